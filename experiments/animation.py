@@ -1,0 +1,111 @@
+"""Plans being refined, then executed on the real level, as an animated GIF."""
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
+from PIL import Image, ImageDraw
+
+from leapjax import planners, rollouts
+from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
+from leapjax.envs.levels import Level
+from leapjax.pretrained import Pretrained
+
+TILE = 32  # pixels per cell
+CAPTION = 34  # pixels of text below the level
+REFINE_MS, STEP_MS, PAUSE_MS = 250, 220, 900
+MAX_PLANS = 20
+GLYPHS = dict(zip(range(len(ACTIONS)), ["L", "R", "F", "pick", "drop", "open", "end"], strict=True))
+
+
+def animate(planner: Pretrained, level: Level, seeds: Sequence[int], seed: int, path: Path) -> None:
+    """Draws one episode per level seed, one after the other, with MiniGrid's renderer."""
+    frames: list[Image.Image] = []
+    durations: list[int] = []
+    for level_seed in seeds:
+        for frame, duration in episode_frames(planner, level, level_seed, seed):
+            frames.append(frame)
+            durations.append(duration)
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True
+    )
+
+
+def episode_frames(
+    planner: Pretrained, level: Level, level_seed: int, seed: int
+) -> list[tuple[Image.Image, int]]:
+    """The frames of one episode with their durations in milliseconds."""
+    adapter = BabyAIAdapter(level)
+    context = planner.specification.sizes.context
+    history = rollouts.History(adapter.reset(level_seed), context, adapter.num_actions)
+    mission = adapter.env.mission
+    frames = []
+    for replan in range(MAX_PLANS):
+        keys = planners.plan_keys(seed, np.array([level_seed]), np.array([replan]))
+        plan = planner(keys, rollouts.stack_contexts([history]))
+        trace = np.asarray(plan.trace[0])
+        for iteration in _distinct(trace):
+            text = f"plan {replan + 1}, iteration {iteration + 1} of {len(trace)}"
+            image = picture(adapter, mission, text, trace[iteration])
+            frames.append((image, REFINE_MS))
+        frames[-1] = (frames[-1][0], PAUSE_MS)
+        for action in np.asarray(plan.actions[0]):
+            if action == END:
+                break
+            transition = adapter.step(int(action))
+            history.advance(int(action), transition.observation)
+            over = transition.terminated or transition.truncated
+            outcome = ("success" if transition.success else "failed") if over else "executing"
+            text = f"step {history.step}: {ACTIONS[action]}; {outcome}"
+            frames.append((picture(adapter, mission, text, None), STEP_MS))
+            if over:
+                frames[-1] = (frames[-1][0], PAUSE_MS)
+                return frames
+    return frames
+
+
+def _distinct(trace: np.ndarray) -> list[int]:
+    """The iterations that changed the plan, and the last."""
+    changed = [0] + [i for i in range(1, len(trace)) if (trace[i] != trace[i - 1]).any()]
+    return changed if changed[-1] == len(trace) - 1 else [*changed, len(trace) - 1]
+
+
+def picture(
+    adapter: BabyAIAdapter, mission: str, text: str, actions: np.ndarray | None
+) -> Image.Image:
+    """The level, the goal, the way of a plan if given, and a caption."""
+    env = adapter.env
+    level_image = Image.fromarray(env.grid.render(TILE, tuple(env.agent_pos), env.agent_dir))
+    image = Image.new("RGB", (max(level_image.width, 320), level_image.height + CAPTION), "white")
+    image.paste(level_image, (0, 0))
+    pen = ImageDraw.Draw(image)
+    if adapter.goal[0] >= 0:
+        x, y = adapter.goal
+        box = [x * TILE, y * TILE, (x + 1) * TILE - 1, (y + 1) * TILE - 1]
+        pen.rectangle(box, outline="white", width=2)
+    pen.text((4, level_image.height + 2), mission[:52], fill="black")
+    if actions is not None:
+        points = [((x + 0.5) * TILE, (y + 0.5) * TILE) for x, y in way(env, actions)]
+        if len(points) > 1:
+            pen.line(points, fill=(80, 160, 255), width=4, joint="curve")
+        x, y = points[-1]
+        pen.ellipse([x - 5, y - 5, x + 5, y + 5], fill=(80, 160, 255))
+        text = f"{text}: {' '.join(GLYPHS[int(action)] for action in actions)}"
+    pen.text((4, level_image.height + 18), text, fill="black")
+    return image
+
+
+def way(env: RoomGridLevel, actions: np.ndarray) -> list[tuple[int, int]]:
+    """The cells that a plan leads through, found by playing it on a copy of the level."""
+    copied = copy.deepcopy(env)
+    cells = [(int(copied.agent_pos[0]), int(copied.agent_pos[1]))]
+    for action in actions:
+        if action == END:
+            break
+        _, _, terminated, truncated, _ = copied.step(int(action))
+        cells.append((int(copied.agent_pos[0]), int(copied.agent_pos[1])))
+        if terminated or truncated:
+            break
+    return cells

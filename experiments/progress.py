@@ -1,0 +1,60 @@
+"""Progress of long work: a live bar on a terminal, plain lines in a log."""
+
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+LOG_INTERVAL = 10.0  # seconds between lines where there is no terminal
+
+
+class Meter:
+    """Shows how far one piece of work is, how fast it goes and how long it will take."""
+
+    def __init__(self, console: Console, title: str, total: int, done: int = 0) -> None:
+        self._console, self._title, self._total = console, title, total
+        self._begun = self._shown = time.monotonic()
+        self._first = done
+        self._bar: Progress | None = None
+        if console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[note]}"),
+                TimeRemainingColumn(),
+                console=console,
+            )
+            self._task = self._bar.add_task(title, total=total, completed=done, note="")
+
+    def __enter__(self) -> Self:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def update(self, done: int, note: str = "") -> None:
+        """`done` of the total, with a note such as the loss."""
+        now = time.monotonic()
+        rate = (done - self._first) / max(now - self._begun, 1e-9)
+        if self._bar:
+            self._bar.update(self._task, completed=done, note=f"{rate:.1f}/s {note}")
+            return
+        if now - self._shown < LOG_INTERVAL and done != self._total:
+            return
+        self._shown = now
+        left = (self._total - done) / rate if rate else float("inf")
+        self._console.print(
+            f"{self._title} {done}/{self._total}  {rate:.1f}/s  ETA {left:.0f}s  {note}",
+            highlight=False,
+        )

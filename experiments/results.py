@@ -1,0 +1,94 @@
+"""Result rows: JSON lines, one file per experiment; tables are made from rows only."""
+
+import datetime
+import json
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from leapjax import scores
+from leapjax.errors import UserError
+from leapjax.pretrained import write_text
+
+Row = dict[str, Any]
+REQUIRED = ("experiment", "level", "method", "preset", "seed", "episodes", "successes", "hash")
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a file; none if there is no file.
+
+    Raises:
+        UserError: a line that is not a row, by its number.
+    """
+    if not path.exists():
+        return []
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            raise UserError(f"{path}, line {number}: not JSON") from None
+        missing = [k for k in REQUIRED if not isinstance(row, dict) or k not in row]
+        if missing:
+            raise UserError(f"{path}, line {number}: a row without {', '.join(missing)}")
+        rows.append(row)
+    return rows
+
+
+def record(path: Path, row: Row) -> None:
+    """Adds a row, in the place of one of the same configuration, atomically."""
+    rows = [other for other in read(path) if other["hash"] != row["hash"]]
+    lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
+    write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def find(path: Path, configuration: str) -> Row | None:
+    """The recorded row of a configuration."""
+    return next((row for row in read(path) if row["hash"] == configuration), None)
+
+
+def versions() -> dict[str, str]:
+    """What a result was made with."""
+    names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
+    found = {name: metadata.version(name) for name in names}
+    return {**found, "python": platform.python_version(), "machine": platform.machine()}
+
+
+def today() -> str:
+    """The date of a row."""
+    return datetime.datetime.now(datetime.UTC).date().isoformat()
+
+
+def percent(row: Row) -> str:
+    """A success rate with its 95% interval."""
+    low, high = scores.wilson_interval(row["successes"], row["episodes"])
+    rate = row["successes"] / row["episodes"]
+    return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows beside the paper's numbers."""
+    columns = (
+        "level", "method", "seed", "success [95%]", "length", "paper",
+        "demos s", "compile s", "train s", "eval s", "plans/s",
+    )  # fmt: skip
+    result = Table(*columns)
+    for row in rows:
+        paper = row.get("paper_success")
+        result.add_row(
+            row["level"],
+            f"{row['method']} ({row['preset']})",
+            str(row["seed"]),
+            percent(row),
+            f"{row['mean_length']:.1f}",
+            "-" if paper is None else f"{paper:.1f}%",
+            *(f"{row[f'{name}_seconds']:.1f}" for name in ("demos", "compile", "train", "eval")),
+            f"{row['plans_per_second']:.0f}",
+        )
+    return result

@@ -1,0 +1,52 @@
+"""Planning with sequence models through iterative energy minimisation, in JAX.
+
+An `Energy` is a few pure functions of one trajectory; a planner finds a plan of low
+energy; `compile_planner` makes it plan for any number of contexts at once.
+"""
+
+from leapjax.energy import compose, constrain, from_total, pseudo_likelihood, view
+from leapjax.errors import UserError
+from leapjax.planners import (
+    CompiledPlanner,
+    CrossEntropyConfig,
+    GibbsConfig,
+    ShootingConfig,
+    compile_planner,
+    cross_entropy_method,
+    gibbs,
+    plan_keys,
+    random_shooting,
+)
+from leapjax.pretrained import Pretrained, load
+from leapjax.rollouts import Episodes, evaluate
+from leapjax.scores import wilson_interval
+from leapjax.types import Agent, Context, Energy, Observation, Plan, TrainState
+
+__all__ = [
+    "Agent",
+    "CompiledPlanner",
+    "Context",
+    "CrossEntropyConfig",
+    "Energy",
+    "Episodes",
+    "GibbsConfig",
+    "Observation",
+    "Plan",
+    "Pretrained",
+    "ShootingConfig",
+    "TrainState",
+    "UserError",
+    "compile_planner",
+    "compose",
+    "constrain",
+    "cross_entropy_method",
+    "evaluate",
+    "from_total",
+    "gibbs",
+    "load",
+    "plan_keys",
+    "pseudo_likelihood",
+    "random_shooting",
+    "view",
+    "wilson_interval",
+]

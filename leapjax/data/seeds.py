@@ -1,0 +1,64 @@
+"""Level seeds: disjoint ranges for training, validation and test, in one place."""
+
+import itertools
+from collections.abc import Iterator
+
+from leapjax.errors import UserError
+
+# Test levels come first so that anyone's `--test-seed 1000` is a fresh test episode.
+VALIDATION_START = 100_000_000
+TRAINING_START = 200_000_000
+TRAINING_STRIDE = 1_000_000  # level seeds of one training seed
+MAX_TRAINING_SEED = 1_000
+
+
+def test_seeds(first: int, episodes: int) -> range:
+    """Level seeds of the test episodes: the same for every method and training seed.
+
+    Raises:
+        UserError: none, or seeds that training or validation may use.
+    """
+    return _within(range(first, first + episodes), 0, VALIDATION_START, "test")
+
+
+def validation_seeds(first: int, episodes: int) -> range:
+    """Level seeds on which choices are made."""
+    start = VALIDATION_START + first
+    return _within(range(start, start + episodes), VALIDATION_START, TRAINING_START, "validation")
+
+
+def training_seeds(seed: int) -> Iterator[int]:
+    """Level seeds for the demonstrations of one training seed.
+
+    Raises:
+        UserError: a training seed out of range.
+    """
+    if not 0 <= seed < MAX_TRAINING_SEED:
+        raise UserError(f"a training seed must be in 0 .. {MAX_TRAINING_SEED - 1}, got {seed}")
+    start = TRAINING_START + seed * TRAINING_STRIDE
+    return itertools.islice(itertools.count(start), TRAINING_STRIDE)
+
+
+def check_disjoint(demonstrations: list[int], episodes: range) -> None:
+    """Refuses evaluation on a level that a demonstration came from.
+
+    Raises:
+        UserError: a shared seed.
+    """
+    shared = [seed for seed in demonstrations if seed in episodes]
+    if shared:
+        raise UserError(
+            f"level seed {shared[0]} is both a demonstration and a test episode: "
+            "choose another --test-seed"
+        )
+
+
+def _within(seeds: range, low: int, high: int, kind: str) -> range:
+    if len(seeds) < 1:
+        raise UserError(f"at least one {kind} episode is needed, got {len(seeds)}")
+    if seeds[0] < low or seeds[-1] >= high:
+        raise UserError(
+            f"{kind} seeds {seeds[0] - low} .. {seeds[-1] - low} leave their range "
+            f"0 .. {high - low - 1}; the seeds beyond it belong to other episodes"
+        )
+    return seeds

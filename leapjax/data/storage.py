@@ -1,0 +1,192 @@
+"""Demonstrations as Minari data sets: written once, atomically, and read by one path.
+
+A data set of the user's own, of the same observations, is read in the same way.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import gymnasium as gym
+import minari
+import numpy as np
+from minari.data_collector import EpisodeBuffer
+from minari.storage.datasets_root_dir import get_dataset_path
+
+from leapjax.data.demonstrations import Collection, Demonstration
+from leapjax.envs import vocabulary
+from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.envs.levels import Level
+from leapjax.errors import UserError
+from leapjax.types import Observation
+
+UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
+FORMAT = 1  # raised whenever what a demonstration holds changes: old caches are then unused
+
+
+def dataset_id(level: Level, count: int, seed: int) -> str:
+    """The id under which `count` demonstrations for a training seed are cached."""
+    name = level.name.removeprefix("BabyAI-").removesuffix("-v0")
+    return f"leapjax/{name}/bot-{count}-seed{seed}-v{FORMAT}"
+
+
+def observation_space(side: int, words: int) -> gym.spaces.Dict:
+    """The Minari observation space of an `Observation`."""
+    integers = {"low": -1, "high": max(side, vocabulary.SIZE, 255), "dtype": np.int32}
+    return gym.spaces.Dict(
+        {
+            "grid": gym.spaces.Box(0, 255, (side, side, 3), np.uint8),
+            "pose": gym.spaces.Box(shape=(3,), **integers),
+            "carried": gym.spaces.Box(shape=(2,), **integers),
+            "goal": gym.spaces.Box(shape=(2,), **integers),
+            "instruction": gym.spaces.Box(shape=(words,), **integers),
+        }
+    )
+
+
+def save(name: str, collection: Collection, description: str) -> None:
+    """Writes a Minari data set; a killed program leaves either all of it or nothing."""
+    demonstrations = collection.demonstrations
+    first = demonstrations[0].observations
+    buffers = [
+        EpisodeBuffer(
+            id=index,
+            seed=demonstration.seed,
+            observations=demonstration.observations._asdict(),
+            actions=list(demonstration.actions),
+            rewards=[0.0] * (len(demonstration.actions) - 1) + [1.0],
+            terminations=[False] * (len(demonstration.actions) - 1) + [True],
+            truncations=[False] * len(demonstration.actions),
+            infos={},
+        )
+        for index, demonstration in enumerate(demonstrations)
+    ]
+    final = get_dataset_path(name)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    # Minari writes in place, under an id: write under a temporary id, then rename.
+    scratch = f"leapjax/unfinished-{os.getpid()}-v0"
+    shutil.rmtree(get_dataset_path(scratch), ignore_errors=True)
+    minari.create_dataset_from_buffers(
+        dataset_id=scratch,
+        buffer=buffers,
+        action_space=gym.spaces.Discrete(NUM_ACTIONS - 1),
+        observation_space=observation_space(first.grid.shape[1], first.instruction.shape[1]),
+        algorithm_name="BabyAI bot",
+        author="leapjax",
+        code_permalink="https://github.com/Farama-Foundation/Minigrid",
+        description=description,
+        jpeg_encoding=False,  # grids are symbols, not pictures
+    )
+    path = get_dataset_path(scratch)
+    _rename_id(path, scratch, name)
+    if final.exists():
+        shutil.rmtree(final)
+    path.rename(final)
+
+
+def load(name: str, level: Level, side: int) -> list[Demonstration]:
+    """The demonstrations of a Minari data set, checked against a level.
+
+    Raises:
+        UserError: missing, damaged, empty, or not of this level's observations.
+    """
+    if not get_dataset_path(name).exists():
+        raise UserError(
+            f"no Minari data set {name!r} in {get_dataset_path()}: "
+            "check the id with `minari list local`"
+        )
+    try:
+        dataset = minari.load_dataset(name)
+        episodes = list(dataset.iterate_episodes())
+        metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+    except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
+        raise UserError(
+            f"the Minari data set {name!r} cannot be read ({_first_line(error)}): "
+            "delete it and it is made again, or restore it"
+        ) from None
+    if not episodes:
+        raise UserError(f"the Minari data set {name!r} has no episodes")
+    demonstrations = []
+    for episode, details in zip(episodes, metadata, strict=True):
+        states = _observation(episode.observations, name)
+        actions = np.asarray(episode.actions)
+        _check_episode(states, actions, name, episode.id, level, side)
+        seed = int(details.get("seed", UNKNOWN_SEED))
+        demonstrations.append(Demonstration(states, actions.astype(np.int32), seed))
+    return demonstrations
+
+
+def _observation(fields: object, name: str) -> Observation:
+    missing = [f for f in Observation._fields if not isinstance(fields, dict) or f not in fields]
+    if missing:
+        raise UserError(
+            f"the Minari data set {name!r} has no observation {missing[0]!r}: "
+            f"expected a dictionary of {', '.join(Observation._fields)}"
+        )
+    assert isinstance(fields, dict)
+    values = {f: np.asarray(fields[f]) for f in Observation._fields}
+    return Observation(
+        **{f: v.astype(np.uint8 if f == "grid" else np.int32) for f, v in values.items()}
+    )
+
+
+def _check_episode(
+    states: Observation, actions: np.ndarray, name: str, episode: int, level: Level, side: int
+) -> None:
+    where = f"episode {episode} of the Minari data set {name!r}"
+    steps = len(actions)
+    expected = {
+        "grid": (steps + 1, side, side, 3),
+        "pose": (steps + 1, 3),
+        "carried": (steps + 1, 2),
+        "goal": (steps + 1, 2),
+        "instruction": (steps + 1, level.words),
+    }
+    if steps == 0:
+        raise UserError(f"{where} has no actions")
+    for field, shape in expected.items():
+        actual = getattr(states, field).shape
+        if actual != shape:
+            raise UserError(
+                f"{where}: {field} has shape {actual}, level {level.name} needs {shape}"
+            )
+    ranges = {
+        "grid objects": (states.grid[..., 0], 0, 10),
+        "grid colours": (states.grid[..., 1], 0, 5),
+        "grid states": (states.grid[..., 2], 0, 3),
+        "positions": (states.pose[:, :2], 0, side - 1),
+        "directions": (states.pose[:, 2], 0, 3),
+        "goals": (states.goal, -1, side - 1),
+        "instruction": (states.instruction, 0, vocabulary.SIZE - 1),
+        "carried objects": (states.carried[:, 0], 0, 10),
+        "carried colours": (states.carried[:, 1], 0, 5),
+        "actions": (actions, 0, NUM_ACTIONS - 2),
+    }
+    for field, (values, low, high) in ranges.items():
+        if values.min() < low or values.max() > high:
+            raise UserError(
+                f"{where}: {field} run from {values.min()} to {values.max()}, "
+                f"expected {low} to {high}"
+            )
+
+
+def _rename_id(path: Path, old: str, new: str) -> None:
+    """Minari keeps the id inside the data set too."""
+    metadata = path / "data" / "metadata.json"
+    if metadata.exists():
+        metadata.write_text(metadata.read_text().replace(old, new))
+    else:
+        import h5py  # noqa: PLC0415  (only where Minari stored HDF5)
+
+        with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
+            file.attrs["dataset_id"] = new
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error).strip() or type(error).__name__
+    return text.splitlines()[0][:200]
+
+
+def exists(name: str) -> bool:
+    """Whether a data set of that id is in the local Minari folder."""
+    return get_dataset_path(name).exists()

@@ -1,0 +1,205 @@
+"""Energies over plans and their algebra: every function here returns an `Energy`.
+
+An energy is written for one trajectory. Parameters are always an argument and varying
+data lives in the context, so an energy is built once and compiled once.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.types import Energy, Params, PyTree, mask_token
+
+EncodeFn = Callable[[Params, PyTree], PyTree]
+LogitsFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
+TotalFn = Callable[[Params, PyTree, jax.Array], jax.Array]
+
+
+def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Energy:
+    """The energy of a masked language model over actions (paper, equation 2).
+
+    `total` is the negative pseudo-log-likelihood, the sum over t of
+    `-log p(a_t | context, a_-t)`, with all T masked copies scored in one batched pass.
+    `conditional` is each term on its own. These are two different objects: the
+    conditionals of `exp(-total)` are not the model's conditionals, so an update that is
+    greedy in the conditionals can raise `total`.
+
+    Args:
+        encode: (params, context) -> memory.
+        logits: (params, memory, tokens `[T]` with MASK, positions `[P]`) -> `[P, A]`
+            unnormalised log-probabilities; -inf forbids an action.
+        num_actions: A, the end action included.
+    """
+    mask = mask_token(num_actions)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        tokens = actions.at[positions].set(mask)
+        return -jax.nn.log_softmax(logits(params, memory, tokens, positions), axis=-1)
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        def term(position: jax.Array) -> jax.Array:
+            energies = conditional(params, memory, actions, position[None])[0]
+            return energies[jnp.minimum(actions[position], num_actions - 1)]
+
+        terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
+        return _infinite_if_incomplete(jnp.sum(terms), actions, num_actions)
+
+    return Energy(encode, conditional, total, _checked(num_actions))
+
+
+def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
+    """An energy from its total alone: any function of a complete plan will do.
+
+    The conditional tries every action at every position, `P * A` evaluations; MASK is not
+    accepted, so planners start from uniform actions.
+
+    Args:
+        encode: (params, context) -> memory.
+        total: (params, memory, actions `[T]`) -> `[]`, lower is better; +inf forbids.
+        num_actions: A.
+    """
+
+    def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        return _infinite_if_incomplete(total(params, memory, actions), actions, num_actions)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        return _try_every_action(
+            lambda plan: guarded_total(params, memory, plan), actions, positions, num_actions
+        )
+
+    return Energy(encode, conditional, guarded_total, _checked(num_actions), accepts_mask=False)
+
+
+def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
+    """The weighted sum of energies (paper, section 4, task compositionality).
+
+    A weight is an inverse temperature: two is twice as sharp. Parameters and memories
+    become tuples with one entry per energy.
+
+    Raises:
+        ValueError: no energies, different action sets, or weights that are negative, not
+            finite or not as many as the energies.
+    """
+    energies = tuple(energies)
+    weights = (1.0,) * len(energies) if weights is None else tuple(map(float, weights))
+    if not energies:
+        raise ValueError("compose needs at least one energy")
+    if len(weights) != len(energies):
+        raise ValueError(f"{len(energies)} energies need as many weights, got {len(weights)}")
+    if any(not 0 <= weight < float("inf") for weight in weights):
+        raise ValueError(f"weights must be finite and at least 0, got {weights}")
+    action_sets = {energy.num_actions for energy in energies}
+    if len(action_sets) > 1:
+        raise ValueError(
+            f"composed energies must agree on one action set, got sizes {sorted(action_sets)}"
+        )
+    # Weight 0 leaves an energy out altogether: 0 * inf would be NaN.
+    active = [index for index, weight in enumerate(weights) if weight > 0]
+
+    def encode(params: Params, context: PyTree) -> PyTree:
+        return tuple(energy.encode(p, context) for energy, p in zip(energies, params, strict=True))
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        result = jnp.zeros((positions.shape[0], energies[0].num_actions), jnp.float32)
+        for i in active:
+            result += weights[i] * energies[i].conditional(params[i], memory[i], actions, positions)
+        return result
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        result = jnp.zeros((), jnp.float32)
+        for i in active:
+            result += weights[i] * energies[i].total(params[i], memory[i], actions)
+        return result
+
+    def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        result = jnp.zeros((), jnp.float32)
+        for i in active:
+            result += energies[i].violation(params[i], memory[i], actions)
+        return result
+
+    accepts_mask = all(energies[i].accepts_mask for i in active)
+    return Energy(encode, conditional, total, energies[0].num_actions, accepts_mask, violation)
+
+
+def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array]) -> Energy:
+    """Adds a test-time constraint (paper, section 4, online adaptation).
+
+    While a plan still holds MASK outside the position in question the penalty is not
+    evaluated: it is a function of complete plans. So the first, all-masked iteration
+    ignores it and every later one obeys it.
+
+    Args:
+        energy: the energy to constrain.
+        penalty: (context, actions `[T]`) -> `[]`: 0 where the plan is allowed, positive
+            (+inf for never) where it is not.
+    """
+
+    def encode(params: Params, context: PyTree) -> PyTree:
+        return energy.encode(params, context), context
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        inner, context = memory
+        base = energy.conditional(params, inner, actions, positions)
+        extra = _try_every_action(
+            lambda plan: jnp.where(
+                jnp.all(plan < energy.num_actions),
+                penalty(context, jnp.minimum(plan, energy.num_actions - 1)),
+                0.0,
+            ),
+            actions,
+            positions,
+            energy.num_actions,
+        )
+        return base + extra
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        inner, context = memory
+        return energy.total(params, inner, actions) + penalty(context, actions)
+
+    def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        inner, context = memory
+        return energy.violation(params, inner, actions) + penalty(context, actions)
+
+    return energy._replace(encode=encode, conditional=conditional, total=total, violation=violation)
+
+
+def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
+    """Puts `function(context)` in front of an energy: what this energy may see."""
+    return energy._replace(encode=lambda params, context: energy.encode(params, function(context)))
+
+
+def _try_every_action(
+    evaluate: Callable[[jax.Array], jax.Array],
+    actions: jax.Array,
+    positions: jax.Array,
+    num_actions: int,
+) -> jax.Array:
+    """`evaluate` of the plan with each action at each position in turn: `[P, A]`."""
+
+    def at(position: jax.Array, action: jax.Array) -> jax.Array:
+        return evaluate(actions.at[position].set(action))
+
+    over_actions = jax.vmap(at, in_axes=(None, 0))
+    choices = jnp.arange(num_actions, dtype=actions.dtype)
+    return jax.vmap(over_actions, in_axes=(0, None))(positions, choices)
+
+
+def _infinite_if_incomplete(energy: jax.Array, actions: jax.Array, num_actions: int) -> jax.Array:
+    """A plan that still holds MASK has no total energy: it is never the best plan."""
+    complete = jnp.all((actions >= 0) & (actions < num_actions))
+    return jnp.where(complete, energy, jnp.inf)
+
+
+def _checked(num_actions: int) -> int:
+    if num_actions < 1:
+        raise ValueError(f"an energy needs at least one action, got {num_actions}")
+    return num_actions

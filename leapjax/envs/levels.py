@@ -1,0 +1,110 @@
+"""BabyAI levels as data: the paper's seven by name, any registered one by its id."""
+
+import contextlib
+import dataclasses
+import difflib
+import io
+
+import gymnasium as gym
+import minigrid  # noqa: F401  (registers the levels)
+from minigrid.envs import babyai
+from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
+
+from leapjax.envs import vocabulary
+from leapjax.errors import UserError
+
+DOORS = ("none", "open", "closed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """A level, and the settings of the paper for it (appendix, tables 4 and 7)."""
+
+    name: str
+    task: str = ""  # class in minigrid.envs.babyai; empty: `name` is a registered id
+    room_size: int = 0  # side of a room, walls included
+    rows: int = 1  # rooms
+    columns: int = 1  # rooms
+    distractors: int = 0  # objects, the target included where the task draws it among them
+    doors: str = "none"  # between rooms: "none", "open" or "closed"
+    context: int = 0  # K, past steps in the context
+    horizon: int = 5  # T
+    iterations: int = 10  # N
+    words: int = vocabulary.LONGEST  # the longest instruction, in tokens
+    paper_success: float | None = None  # percent (paper, table 1)
+
+
+_GO_TO, _WITH_PLACE = 5, 9  # "go to the red ball", "pick up the red ball in front of you"
+_SEQUENCE = 4 * _GO_TO + 4
+
+LEVELS = {
+    level.name: level
+    for level in (
+        Level("GoToLocalS7N5", "GoToLocal", 7, 1, 1, 5, words=_GO_TO, paper_success=91.0),
+        Level("GoToLocalS8N7", "GoToLocal", 8, 1, 1, 7, words=_GO_TO, paper_success=95.0),
+        Level(
+            "GoToObjMazeS4", "GoTo", 4, 3, 3, 1, "open",
+            horizon=10, iterations=30, words=_GO_TO, paper_success=62.5,
+        ),
+        Level(
+            "GoToObjMazeS7", "GoTo", 7, 3, 3, 1, "open",
+            horizon=15, iterations=50, words=_GO_TO, paper_success=42.5,
+        ),
+        Level(
+            "GoToObjMazeS4R2Close", "GoTo", 4, 2, 2, 1, "closed",
+            words=_GO_TO, paper_success=55.0,
+        ),
+        Level("PickUpLoc", "PickupLoc", 8, 1, 1, 8, words=_WITH_PLACE, paper_success=67.0),
+        Level(
+            "GoToSeqS5R2", "GoToSeq", 5, 2, 2, 4, "closed",
+            context=20, words=_SEQUENCE, paper_success=33.0,
+        ),
+    )
+}  # fmt: skip
+
+
+def registered_levels() -> list[str]:
+    """The ids of all BabyAI levels that MiniGrid registers."""
+    return sorted(name for name in gym.registry if name.startswith("BabyAI-"))
+
+
+def find_level(name: str) -> Level:
+    """The level of that name or id.
+
+    Raises:
+        UserError: there is none; names the nearest.
+    """
+    if name in LEVELS:
+        return LEVELS[name]
+    if name in registered_levels():
+        return Level(name)
+    known = [*LEVELS, *registered_levels()]
+    lowered = {candidate.lower(): candidate for candidate in known}
+    near = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)
+    hint = f"did you mean {', '.join(lowered[match] for match in near)}?" if near else ""
+    raise UserError(
+        f"unknown level {name!r}: expected one of {', '.join(LEVELS)}, "
+        f"or the id of a registered BabyAI level; {hint}".rstrip("; ")
+    )
+
+
+def make_environment(level: Level) -> RoomGridLevel:
+    """MiniGrid's environment of a level, without wrappers, not yet reset."""
+    if not level.task:
+        with silenced():
+            return gym.make(level.name).unwrapped  # type: ignore[return-value]
+    rooms = {"room_size": level.room_size, "num_rows": level.rows, "num_cols": level.columns}
+    distractors = {"num_dists": level.distractors}
+    # Each task takes only what it does not fix itself.
+    arguments = {
+        "GoToLocal": {"room_size": level.room_size, **distractors},
+        "GoTo": {**rooms, **distractors, "doors_open": level.doors == "open"},
+        "PickupLoc": {"room_size": level.room_size},
+        "GoToSeq": {**rooms, **distractors},
+    }[level.task]
+    return getattr(babyai, level.task)(**arguments)
+
+
+def silenced() -> contextlib.redirect_stdout:
+    """Level generation prints 'Sampling rejected: ...': not for our users."""
+    return contextlib.redirect_stdout(io.StringIO())

@@ -1,0 +1,97 @@
+"""What an agent sees of a BabyAI level: `observe`, and the goal fixed at reset.
+
+Everything here reads MiniGrid's state and changes nothing.
+"""
+
+from collections import deque
+
+import numpy as np
+from minigrid.core.constants import COLOR_TO_IDX, DIR_TO_VEC, OBJECT_TO_IDX
+from minigrid.core.grid import Grid
+from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
+from minigrid.envs.babyai.core.verifier import GoToInstr, OpenInstr, PickupInstr
+
+from leapjax.types import Observation
+
+NO_GOAL = (-1, -1)
+Cell = tuple[int, int]
+
+
+def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) -> Observation:
+    """The full state of a level as an `Observation` of NumPy arrays.
+
+    Args:
+        env: a level that was reset.
+        side: S; smaller or non-square grids are padded at the far ends with zeros.
+        goal: what `nearest_goal` said at reset.
+        instruction: `[L]` token ids.
+    """
+    grid = np.zeros((side, side, 3), np.uint8)
+    width, height = env.grid.width, env.grid.height
+    grid[:width, :height] = env.grid.encode()
+    x, y = map(int, env.agent_pos)
+    grid[x, y] = OBJECT_TO_IDX["agent"], 0, env.agent_dir
+    carried = env.carrying
+    held = (OBJECT_TO_IDX[carried.type], COLOR_TO_IDX[carried.color]) if carried else (0, 0)
+    return Observation(
+        grid=grid,
+        pose=np.array([x, y, env.agent_dir], np.int32),
+        carried=np.array(held, np.int32),
+        goal=np.array(goal, np.int32),
+        instruction=instruction,
+    )
+
+
+def nearest_goal(env: RoomGridLevel) -> Cell:
+    """The target of an instruction that names one: the match nearest by path length.
+
+    Ties go to the smaller x, then the smaller y. Paths lead through doors, open or not;
+    where objects block every path, the nearest through them counts, after all others.
+    `NO_GOAL` for instructions with several targets, and where every match is out of the
+    grid (a key in a closed box).
+    """
+    instruction = env.instrs  # pyright: ignore[reportAttributeAccessIssue]
+    if not isinstance(instruction, GoToInstr | OpenInstr | PickupInstr):
+        return NO_GOAL
+    matches = [(int(x), int(y)) for x, y in instruction.desc.obj_poss]
+    if not matches:
+        return NO_GOAL
+    start = (int(env.agent_pos[0]), int(env.agent_pos[1]))
+    free = path_lengths(env.grid, start, through_objects=False)
+    blocked = path_lengths(env.grid, start, through_objects=True)
+    far = env.grid.width * env.grid.height
+
+    def distance(cell: Cell) -> tuple[int, Cell]:
+        return free.get(cell, far + blocked.get(cell, far)), cell
+
+    return min(matches, key=distance)
+
+
+def path_lengths(grid: Grid, start: Cell, through_objects: bool) -> dict[Cell, int]:
+    """Moves from `start` to every cell that can be reached, or touched, from it.
+
+    An object ends a path (it is reached, not passed) unless `through_objects`; a wall
+    always does.
+    """
+    lengths = {start: 0}
+    queue = deque([start])
+    while queue:
+        x, y = cell = queue.popleft()
+        content = grid.get(x, y)
+        passable = content is None or content.type == "door"
+        passable |= through_objects and content is not None and content.type != "wall"
+        if cell != start and not passable:
+            continue
+        for dx, dy in DIR_TO_VEC:
+            near = (x + int(dx), y + int(dy))
+            inside = 0 <= near[0] < grid.width and 0 <= near[1] < grid.height
+            if inside and near not in lengths:
+                lengths[near] = lengths[cell] + 1
+                queue.append(near)
+    return lengths
+
+
+def front_cell(env: RoomGridLevel) -> Cell:
+    """The cell that the agent faces."""
+    x, y = env.front_pos
+    return int(x), int(y)

@@ -1,0 +1,77 @@
+"""Instructions as token ids, from BabyAI's grammar and never from the order of the data.
+
+Every registered BabyAI level speaks this language (minigrid.envs.babyai.core.verifier):
+
+    instruction = sequence | pair;  sequence = pair ", then" pair | pair "after you" pair
+    pair        = clause | clause "and" clause
+    clause      = "go to" d | "pick up" d | "open" d | "put" d "next to" d
+    d           = ("the" | "a") [colour] type [place]
+    place       = "in front of you" | "behind you" | "on your left" | "on your right"
+"""
+
+import re
+
+import numpy as np
+from minigrid.core.constants import IDX_TO_COLOR, IDX_TO_OBJECT
+
+from leapjax.errors import UserError
+
+WORDS = (
+    *("go", "to", "pick", "up", "open", "put", "next", "then", "after", "you", "and", ","),
+    *("the", "a", "object", "box", "ball", "key", "door"),
+    *("red", "green", "blue", "purple", "yellow", "grey"),
+    *("in", "front", "of", "behind", "on", "your", "left", "right"),
+)
+PAD = 0  # fills an instruction on the right
+WORD_IDS = {word: index for index, word in enumerate(WORDS, start=1)}
+SIZE = len(WORD_IDS) + 1  # padding included
+
+# "put the red ball in front of you next to the red ball in front of you"
+LONGEST_CLAUSE = 17
+LONGEST = 4 * LONGEST_CLAUSE + 4  # four clauses, "and" twice and ", then" or "after you"
+
+
+def encode(instruction: str, length: int) -> np.ndarray:
+    """Token ids `[length]` int32 of an instruction, padded on the right.
+
+    Raises:
+        UserError: a word that is not BabyAI's, which it names, or too many words.
+    """
+    words = re.findall(r"[a-z]+|[^a-z\s]", instruction.lower())
+    unknown = [word for word in words if word not in WORD_IDS]
+    if unknown:
+        raise UserError(
+            f"unknown word {unknown[0]!r} in instruction {instruction!r}: "
+            f"BabyAI's words are {', '.join(WORDS)}"
+        )
+    if len(words) > length:
+        raise UserError(
+            f"instruction of {len(words)} words where at most {length} fit: {instruction!r}"
+        )
+    ids = np.zeros(length, np.int32)
+    ids[: len(words)] = [WORD_IDS[word] for word in words]
+    return ids
+
+
+def decode(ids: np.ndarray) -> str:
+    """The instruction that token ids stand for."""
+    words = [WORDS[index - 1] for index in np.asarray(ids) if index != PAD]
+    return " ".join(words).replace(" ,", ",")
+
+
+def mirrored_words() -> np.ndarray:
+    """`[SIZE]` int32: the id of each word in a mirrored world (left and right swapped)."""
+    ids = np.arange(SIZE, dtype=np.int32)
+    left, right = WORD_IDS["left"], WORD_IDS["right"]
+    ids[[left, right]] = right, left
+    return ids
+
+
+def colour_words() -> np.ndarray:
+    """`[6]` int32: the id of each colour's word, in MiniGrid's order of colours."""
+    return np.array([WORD_IDS[IDX_TO_COLOR[i]] for i in sorted(IDX_TO_COLOR)], np.int32)
+
+
+def object_words(objects: tuple[int, ...]) -> np.ndarray:
+    """int32: the id of the word for each of MiniGrid's object indices."""
+    return np.array([WORD_IDS[IDX_TO_OBJECT[i]] for i in objects], np.int32)

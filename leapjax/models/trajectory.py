@@ -1,0 +1,228 @@
+"""Masked language models over trajectories (paper, section 3.1): `encode`, then `logits`.
+
+Both models score actions from the same `Context`. Every position of the plan carries the
+current state (paper, equation 4), so the memory is computed once per plan and only action
+tokens change from pass to pass.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from leapjax.data import symmetries
+from leapjax.models import encoders
+from leapjax.models.transformer import Transformer, dense
+from leapjax.types import Context, Observation, PyTree
+
+ARCHITECTURES = ("paper", "leapjax")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The network. The defaults are the paper's transformer."""
+
+    architecture: str = "leapjax"  # "paper": the appendix's network; "leapjax": ours
+    layers: int = 3  # transformer layers
+    heads: int = 4  # attention heads
+    width: int = 128  # D, embedding dimension
+    dropout: float = 0.1
+    channels: int = 32  # leapjax: features per grid cell
+    rounds: int = 4  # leapjax: rounds of convolution over the grid
+    fields: int = 8  # leapjax: learned distance fields
+    sweeps: int = 16  # leapjax: rounds of value iteration that make them
+
+    def __post_init__(self) -> None:
+        if self.architecture not in ARCHITECTURES:
+            raise ValueError(
+                f"unknown architecture {self.architecture!r}: "
+                f"expected one of {', '.join(ARCHITECTURES)}"
+            )
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} is not a multiple of {self.heads} heads")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """What a model must know of its environment and of the plans it scores."""
+
+    side: int  # S
+    vocabulary: int  # number of word ids, padding included
+    num_actions: int  # A, the end action included
+    context: int  # K
+    horizon: int  # T
+    max_steps: int  # the longest episode, for the embedding of time
+
+
+def forbid_early_end(logits: jax.Array, positions: jax.Array) -> jax.Array:
+    """The end action, which is the last one, is never the first of a plan: `[P, A]`."""
+    end = jnp.arange(logits.shape[-1]) == logits.shape[-1] - 1
+    return jnp.where(end & (positions[:, None] == 0), -jnp.inf, logits)
+
+
+class PaperModel(nn.Module):
+    """The network of the paper's appendix: state and action tokens, interleaved.
+
+    Tokens s_1 a_1 ... s_n a_n s_n a_n+1 ... with fully bidirectional attention; an action
+    is read off its state token and all tokens share one embedding of the time at the end
+    of the plan, as in the authors' code.
+    """
+
+    config: ModelConfig
+    sizes: Sizes
+
+    def setup(self) -> None:  # noqa: D102
+        c, sizes = self.config, self.sizes
+        self.instruction = encoders.InstructionEncoder(sizes.vocabulary, c.width)
+        self.state = encoders.PaperStateEncoder(sizes.side, c.width)
+        self.action = nn.Embed(sizes.num_actions + 2, c.width, embedding_init=_small)
+        tokens = 2 * (sizes.context + sizes.horizon)
+        self.position = nn.Embed(tokens, c.width, embedding_init=nn.initializers.zeros)
+        steps = sizes.max_steps + sizes.horizon + 1
+        self.time = nn.Embed(steps, c.width, embedding_init=nn.initializers.zeros)
+        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout)
+        self.drop = nn.Dropout(c.dropout)
+        self.head = dense(sizes.num_actions, use_bias=False)
+
+    def encode(self, context: Context, deterministic: bool = True) -> PyTree:
+        """The embeddings that every pass shares: `[2 (K + T), D]`."""
+        del deterministic
+        horizon, past = self.sizes.horizon, self.sizes.context
+        instruction = self.instruction(context.observation.instruction)
+        states = jax.tree.map(
+            lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
+        )
+        states = jax.vmap(self.state, in_axes=(0, None))(states, instruction)  # [K + 1, D]
+        states = jnp.concatenate([states, jnp.repeat(states[-1:], horizon - 1, axis=0)])
+        actions = jnp.tanh(self.action(context.actions))
+        actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
+        tokens = jnp.stack([states, actions], axis=1).reshape(2 * (past + horizon), -1)
+        time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
+        return tokens + self.position(jnp.arange(tokens.shape[0])) + time
+
+    def logits(
+        self,
+        memory: PyTree,
+        actions: jax.Array,
+        positions: jax.Array,
+        deterministic: bool = True,
+    ) -> jax.Array:
+        """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
+        first = 2 * self.sizes.context
+        embedded = jnp.tanh(self.action(actions))
+        x = memory.at[first + 1 + 2 * jnp.arange(self.sizes.horizon)].add(embedded)
+        x = self.drop(x, deterministic=deterministic)
+        h = self.transformer(x, first + 2 * positions, deterministic=deterministic)
+        return forbid_early_end(self.head(h), positions)
+
+
+class LeapModel(nn.Module):
+    """Ours: a canonical frame, the state once, and a cached context.
+
+    The grid is turned so that the agent faces right; learned distances spread over it;
+    what the plan needs is read at the agent, at the goal and over the whole grid.
+    These few tokens are a prefix that never attends to the plan, so its keys and values
+    are computed once per plan, and a pass runs over T action tokens only.
+    """
+
+    config: ModelConfig
+    sizes: Sizes
+
+    def setup(self) -> None:  # noqa: D102
+        c, sizes = self.config, self.sizes
+        self.instruction = encoders.InstructionEncoder(sizes.vocabulary, c.width)
+        self.cells = encoders.CellEmbedding(c.channels)
+        self.modulation = dense(2 * c.channels)
+        self.visited = nn.Dense(c.channels, use_bias=False)
+        self.grid = encoders.GridEncoder(c.channels, c.fields, c.sweeps, c.rounds)
+        self.read_agent = encoders.projection(c.width, "read_agent")
+        self.read_goal = encoders.projection(c.width, "read_goal")
+        self.read_all = encoders.projection(c.width, "read_all")
+        self.carried = nn.Embed(encoders.OBJECTS, c.width, embedding_init=_small)
+        self.carried_colour = nn.Embed(encoders.COLOURS, c.width, embedding_init=_small)
+        self.action = nn.Embed(sizes.num_actions + 2, c.width, embedding_init=_small)
+        self.position = nn.Embed(sizes.horizon, c.width, embedding_init=_small)
+        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout)
+        self.drop = nn.Dropout(c.dropout)
+        self.head = dense(sizes.num_actions, use_bias=False)
+
+    def encode(self, context: Context, deterministic: bool = True) -> PyTree:
+        """Keys and values of the prefix tokens, per layer."""
+        direction = context.observation.pose[2]
+        observation = symmetries.rotate(context.observation, direction)
+        side = self.sizes.side
+        instruction = self.instruction(observation.instruction)
+        cells = self.cells(observation)
+        if self.sizes.context:
+            cells += self.visited(self._visits(context, direction))
+        scale, shift = jnp.split(self.modulation(instruction), 2)
+        grid = self.grid(cells * (1 + scale) + shift, observation.pose[:2])
+        # The agent's neighbourhood holds what the first steps depend on.
+        agent = self.read_agent(encoders.neighbourhood(grid, observation.pose[:2]))
+        agent += self.carried(observation.carried[0])
+        agent += self.carried_colour(observation.carried[1])
+        tokens = jnp.stack(
+            [
+                agent,
+                self.read_goal(encoders.feature_at(grid, observation.goal)),
+                self.read_all(grid.reshape(side * side, -1).max(axis=0)),
+                instruction,
+            ]
+        )
+        tokens = self.drop(tokens, deterministic=deterministic)
+        return self.transformer.prefix(tokens, deterministic=deterministic)
+
+    def logits(
+        self,
+        memory: PyTree,
+        actions: jax.Array,
+        positions: jax.Array,
+        deterministic: bool = True,
+    ) -> jax.Array:
+        """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
+        x = self.action(actions) + self.position(jnp.arange(self.sizes.horizon))
+        x = self.drop(x, deterministic=deterministic)
+        h = self.transformer(x, positions, memory, deterministic=deterministic)
+        return forbid_early_end(self.head(h), positions)
+
+    def _visits(self, context: Context, direction: jax.Array) -> jax.Array:
+        """When the agent last stood in, and last faced, each cell: `[S, S, 4]`.
+
+        The context drawn on the grid: each mark once as 1, once as its recency in (0, 1].
+        """
+        side, past = self.sizes.side, self.sizes.context
+        valid = context.actions <= self.sizes.num_actions  # PAD before the start
+        recency = jnp.arange(1, past + 1) / past
+
+        def marks(pose: jax.Array) -> jax.Array:
+            turned = symmetries.rotate_pose(pose, direction, side)
+            front = turned[:2] + symmetries.DIRECTION_VECTORS[turned[2]]
+            cells = [encoders.one_cell(turned[:2], side), encoders.one_cell(front, side)]
+            return jnp.stack(cells, axis=-1)  # [S, S, 2]
+
+        drawn = jax.vmap(marks)(context.past.pose) * valid[:, None, None, None]
+        latest = (drawn * recency[:, None, None, None]).max(axis=0)
+        return jnp.concatenate([drawn.max(axis=0), latest], axis=-1)
+
+
+def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> jax.Array:
+    return nn.initializers.normal(0.02)(key, shape, dtype)
+
+
+def build(config: ModelConfig, sizes: Sizes) -> PaperModel | LeapModel:
+    """The module that a configuration describes."""
+    return {"paper": PaperModel, "leapjax": LeapModel}[config.architecture](config, sizes)
+
+
+def blank_context(sizes: Sizes, instruction_length: int) -> Context:
+    """A context of the right shapes, all zeros: what parameters are initialised with."""
+    observation = Observation(
+        grid=jnp.zeros((sizes.side, sizes.side, 3), jnp.uint8),
+        pose=jnp.zeros(3, jnp.int32),
+        carried=jnp.zeros(2, jnp.int32),
+        goal=jnp.zeros(2, jnp.int32),
+        instruction=jnp.ones(instruction_length, jnp.int32),
+    )
+    past = jax.tree.map(lambda x: jnp.zeros((sizes.context, *x.shape), x.dtype), observation)
+    return Context(observation, past, jnp.zeros(sizes.context, jnp.int32), jnp.int32(0))

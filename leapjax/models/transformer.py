@@ -1,0 +1,127 @@
+"""A pre-norm transformer whose keys and values of a fixed prefix are computed once.
+
+`Transformer.prefix` runs the prefix tokens through all layers among themselves;
+`Transformer.__call__` runs the tokens that change, which also attend to the prefix, and
+computes the last layer only where it is asked for. All for one sequence, `[tokens, D]`.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
+
+
+class KeysValues(NamedTuple):
+    """What one layer remembers of a sequence."""
+
+    keys: jax.Array  # [tokens, heads, D / heads]
+    values: jax.Array  # [tokens, heads, D / heads]
+
+
+def dense(features: int, use_bias: bool = True, scale: float = WEIGHT_SCALE) -> nn.Dense:
+    """A linear layer with the initialisation of this transformer."""
+    return nn.Dense(features, use_bias, kernel_init=nn.initializers.normal(scale))
+
+
+class Block(nn.Module):
+    """One layer: attention, then a two-layer perceptron, each on a normalised residual."""
+
+    width: int  # D
+    heads: int
+    dropout: float
+    activation: Callable[[jax.Array], jax.Array]
+
+    def setup(self) -> None:  # noqa: D102
+        self.norm_attention = nn.LayerNorm()
+        self.query = dense(self.width)
+        # A key bias shifts all scores of a query alike, so softmax cannot see it.
+        self.key = dense(self.width, use_bias=False)
+        self.value = dense(self.width)
+        self.output = dense(self.width)
+        self.norm_perceptron = nn.LayerNorm()
+        self.expand = dense(4 * self.width)
+        self.contract = dense(self.width)
+        self.drop = nn.Dropout(self.dropout)
+
+    def keys_values(self, x: jax.Array) -> KeysValues:
+        """What others attend to in tokens `[tokens, D]`."""
+        h = self.norm_attention(x)
+        return KeysValues(self._heads(self.key(h)), self._heads(self.value(h)))
+
+    def __call__(
+        self, x: jax.Array, memory: KeysValues, mask: jax.Array | None, deterministic: bool
+    ) -> jax.Array:
+        """Tokens `[Q, D]` after this layer, attending to `memory` where `mask [Q, M]` is."""
+        queries = self._heads(self.query(self.norm_attention(x)))
+        scores = jnp.einsum("qhd,mhd->hqm", queries, memory.keys)
+        scores /= jnp.sqrt(self.width / self.heads)
+        if mask is not None:
+            scores = jnp.where(mask, scores, -1e30)
+        weights = self.drop(jax.nn.softmax(scores, axis=-1), deterministic=deterministic)
+        attended = jnp.einsum("hqm,mhd->qhd", weights, memory.values).reshape(x.shape)
+        x = x + self.drop(self.output(attended), deterministic=deterministic)
+        h = self.contract(self.activation(self.expand(self.norm_perceptron(x))))
+        return x + self.drop(h, deterministic=deterministic)
+
+    def _heads(self, x: jax.Array) -> jax.Array:
+        return x.reshape(x.shape[0], self.heads, self.width // self.heads)
+
+
+class Transformer(nn.Module):
+    """Layers of `Block` and a final norm."""
+
+    layers: int
+    width: int  # D
+    heads: int
+    dropout: float = 0.0
+    activation: Callable[[jax.Array], jax.Array] = nn.gelu
+
+    def setup(self) -> None:  # noqa: D102
+        self.blocks = [
+            Block(self.width, self.heads, self.dropout, self.activation) for _ in range(self.layers)
+        ]
+        self.norm = nn.LayerNorm()
+
+    def prefix(
+        self, x: jax.Array, mask: jax.Array | None = None, deterministic: bool = True
+    ) -> list[KeysValues]:
+        """Keys and values, per layer, of prefix tokens `[M, D]` that see only each other.
+
+        `mask [M]` is False at prefix tokens that nobody may attend to.
+        """
+        memory = []
+        for block in self.blocks[:-1]:
+            memory.append(block.keys_values(x))
+            x = block(x, memory[-1], mask, deterministic)
+        return [*memory, self.blocks[-1].keys_values(x)]
+
+    def __call__(
+        self,
+        x: jax.Array,
+        queried: jax.Array,
+        prefix: list[KeysValues] | None = None,
+        prefix_mask: jax.Array | None = None,
+        deterministic: bool = True,
+    ) -> jax.Array:
+        """Outputs `[Q, D]` at token indices `queried [Q]` of tokens `x [tokens, D]`.
+
+        Attention is bidirectional over the tokens, and over the prefix where it is given
+        and `prefix_mask [M]` is not False.
+        """
+        mask = None
+        if prefix_mask is not None:
+            mask = jnp.concatenate([prefix_mask, jnp.ones(x.shape[0], bool)])
+        for index, block in enumerate(self.blocks):
+            memory = block.keys_values(x)
+            if prefix is not None:
+                memory = KeysValues(
+                    *(jnp.concatenate(pair) for pair in zip(prefix[index], memory, strict=True))
+                )
+            if index == self.layers - 1:
+                x = x[queried]
+            x = block(x, memory, mask, deterministic)
+        return self.norm(x)

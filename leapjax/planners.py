@@ -1,0 +1,351 @@
+"""Planners: `(energy, params, key, context, config) -> Plan`, pure, for one context.
+
+They know only `Energy`. `compile_planner` turns one into the jitted, batched function
+that plans for any number of contexts at once.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax import schedules
+from leapjax.types import Energy, Params, Plan, PyTree, mask_token
+
+ORDERS = ("random", "sequential")
+
+
+@dataclasses.dataclass(frozen=True)
+class GibbsConfig:
+    """Iterative planning through energy minimisation (paper, algorithm 1)."""
+
+    horizon: int = 5  # T, planned actions
+    iterations: int = 10  # N, passes of the model; the first fills every position
+    resampled: int = 1  # P, positions resampled together in every later iteration
+    order: str = "random"  # which positions: "random", or "sequential" from left to right
+    temperature: float = 0.0  # of the first iteration; 0 takes the most likely action
+    final_temperature: float | None = None  # of the last, linear between; None: the same
+    restarts: int = 1  # R independent plans, of which the one of least energy is kept
+    score: bool = False  # also return the energy of the plan (T more passes)
+    score_trace: bool = False  # also return the energy after every iteration (N * T passes)
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "horizon", "iterations", "resampled", "restarts")
+        if self.resampled > self.horizon:
+            raise ValueError(
+                f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
+            )
+        if self.order not in ORDERS:
+            raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ShootingConfig:
+    """Random shooting (paper, appendix, ablation): the best of random plans."""
+
+    horizon: int = 5  # T
+    candidates: int = 30  # uniform action sequences
+    score: bool = False  # also return the energy of the plan (known anyway)
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "horizon", "candidates")
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossEntropyConfig:
+    """The cross-entropy method as the paper's appendix describes it."""
+
+    horizon: int = 5  # T
+    iterations: int = 10  # N, rounds; the first draws uniform sequences
+    candidates: int = 30  # sequences per round
+    elites: int = 3  # kept as parents of the next round, each child with one token changed
+    keep_elites: bool = True  # elites survive unchanged, so the best energy never rises
+    score: bool = False
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "horizon", "iterations", "candidates", "elites")
+        if self.elites > self.candidates:
+            raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
+
+
+PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig
+
+
+def gibbs(
+    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: GibbsConfig
+) -> Plan:
+    """Gibbs sampling over action tokens (paper, algorithm 1): N passes in all.
+
+    Iteration 1 fills every position from all MASK (or is a uniform plan, for an energy
+    that does not accept MASK); iterations 2 to N mask P positions, read the energy of
+    every action there, and draw actions with probability proportional to
+    `exp(-energy / temperature)`.
+    """
+    memory = energy.encode(params, context)
+    if config.restarts == 1:
+        actions, trace = _gibbs_chain(energy, params, memory, key, config)
+        least = None
+    else:
+        keys = jax.random.split(key, config.restarts)
+        plans, traces = jax.vmap(lambda k: _gibbs_chain(energy, params, memory, k, config))(keys)
+        energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
+        best = jnp.argmin(energies)
+        actions, trace, least = plans[best], traces[best], energies[best]
+    plan = Plan(actions, trace, energy.violation(params, memory, actions) <= 0)
+    if config.score:
+        least = energy.total(params, memory, actions) if least is None else least
+        plan = plan._replace(energy=least)
+    if config.score_trace:
+        scores = jax.vmap(lambda a: energy.total(params, memory, a))(trace)
+        plan = plan._replace(trace_energies=scores)
+    return plan
+
+
+def _gibbs_chain(
+    energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
+) -> tuple[jax.Array, jax.Array]:
+    """One chain: the final actions `[T]` and the actions after every iteration `[N, T]`."""
+    horizon, iterations = config.horizon, config.iterations
+    order_key, noise_key, start_key = jax.random.split(key, 3)
+    last = config.temperature if config.final_temperature is None else config.final_temperature
+    temperatures = schedules.linear_temperatures(config.temperature, last, iterations)
+    positions = _scan_order(order_key, config)  # [N - 1, P]
+    noisy = max(config.temperature, last) > 0
+
+    # All randomness is drawn at once, before the loop: inside it costs more than the draws.
+    def noise(k: jax.Array, *shape: int) -> jax.Array:
+        if noisy:
+            return jax.random.gumbel(k, (*shape, energy.num_actions))
+        return jnp.zeros((*shape, 1))
+
+    if energy.accepts_mask:
+        everywhere = jnp.arange(horizon)
+        blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
+        energies = energy.conditional(params, memory, blank, everywhere)
+        chex.assert_shape(energies, (horizon, energy.num_actions))
+        start = _draw(energies, noise(start_key, horizon), temperatures[0])
+    else:
+        start = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
+
+    def resample(
+        actions: jax.Array, inputs: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        where, gumbel, temperature = inputs
+        energies = energy.conditional(params, memory, actions, where)  # [P, A]
+        actions = actions.at[where].set(_draw(energies, gumbel, temperature))
+        return actions, actions
+
+    inputs = (
+        positions,
+        noise(noise_key, iterations - 1, config.resampled),
+        temperatures[1:],
+    )
+    actions, later = jax.lax.scan(resample, start, inputs)
+    return actions, jnp.concatenate([start[None], later])
+
+
+def _scan_order(key: jax.Array, config: GibbsConfig) -> jax.Array:
+    """The positions of iterations 2 to N: `[N - 1, P]`, distinct within an iteration."""
+    shape = (config.iterations - 1, config.resampled)
+    if config.order == "sequential":
+        return jnp.arange(shape[0] * shape[1]).reshape(shape) % config.horizon
+    if config.resampled == 1:
+        return jax.random.randint(key, shape, 0, config.horizon)
+    scores = jax.random.uniform(key, (shape[0], config.horizon))
+    return jnp.argsort(scores, axis=-1)[:, : config.resampled]
+
+
+def _draw(energies: jax.Array, gumbel: jax.Array, temperature: jax.Array) -> jax.Array:
+    """Actions `[P]` from energies `[P, A]`, by the Gumbel-max trick; least energy at 0.
+
+    Noise times temperature, not energy over temperature: exact at 0, and +inf stays +inf.
+    """
+    return jnp.argmin(energies - temperature * gumbel, axis=-1).astype(jnp.int32)
+
+
+def random_shooting(
+    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
+) -> Plan:
+    """The uniform random plan of least energy (paper, appendix, ablation)."""
+    memory = energy.encode(params, context)
+    plans = jax.random.randint(key, (config.candidates, config.horizon), 0, energy.num_actions)
+    energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
+    best = jnp.argmin(energies)
+    plan = Plan(plans[best], plans[best][None], energy.violation(params, memory, plans[best]) <= 0)
+    return plan._replace(energy=energies[best]) if config.score else plan
+
+
+def cross_entropy_method(
+    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: CrossEntropyConfig
+) -> Plan:
+    """Keep the elites, change one token in each child (paper, appendix, ablation).
+
+    The plan returned is the best of the last round, as in the paper; with `keep_elites`
+    that is also the best ever seen.
+    """
+    memory = energy.encode(params, context)
+    count, horizon = config.candidates, config.horizon
+
+    def score(plans: jax.Array) -> jax.Array:
+        return jax.vmap(lambda a: energy.total(params, memory, a))(plans)
+
+    def breed(
+        carry: tuple[jax.Array, jax.Array], round_key: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        plans, energies = carry
+        parents = plans[jnp.argsort(energies)[: config.elites]]
+        place_key, action_key = jax.random.split(round_key)
+        children = parents[jnp.arange(count) % config.elites]
+        where = jax.random.randint(place_key, (count,), 0, horizon)
+        # A shift by 1 .. A-1 always changes the token.
+        shift = jax.random.randint(action_key, (count,), 1, max(energy.num_actions, 2))
+        rows = jnp.arange(count)
+        changed = (children[rows, where] + shift) % energy.num_actions
+        children = children.at[rows, where].set(changed)
+        if config.keep_elites:
+            children = children.at[: config.elites].set(parents)
+        energies = score(children)
+        return (children, energies), children[jnp.argmin(energies)]
+
+    first_key, loop_key = jax.random.split(key)
+    plans = jax.random.randint(first_key, (count, horizon), 0, energy.num_actions)
+    energies = score(plans)
+    first = plans[jnp.argmin(energies)]
+    keys = jax.random.split(loop_key, config.iterations)[1:]
+    (plans, energies), later = jax.lax.scan(breed, (plans, energies), keys)
+    best = jnp.argmin(energies)
+    plan = Plan(
+        plans[best],
+        jnp.concatenate([first[None], later]),
+        energy.violation(params, memory, plans[best]) <= 0,
+    )
+    return plan._replace(energy=energies[best]) if config.score else plan
+
+
+def planner_for(config: PlannerConfig) -> Callable[..., Plan]:
+    """The planner that a configuration belongs to."""
+    planners: dict[type, Callable[..., Plan]] = {
+        GibbsConfig: gibbs,
+        ShootingConfig: random_shooting,
+        CrossEntropyConfig: cross_entropy_method,
+    }
+    if type(config) not in planners:
+        raise TypeError(f"no planner takes a {type(config).__name__}")
+    return planners[type(config)]
+
+
+class CompiledPlanner:
+    """A jitted planner for batches of any size; made by `compile_planner`."""
+
+    def __init__(self, energy: Energy, config: PlannerConfig, chunk_sizes: Sequence[int]) -> None:
+        self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
+        if not self.chunk_sizes or self.chunk_sizes[0] < 1:
+            raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
+        planner = planner_for(config)
+
+        def plan_chunk(params: Params, keys: jax.Array, contexts: PyTree) -> Plan:
+            return jax.vmap(lambda key, context: planner(energy, params, key, context, config))(
+                keys, contexts
+            )
+
+        self.plan_chunk = jax.jit(plan_chunk)
+
+    def __call__(self, params: Params, keys: jax.Array, contexts: PyTree) -> Plan:
+        """Plans for B contexts.
+
+        Args:
+            params: of the energy.
+            keys: `[B]`, see `plan_keys`.
+            contexts: leaves with a leading `[B]`.
+
+        Returns:
+            A `Plan` whose fields have a leading `[B]`.
+
+        Raises:
+            ValueError: no contexts, or not as many as keys.
+        """
+        batch = keys.shape[0]
+        if batch == 0:
+            raise ValueError("no contexts to plan for")
+        for path, leaf in jax.tree.leaves_with_path(contexts):
+            if np.ndim(leaf) == 0 or leaf.shape[0] != batch:
+                raise ValueError(
+                    f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
+                    f"dimension must be the number of keys, {batch}"
+                )
+        plans = []
+        for start, size, used in split_batch(batch, self.chunk_sizes):
+            # A last chunk that is not full repeats its last row, which is then cut off.
+            rows = np.minimum(np.arange(start, start + size), batch - 1)
+            window = slice(start, start + size) if used == size else rows
+            chunk = self.plan_chunk(
+                params, keys[window], jax.tree.map(lambda leaf, w=window: leaf[w], contexts)
+            )
+            plans.append(jax.tree.map(lambda leaf, n=used: leaf[:n], chunk))
+        if len(plans) == 1:
+            return plans[0]
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
+
+    def sizes_up_to(self, batch: int) -> list[int]:
+        """The chunk sizes that batches of at most so many plans can need."""
+        batches = range(1, min(batch, 2 * self.chunk_sizes[-1]) + 1)
+        return sorted({size for b in batches for _, size, _ in split_batch(b, self.chunk_sizes)})
+
+
+def compile_planner(
+    energy: Energy, config: PlannerConfig, chunk_sizes: Sequence[int] = (1, 8, 64)
+) -> CompiledPlanner:
+    """Builds, once, the planner that serves batches of any size.
+
+    A batch is split into chunks of a few fixed sizes, so that 7, 300 or 10,000 contexts
+    just work: each chunk size compiles at its first use, a chunk fits the cache, only the
+    last chunk is ever padded, and all are dispatched before any is waited for.
+
+    Args:
+        energy: what to minimise.
+        config: of `gibbs`, `random_shooting` or `cross_entropy_method`, and which of them.
+        chunk_sizes: allowed numbers of plans per call of the compiled function.
+    """
+    return CompiledPlanner(energy, config, chunk_sizes)
+
+
+def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Covers a batch with chunks: `(start, size, rows used)`, sizes in ascending order.
+
+    Greedy from the largest. What is left at the end is padded to the next size if it nearly
+    fills it, or if only chunks of the smallest size would be left to do.
+    """
+    chunks: list[tuple[int, int, int]] = []
+    start = 0
+    while start < batch:
+        left = batch - start
+        fitting = [size for size in sizes if size <= left]
+        larger = [size for size in sizes if size > left]
+        size = fitting[-1] if fitting else larger[0]
+        nearly_full = bool(larger) and left > 0.8 * larger[0]
+        one_by_one = bool(larger) and size == sizes[0] and left > 2 * size
+        if nearly_full or one_by_one:
+            size = larger[0]
+        chunks.append((start, size, min(size, left)))
+        start += size
+    return chunks
+
+
+def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> jax.Array:
+    """Keys `[B]` that depend on (seed, episode, replan index) and not on the batch row."""
+    return _plan_keys(jax.random.key(seed), jnp.asarray(episodes), jnp.asarray(replans))
+
+
+@jax.jit
+def _plan_keys(key: jax.Array, episodes: jax.Array, replans: jax.Array) -> jax.Array:
+    fold = jax.vmap(lambda e, r: jax.random.fold_in(jax.random.fold_in(key, e), r))
+    return fold(episodes, replans)
+
+
+def _check_positive(config: PlannerConfig, *names: str) -> None:
+    for name in names:
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")

@@ -1,0 +1,136 @@
+"""Plan, act, replan: many episodes in lockstep, so that hundreds are planned per call."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from leapjax import planners
+from leapjax.envs.adapter import Adapter
+from leapjax.planners import CompiledPlanner
+from leapjax.types import Context, Params, PyTree, pad_token
+
+
+class Episodes(NamedTuple):
+    """What E episodes gave."""
+
+    seeds: np.ndarray  # [E] level seeds
+    successes: np.ndarray  # [E] bool
+    lengths: np.ndarray  # [E] int: environment steps
+    plans: int  # plans made in all
+    planning_seconds: float  # of the planner alone, compilation included
+    seconds: float  # in all
+
+
+class History:
+    """The last K states and actions of one episode, as a planner's context."""
+
+    def __init__(self, observation: PyTree, length: int, num_actions: int) -> None:
+        self.current = observation
+        self.step = 0
+        self._length = length
+        self._past: list[PyTree] = []
+        self._actions: list[int] = []
+        self._blank = jax.tree.map(np.zeros_like, observation)
+        self._pad = pad_token(num_actions)
+
+    def advance(self, action: int, observation: PyTree) -> None:
+        """Records one step."""
+        if self._length:
+            self._past = [*self._past, self.current][-self._length :]
+            self._actions = [*self._actions, action][-self._length :]
+        self.current = observation
+        self.step += 1
+
+    def context(self) -> Context:
+        """As NumPy arrays, padded at the front where the episode is younger than K."""
+        missing = self._length - len(self._past)
+        past = [self._blank] * missing + self._past
+        actions = [self._pad] * missing + self._actions
+        if past:
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *past)
+        else:
+            stacked = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), self._blank)
+        return Context(
+            self.current, stacked, np.array(actions, np.int32), np.array(self.step, np.int32)
+        )
+
+
+def stack_contexts(histories: Sequence[History]) -> Context:
+    """The contexts of B episodes, leaves with a leading `[B]`."""
+    contexts = [history.context() for history in histories]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *contexts)
+
+
+def evaluate(
+    make_adapter: Callable[[], Adapter],
+    seeds: Sequence[int],
+    plan: CompiledPlanner,
+    params: Params,
+    *,
+    context: int,
+    seed: int = 0,
+    executed: int | None = None,
+    iteration: int | None = None,
+    progress: Callable[[int, int], None] = lambda over, succeeded: None,
+) -> Episodes:
+    """Plays one episode per level seed, all in lockstep, replanning when a plan is used up.
+
+    Finished episodes leave the batch. A plan's randomness derives from (seed, level seed,
+    replan index), so an episode plays the same way whatever else is in the batch.
+
+    Args:
+        make_adapter: makes one environment; called once per episode.
+        seeds: level seeds.
+        plan: from `compile_planner`.
+        params: of the energy.
+        context: K.
+        seed: of the planner's randomness.
+        executed: actions to execute before replanning; None for all T.
+        iteration: execute the plan as it stood after this many iterations; None: the last.
+        progress: called with (episodes over, successes) after every round.
+    """
+    begun = time.perf_counter()
+    adapters = [make_adapter() for _ in seeds]
+    end = adapters[0].num_actions - 1
+    histories = [
+        History(adapter.reset(int(s)), context, end + 1)
+        for adapter, s in zip(adapters, seeds, strict=True)
+    ]
+    successes = np.zeros(len(seeds), bool)
+    lengths = np.zeros(len(seeds), int)
+    active = list(range(len(seeds)))
+    planned, planning_seconds, replan = 0, 0.0, 0
+    while active:
+        before = time.perf_counter()
+        episodes = np.array([seeds[i] for i in active], np.uint32)
+        keys = planners.plan_keys(seed, episodes, np.full(len(active), replan, np.uint32))
+        plans = plan(params, keys, stack_contexts([histories[i] for i in active]))
+        chosen = plans.actions if iteration is None else plans.trace[:, iteration - 1]
+        actions = np.asarray(chosen)[:, :executed]  # [B, executed]
+        planning_seconds += time.perf_counter() - before
+        planned += len(active)
+        survivors = []
+        for row, episode in enumerate(active):
+            over = False
+            for action in actions[row]:
+                if action == end:
+                    break
+                transition = adapters[episode].step(int(action))
+                histories[episode].advance(int(action), transition.observation)
+                over = transition.terminated or transition.truncated
+                if over:
+                    successes[episode] = transition.success
+                    break
+            lengths[episode] = histories[episode].step
+            if not over:
+                survivors.append(episode)
+        active = survivors
+        replan += 1
+        progress(len(seeds) - len(active), int(successes.sum()))
+    return Episodes(
+        np.asarray(seeds), successes, lengths, planned, planning_seconds,
+        time.perf_counter() - begun,
+    )  # fmt: skip
