@@ -90,8 +90,8 @@ def picture(
         points = [((x + 0.5) * TILE, (y + 0.5) * TILE) for x, y in way(env, actions)]
         if len(points) > 1:
             pen.line(points, fill=(80, 160, 255), width=4, joint="curve")
-        x, y = points[-1]
-        pen.ellipse([x - 5, y - 5, x + 5, y + 5], fill=(80, 160, 255))
+        last_x, last_y = points[-1]
+        pen.ellipse([last_x - 5, last_y - 5, last_x + 5, last_y + 5], fill=(80, 160, 255))
         text = f"{text}: {' '.join(GLYPHS[int(action)] for action in actions)}"
     pen.text((4, level_image.height + 18), text, fill="black")
     return image

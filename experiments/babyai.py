@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for config in configs:
             for seed in config.seeds:
                 rows.append(run(config, seed, console))
-        console.print(results.table(rows))
+        console.print(results.success_table(rows), results.time_table(rows))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

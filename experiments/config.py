@@ -105,16 +105,22 @@ def parse(arguments: Sequence[str]) -> list[Config]:
         UserError: an unknown level or preset.
     """
     # Level and preset come first, because they decide the defaults of everything else.
-    flags = tyro.cli(Config, args=list(arguments), return_unknown_args=False)
+    flags = _parse(arguments, Config())
     names = list(levels.LEVELS) if flags.level == "all" else [flags.level]
     configs = []
     for name in names:
         default = preset(levels.find_level(name), flags.preset)
-        config = tyro.cli(Config, args=list(arguments), default=default)
-        config = dataclasses.replace(config, level=name)
+        config = dataclasses.replace(_parse(arguments, default), level=name)
         check(config)
         configs.append(config)
     return configs
+
+
+def _parse(arguments: Sequence[str], default: Config) -> Config:
+    try:
+        return tyro.cli(Config, args=list(arguments), default=default)
+    except ValueError as error:  # the dataclasses refuse values that cannot be
+        raise UserError(str(error)) from None
 
 
 def check(config: Config) -> None:

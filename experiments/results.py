@@ -72,13 +72,9 @@ def percent(row: Row) -> str:
     return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
 
 
-def table(rows: Sequence[Row]) -> Table:
-    """The rows beside the paper's numbers."""
-    columns = (
-        "level", "method", "seed", "success [95%]", "length", "paper",
-        "demos s", "compile s", "train s", "eval s", "plans/s",
-    )  # fmt: skip
-    result = Table(*columns)
+def success_table(rows: Sequence[Row]) -> Table:
+    """Success rates beside the paper's."""
+    result = Table("level", "method", "seed", "success [95%]", "length", "paper")
     for row in rows:
         paper = row.get("paper_success")
         result.add_row(
@@ -88,7 +84,15 @@ def table(rows: Sequence[Row]) -> Table:
             percent(row),
             f"{row['mean_length']:.1f}",
             "-" if paper is None else f"{paper:.1f}%",
-            *(f"{row[f'{name}_seconds']:.1f}" for name in ("demos", "compile", "train", "eval")),
-            f"{row['plans_per_second']:.0f}",
         )
+    return result
+
+
+def time_table(rows: Sequence[Row]) -> Table:
+    """Where the time of each run went."""
+    parts = ("demos", "compile", "train", "eval")
+    result = Table("level", "seed", *(f"{part} (s)" for part in parts), "plans/s")
+    for row in rows:
+        seconds = (f"{row[f'{part}_seconds']:.1f}" for part in parts)
+        result.add_row(row["level"], str(row["seed"]), *seconds, f"{row['plans_per_second']:.0f}")
     return result

@@ -133,7 +133,8 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
 
     While a plan still holds MASK outside the position in question the penalty is not
     evaluated: it is a function of complete plans. So the first, all-masked iteration
-    ignores it and every later one obeys it.
+    ignores it and every later one obeys it. A penalty that grows with the number of
+    violations leads the search out of them one by one; +inf only filters.
 
     Args:
         energy: the energy to constrain.
@@ -159,7 +160,10 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
             positions,
             energy.num_actions,
         )
-        return base + extra
+        # Where no action at a position makes the plan allowed, another position has to
+        # change: the constraint then says nothing about this one.
+        hopeless = jnp.all(jnp.isinf(extra), axis=-1, keepdims=True)
+        return base + jnp.where(hopeless, 0.0, extra)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory

@@ -135,7 +135,7 @@ def demonstrate(
     action, reward, over = None, 0.0, False
     try:
         while not over:
-            action = int(bot.replan(action))  # pyright: ignore[reportArgumentType]
+            action = int(bot.replan(action))
             if action == END:  # `done`: the bot believes the mission over, and it is not
                 break
             _, reward, terminated, truncated, _ = env.step(action)

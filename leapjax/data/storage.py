@@ -32,14 +32,17 @@ def dataset_id(level: Level, count: int, seed: int) -> str:
 
 def observation_space(side: int, words: int) -> gym.spaces.Dict:
     """The Minari observation space of an `Observation`."""
-    integers = {"low": -1, "high": max(side, vocabulary.SIZE, 255), "dtype": np.int32}
+
+    def integers(length: int) -> gym.spaces.Box:
+        return gym.spaces.Box(-1, 255, (length,), np.int32)
+
     return gym.spaces.Dict(
         {
             "grid": gym.spaces.Box(0, 255, (side, side, 3), np.uint8),
-            "pose": gym.spaces.Box(shape=(3,), **integers),
-            "carried": gym.spaces.Box(shape=(2,), **integers),
-            "goal": gym.spaces.Box(shape=(2,), **integers),
-            "instruction": gym.spaces.Box(shape=(words,), **integers),
+            "pose": integers(3),
+            "carried": integers(2),
+            "goal": integers(2),
+            "instruction": integers(words),
         }
     )
 

@@ -50,7 +50,7 @@ def nearest_goal(env: RoomGridLevel) -> Cell:
     `NO_GOAL` for instructions with several targets, and where every match is out of the
     grid (a key in a closed box).
     """
-    instruction = env.instrs  # pyright: ignore[reportAttributeAccessIssue]
+    instruction = env.instrs  # type: ignore[attr-defined]
     if not isinstance(instruction, GoToInstr | OpenInstr | PickupInstr):
         return NO_GOAL
     matches = [(int(x), int(y)) for x, y in instruction.desc.obj_poss]

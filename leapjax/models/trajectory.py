@@ -212,7 +212,9 @@ def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float3
 
 def build(config: ModelConfig, sizes: Sizes) -> PaperModel | LeapModel:
     """The module that a configuration describes."""
-    return {"paper": PaperModel, "leapjax": LeapModel}[config.architecture](config, sizes)
+    if config.architecture == "paper":
+        return PaperModel(config, sizes)
+    return LeapModel(config, sizes)
 
 
 def blank_context(sizes: Sizes, instruction_length: int) -> Context:

@@ -1,0 +1,28 @@
+# `make babyai` and `make test` need only Python 3.11 or newer and make: they set up .venv
+# once and reuse it.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/ready
+
+.PHONY: babyai test lint clean
+
+# The main job: train LEAP on a BabyAI level and report its success beside the paper's.
+# More options: make babyai ARGS="--level all".
+babyai: $(READY)
+	$(BIN)/python -m experiments.babyai $(ARGS)
+
+test: $(READY)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $(READY)
+
+clean:
+	rm -rf .venv

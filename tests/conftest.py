@@ -1,0 +1,26 @@
+"""What several tests share."""
+
+import jax
+import pytest
+
+from leapjax.data import demonstrations
+from leapjax.data.demonstrations import Demonstration
+from leapjax.envs import levels
+
+
+@pytest.fixture(autouse=True)
+def minari_folder(tmp_path, monkeypatch):
+    """Every test has an empty Minari folder of its own: none can touch the user's."""
+    folder = tmp_path / "minari"
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def local_demonstrations() -> list[Demonstration]:
+    """Five demonstrations of GoToLocalS7N5; not to be changed."""
+    level = levels.find_level("GoToLocalS7N5")
+    collected = demonstrations.collect(level, 5, seed=0).demonstrations
+    for leaf in jax.tree.leaves([(d.observations, d.actions) for d in collected]):
+        leaf.setflags(write=False)
+    return collected

@@ -1,0 +1,121 @@
+"""A joint distribution over all A^T plans that is small enough to enumerate: the truth.
+
+`enumerable_energy` is an `Energy` whose conditionals are the exact conditionals of the
+joint and whose total is its exact negative logarithm. The same numbers, in plain NumPy
+and by counting over all plans, are `joint_probabilities` and `conditional_by_counting`.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from leapjax.types import Energy, mask_token
+
+
+def enumerable_energy(horizon: int, num_actions: int) -> Energy:
+    """Params: log weights `[A] * T`. Context: a tilt `[T, A]` added to the log weights.
+
+    The conditional marginalises over positions that hold MASK; the total of a plan that
+    holds MASK is infinite.
+    """
+    mask = mask_token(num_actions)
+
+    def encode(params, context):
+        weights = params
+        for t in range(horizon):
+            weights = weights + _along_axis(context[t], t, horizon)
+        return weights - jax.nn.logsumexp(weights)
+
+    def conditional(params, memory, actions, positions):
+        tokens = actions.at[positions].set(mask)
+        known = memory
+        for t in range(horizon):
+            possible = (tokens[t] == mask) | (jnp.arange(num_actions) == tokens[t])
+            known = known + _along_axis(jnp.where(possible, 0.0, -jnp.inf), t, horizon)
+        marginals = [
+            jax.nn.logsumexp(known, axis=tuple(s for s in range(horizon) if s != t))
+            for t in range(horizon)
+        ]
+        return -jax.nn.log_softmax(jnp.stack(marginals), axis=-1)[positions]
+
+    def total(params, memory, actions):
+        complete = jnp.all(actions < num_actions)
+        return jnp.where(complete, -memory[tuple(actions)], jnp.inf)
+
+    return Energy(encode, conditional, total, num_actions)
+
+
+def _along_axis(values, axis: int, axes: int):
+    shape = [1] * axes
+    shape[axis] = -1
+    return values.reshape(shape)
+
+
+def random_table(seed: int, horizon: int, num_actions: int, scale: float = 1.5) -> np.ndarray:
+    """Log weights `[A] * T` of a joint whose actions depend on each other."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(scale=scale, size=(num_actions,) * horizon).astype(np.float32)
+
+
+def no_tilt(horizon: int, num_actions: int) -> np.ndarray:
+    return np.zeros((horizon, num_actions), np.float32)
+
+
+def all_plans(horizon: int, num_actions: int) -> np.ndarray:
+    """Every plan `[A^T, T]`, in the order of the flattened joint."""
+    return np.array(list(itertools.product(range(num_actions), repeat=horizon)), np.int32)
+
+
+def joint_probabilities(table: np.ndarray, tilt: np.ndarray | None = None) -> np.ndarray:
+    """The joint `[A] * T`, in float64."""
+    weights = np.asarray(table, np.float64)
+    if tilt is not None:
+        weights = weights.copy()
+        for plan in np.ndindex(*weights.shape):
+            weights[plan] += sum(float(tilt[t, a]) for t, a in enumerate(plan))
+    weights = np.exp(weights - weights.max())
+    return weights / weights.sum()
+
+
+def conditional_by_counting(joint: np.ndarray, tokens: np.ndarray, position: int) -> np.ndarray:
+    """p(action at position | the tokens elsewhere that are not MASK) `[A]`."""
+    num_actions = joint.shape[0]
+    result = np.zeros(num_actions)
+    for plan in np.ndindex(*joint.shape):
+        agrees = all(
+            t == position or tokens[t] == num_actions or tokens[t] == a for t, a in enumerate(plan)
+        )
+        if agrees:
+            result[plan[position]] += joint[plan]
+    return result / result.sum()
+
+
+def plan_counts(plans: np.ndarray, num_actions: int) -> np.ndarray:
+    """How often each plan occurs `[A^T]`, in the order of the flattened joint."""
+    plans = np.asarray(plans)
+    horizon = plans.shape[-1]
+    index = plans @ (num_actions ** np.arange(horizon - 1, -1, -1))
+    return np.bincount(index, minlength=num_actions**horizon)
+
+
+def fit_p_value(counts: np.ndarray, probabilities: np.ndarray) -> float:
+    """How well counts fit a distribution: chi-square, rare outcomes pooled."""
+    counts = np.asarray(counts, np.float64).reshape(-1)
+    expected = np.asarray(probabilities, np.float64).reshape(-1) * counts.sum()
+    if np.any(counts[expected == 0] > 0):
+        return 0.0
+    order = np.argsort(expected)
+    counts, expected = counts[order], expected[order]
+    # The classical rule: at least five expected in every class.
+    enough = np.searchsorted(np.cumsum(expected), 5.0) + 1
+    counts = np.append(counts[:enough].sum(), counts[enough:])
+    expected = np.append(expected[:enough].sum(), expected[enough:])
+    return float(stats.chisquare(counts, expected).pvalue)
+
+
+def total_variation(counts: np.ndarray, probabilities: np.ndarray) -> float:
+    counts = np.asarray(counts, np.float64).reshape(-1)
+    return 0.5 * float(np.abs(counts / counts.sum() - np.asarray(probabilities).reshape(-1)).sum())

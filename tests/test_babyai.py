@@ -1,0 +1,249 @@
+"""The real `main`, end to end at toy size, and what it says to wrong input."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import babyai, results
+from leapjax import UserError, load, plan_keys, rollouts
+from leapjax.data import storage
+from leapjax.envs.adapter import BabyAIAdapter
+from leapjax.envs.levels import LEVELS
+
+LEVEL = "GoToLocalS7N5"
+TOY = [
+    "--demos",
+    "6",
+    "--episodes",
+    "5",
+    "--steps",
+    "4",
+    "--batch",
+    "4",
+    "--width",
+    "16",
+    "--heads",
+    "2",
+    "--layers",
+    "1",
+    "--channels",
+    "4",
+    "--rounds",
+    "1",
+    "--fields",
+    "2",
+    "--sweeps",
+    "2",
+    "--iterations",
+    "3",
+]
+FIELDS = [
+    "experiment",
+    "level",
+    "method",
+    "preset",
+    "seed",
+    "demos",
+    "episodes",
+    "successes",
+    "mean_length",
+    "horizon",
+    "iterations",
+    "executed",
+    "train_steps",
+    "train_seconds",
+    "eval_seconds",
+    "plans_per_second",
+    "params",
+    "versions",
+    "date",
+    "hash",
+]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """An empty folder with its own Minari data sets, where one toy run has finished."""
+    folder = tmp_path_factory.mktemp("workplace")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("MINARI_DATASETS_PATH", str(folder / "datasets"))
+        patch.setenv("LEAPJAX_COMPILATION_CACHE", str(folder / "cache"))
+        assert babyai.main(TOY) == 0
+        yield folder
+
+
+def run_folder(workplace):
+    (folder,) = (p for p in (workplace / "runs").iterdir() if p.is_dir() and "leapjax" in p.name)
+    return folder
+
+
+def test_a_run_leaves_a_row_with_every_field(workplace):
+    (row,) = results.read(workplace / "runs" / "babyai.jsonl")
+    assert set(FIELDS) <= row.keys()
+    assert row["level"] == LEVEL and row["preset"] == "leapjax" and row["demos"] == 6
+    assert row["episodes"] == 5 and 0 <= row["successes"] <= 5
+    assert row["iterations"] == 3 and row["horizon"] == 5 and row["train_steps"] == 4
+    assert row["configuration"]["training"]["batch"] == 4
+    assert not (workplace / "results").exists()
+
+
+def test_a_run_leaves_pictures_metrics_and_a_checkpoint(workplace):
+    folder = run_folder(workplace)
+    for name in ("loss.png", "iterations.png"):
+        assert Image.open(folder / name).size[0] > 300
+    assert getattr(Image.open(folder / "plan.gif"), "n_frames", 1) > 3
+    metrics = babyai.read_metrics(folder)
+    assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
+
+
+def test_the_checkpoint_evaluates_again_without_training(workplace, capsys):
+    (before,) = results.read(workplace / "runs" / "babyai.jsonl")
+    arguments = ["--checkpoint", str(run_folder(workplace)), "--runs", "again", "--no-pictures"]
+    assert babyai.main([*TOY, *arguments]) == 0
+    (after,) = results.read(workplace / "again" / "babyai.jsonl")
+    assert after["train_steps"] == 0 and after["train_seconds"] == 0
+    assert (after["successes"], after["mean_length"]) == (
+        before["successes"],
+        before["mean_length"],
+    )
+
+
+def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
+    assert babyai.main([*TOY, "--no-pictures"]) == 0
+    assert "continuing at step 4 of 4" in capsys.readouterr().out
+    assert len(results.read(workplace / "runs" / "babyai.jsonl")) == 1
+
+
+def test_a_loaded_planner_plans(workplace):
+    planner = load(run_folder(workplace))
+    adapter = BabyAIAdapter(LEVELS[LEVEL])
+    histories = [rollouts.History(adapter.reset(s), 0, adapter.num_actions) for s in range(3)]
+    plan = planner(plan_keys(0, np.arange(3), np.zeros(3)), rollouts.stack_contexts(histories))
+    actions = np.asarray(plan.actions)
+    assert actions.shape == (3, 5) and plan.trace.shape == (3, 3, 5)
+    assert actions.min() >= 0 and actions.max() < 7
+    assert (actions[:, 0] != 6).all()  # end is never first
+
+
+def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
+    arguments = [*TOY, "--record", "--no-pictures"]
+    assert babyai.main(arguments) == 0
+    path = workplace / "results" / "babyai.jsonl"
+    first = path.read_text()
+    assert babyai.main(arguments) == 0
+    assert "recorded already" in capsys.readouterr().out
+    assert path.read_text() == first
+    assert babyai.main([*arguments, "--force"]) == 0
+    assert len(results.read(path)) == 1
+    shutil.rmtree(workplace / "results")
+
+
+def test_the_paper_preset_and_a_level_with_context_run(workplace):
+    arguments = ["--preset", "paper", "--level", "GoToSeqS5R2", "--context", "2"]
+    assert babyai.main([*TOY, *arguments, "--no-pictures", "--runs", "paper"]) == 0
+    (row,) = results.read(workplace / "paper" / "babyai.jsonl")
+    assert row["preset"] == "paper" and row["level"] == "GoToSeqS5R2"
+    assert row["configuration"]["context"] == 2
+
+
+def test_a_level_by_its_id_that_is_not_square(workplace):
+    arguments = ["--level", "BabyAI-PutNextS4N1-v0", "--no-pictures", "--runs", "id"]
+    assert babyai.main([*TOY, *arguments]) == 0
+    (row,) = results.read(workplace / "id" / "babyai.jsonl")
+    assert row["level"] == "BabyAI-PutNextS4N1-v0" and row["paper_success"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
+        (["--preset", "papr"], "unknown preset 'papr'"),
+        (["--demos", "0"], "--demos must be at least 1"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--horizon", "50", "--resampled", "1"], "longer than an episode"),
+        (["--horizon", "0"], "horizon must be at least 1"),
+        (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
+        (["--masking", "some"], "unknown masking 'some'"),
+        (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
+        (["--seeds", "-1"], "a training seed must be in"),
+        (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
+        (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):
+    assert babyai.main([*TOY, *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1 and error.startswith("error: ")
+
+
+def test_a_checkpoint_of_another_level_or_shape_is_refused(workplace, capsys):
+    checkpoint = ["--checkpoint", str(run_folder(workplace))]
+    assert babyai.main([*TOY, *checkpoint, "--level", "GoToLocalS8N7"]) == 2
+    assert "level is GoToLocalS7N5, not GoToLocalS8N7" in capsys.readouterr().err
+    assert babyai.main([*TOY, *checkpoint, "--horizon", "4"]) == 2
+    assert "horizon is 5, not 4" in capsys.readouterr().err
+
+
+def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(run_folder(workplace), copy)
+    specification = json.loads((copy / "specification.json").read_text())
+    specification["model"]["width"] = 32
+    (copy / "specification.json").write_text(json.dumps(specification))
+    with pytest.raises(UserError, match="does not fit its configuration"):
+        load(copy)
+    (copy / "specification.json").write_text("{")
+    with pytest.raises(UserError, match="not valid JSON"):
+        load(copy)
+
+
+def test_a_data_set_of_the_users_own_is_trained_on(workplace):
+    mine = storage.dataset_id(LEVELS[LEVEL], 6, 0)
+    arguments = ["--demonstrations", mine, "--runs", "mine", "--no-pictures"]
+    assert babyai.main([*TOY, *arguments]) == 0
+    (row,) = results.read(workplace / "mine" / "babyai.jsonl")
+    (original,) = results.read(workplace / "runs" / "babyai.jsonl")
+    assert row["successes"] == original["successes"]
+
+
+def test_too_few_demonstrations_in_a_data_set(workplace, capsys):
+    mine = storage.dataset_id(LEVELS[LEVEL], 6, 0)
+    assert babyai.main([*TOY, "--demonstrations", mine, "--demos", "7"]) == 2
+    assert "fewer than --demos 7" in capsys.readouterr().err
+
+
+def test_evaluation_does_not_depend_on_the_batch(workplace):
+    planner = load(run_folder(workplace))
+    level = LEVELS[LEVEL]
+
+    def play(seeds):
+        return rollouts.evaluate(
+            lambda: BabyAIAdapter(level), seeds, planner.plan, planner.params, context=0
+        )
+
+    together, alone = play(range(9)), play([4])
+    assert together.lengths[4] == alone.lengths[0]
+    assert together.successes[4] == alone.successes[0]
+
+
+def test_rows_refuse_damage_by_line_number(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    row = dict.fromkeys(results.REQUIRED, 1)
+    path.write_text(json.dumps(row) + "\n{oops\n")
+    with pytest.raises(UserError, match="line 2: not JSON"):
+        results.read(path)
+    path.write_text("[]\n")
+    with pytest.raises(UserError, match="line 1: a row without"):
+        results.read(path)
+
+
+def test_parameters_are_plain_arrays(workplace):
+    assert all(
+        isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(load(run_folder(workplace)).params)
+    )

@@ -1,0 +1,396 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.energy import compose, constrain, from_total, pseudo_likelihood, view
+from leapjax.types import Energy, mask_token, pad_token
+from tests.enumerable import (
+    all_plans,
+    conditional_by_counting,
+    enumerable_energy,
+    joint_probabilities,
+    no_tilt,
+    random_table,
+)
+
+HORIZON, ACTIONS = 3, 3
+MASK = mask_token(ACTIONS)
+EVERYWHERE = np.arange(HORIZON)
+PLANS = all_plans(HORIZON, ACTIONS)
+NO_TILT = no_tilt(HORIZON, ACTIONS)
+
+
+def conditionals(energy, params, context, plans=PLANS):
+    """The energies `[plans, T, A]` of every action, one position at a time."""
+
+    @jax.jit
+    def evaluate(params, context, plans):
+        memory = energy.encode(params, context)
+
+        def at(plan, position):
+            return energy.conditional(params, memory, plan, position[None])[0]
+
+        return jax.vmap(jax.vmap(at, (None, 0)), (0, None))(plans, jnp.arange(plans.shape[1]))
+
+    return np.asarray(evaluate(params, context, jnp.asarray(plans)))
+
+
+def totals(energy, params, context, plans=PLANS):
+    @jax.jit
+    def evaluate(params, context, plans):
+        memory = energy.encode(params, context)
+        return jax.vmap(lambda plan: energy.total(params, memory, plan))(plans)
+
+    return np.asarray(evaluate(params, context, jnp.asarray(plans)))
+
+
+def violations(energy, params, context, plans=PLANS):
+    memory = energy.encode(params, context)
+    return np.asarray(
+        jax.vmap(lambda plan: energy.violation(params, memory, plan))(jnp.asarray(plans))
+    )
+
+
+def probabilities(energies):
+    """What a sampler at temperature 1 makes of energies, in float64."""
+    weights = np.exp(-(energies - energies.min(-1, keepdims=True)).astype(np.float64))
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def exact_conditionals(joint, plans=PLANS):
+    return np.array(
+        [[conditional_by_counting(joint, plan, t) for t in range(HORIZON)] for plan in plans]
+    )
+
+
+ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
+TABLE, OTHER_TABLE = random_table(0, HORIZON, ACTIONS), random_table(1, HORIZON, ACTIONS)
+
+
+# The helper that the other tests take for the truth.
+
+
+def test_enumerable_energy_is_the_joint():
+    tilt = np.random.default_rng(5).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
+    joint = joint_probabilities(TABLE, tilt)
+    np.testing.assert_allclose(
+        totals(ENUMERABLE, TABLE, tilt), -np.log(joint.reshape(-1)), rtol=1e-5, atol=1e-5
+    )
+    masked = np.array([[MASK, MASK, MASK], [2, MASK, 0], [MASK, 1, MASK], [0, 2, MASK]], np.int32)
+    plans = np.concatenate([PLANS[::5], masked])
+    np.testing.assert_allclose(
+        probabilities(conditionals(ENUMERABLE, TABLE, tilt, plans)),
+        exact_conditionals(joint, plans),
+        atol=1e-5,
+    )
+    assert np.isposinf(totals(ENUMERABLE, TABLE, tilt, masked)).all()
+
+
+def test_enumerable_energy_masks_all_positions_together():
+    joint = joint_probabilities(TABLE)
+    plan, positions = jnp.array([0, 2, 1]), jnp.array([2, 0])
+    memory = ENUMERABLE.encode(TABLE, NO_TILT)
+    energies = ENUMERABLE.conditional(TABLE, memory, plan, positions)
+    masked = np.array([MASK, 2, MASK])
+    expected = [conditional_by_counting(joint, masked, t) for t in (2, 0)]
+    np.testing.assert_allclose(probabilities(np.asarray(energies)), expected, atol=1e-5)
+
+
+# The pseudo-likelihood of a masked language model.
+
+
+def pairwise_logits(params, memory, tokens, positions):
+    """Every token votes for the action at every other position: `params [T, T, A + 2, A]`."""
+    votes = params[positions[:, None], jnp.arange(HORIZON), tokens] + memory
+    return votes.sum(1)
+
+
+PAIRWISE = pseudo_likelihood(lambda params, context: context["bias"], pairwise_logits, ACTIONS)
+VOTES = np.random.default_rng(2).normal(size=(HORIZON, HORIZON, ACTIONS + 2, ACTIONS))
+VOTES = VOTES.astype(np.float32)
+BIAS = {"bias": np.random.default_rng(3).normal(size=ACTIONS).astype(np.float32)}
+
+
+def pairwise_log_likelihood(tokens, position):
+    logits = sum(VOTES[position, t, tokens[t]] + BIAS["bias"] for t in range(HORIZON))
+    logits = logits.astype(np.float64)
+    return logits - np.log(np.exp(logits).sum())
+
+
+def test_pseudo_likelihood_total_is_a_loop_over_positions():
+    expected = []
+    for plan in PLANS:
+        energy = 0.0
+        for t in range(HORIZON):
+            masked = plan.copy()
+            masked[t] = MASK
+            energy -= pairwise_log_likelihood(masked, t)[plan[t]]
+        expected.append(energy)
+    np.testing.assert_allclose(totals(PAIRWISE, VOTES, BIAS), expected, rtol=1e-5)
+
+
+def test_pseudo_likelihood_conditional_masks_all_positions_together():
+    plan, positions = np.array([1, 0, 2], np.int32), np.array([2, 1])
+    masked = np.array([1, MASK, MASK])
+    energies = PAIRWISE.conditional(VOTES, BIAS["bias"], jnp.asarray(plan), jnp.asarray(positions))
+    expected = [-pairwise_log_likelihood(masked, t) for t in positions]
+    np.testing.assert_allclose(energies, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("energy", [PAIRWISE, from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)])
+def test_incomplete_plan_has_infinite_total(energy):
+    incomplete = [[t if s != t else token for s in range(3)] for t in range(3) for token in (3, 4)]
+    incomplete += [[MASK] * 3, [pad_token(ACTIONS)] * 3, [0, -1, 0]]
+    assert np.isposinf(totals(energy, VOTES, BIAS, np.array(incomplete, np.int32))).all()
+    assert np.isfinite(totals(energy, VOTES, BIAS)).all()
+
+
+def test_forbidden_action_is_infinite_and_not_nan():
+    def logits(params, memory, tokens, positions):
+        forbidden = (positions[:, None] == 1) & (jnp.arange(ACTIONS) == 2)
+        return jnp.where(forbidden, -jnp.inf, pairwise_logits(params, memory, tokens, positions))
+
+    energy = pseudo_likelihood(PAIRWISE.encode, logits, ACTIONS)
+    forbidden = PLANS[:, 1] == 2
+    actual = totals(energy, VOTES, BIAS)
+    assert np.isposinf(actual[forbidden]).all()
+    assert np.isfinite(actual[~forbidden]).all()
+    table = conditionals(energy, VOTES, BIAS)
+    assert np.isposinf(table[:, 1, 2]).all()
+    assert np.isfinite(np.delete(table.reshape(-1, 9), 5, axis=1)).all()
+    # What is left is still a distribution.
+    np.testing.assert_allclose(np.exp(-table).sum(-1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("num_actions", [0, -1])
+def test_energy_without_actions_is_refused(num_actions):
+    for make in (pseudo_likelihood, from_total):
+        with pytest.raises(ValueError, match="at least one action"):
+            make(lambda p, c: c, lambda *_: jnp.zeros(()), num_actions)
+
+
+# An energy from its total alone.
+
+
+ADDITIVE = np.random.default_rng(4).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
+
+
+def additive_total(params, memory, actions):
+    return sum(params[t, actions[t]] for t in range(HORIZON)) + memory
+
+
+def test_conditional_of_an_additive_energy_is_its_own_table():
+    energy = from_total(lambda params, context: context, additive_total, ACTIONS)
+    assert not energy.accepts_mask
+    actual = conditionals(energy, ADDITIVE, jnp.float32(7.0))
+    expected = np.broadcast_to(ADDITIVE, actual.shape)
+    np.testing.assert_allclose(
+        actual - actual[..., :1], expected - expected[..., :1], rtol=1e-4, atol=1e-5
+    )
+
+
+def test_conditional_from_the_exact_total_is_exact():
+    energy = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
+    expected = exact_conditionals(joint_probabilities(TABLE))
+    actual = probabilities(conditionals(energy, TABLE, NO_TILT))
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+# Sums of energies.
+
+
+@pytest.mark.parametrize("weights", [None, (1.0, 1.0), (0.5, 2.0), (3.0, 0.0), (0.0, 1.0)])
+def test_composition_is_the_weighted_product_of_the_joints(weights):
+    first, second = weights or (1.0, 1.0)
+    composed = compose([ENUMERABLE, ENUMERABLE], weights)
+    params, context = (TABLE, OTHER_TABLE), NO_TILT
+    logs = [np.log(joint_probabilities(table)) for table in params]
+    summed = first * logs[0] + second * logs[1]
+    np.testing.assert_allclose(
+        totals(composed, params, context), -summed.reshape(-1), rtol=1e-5, atol=1e-4
+    )
+    product = np.exp(summed) / np.exp(summed).sum()
+    np.testing.assert_allclose(
+        probabilities(conditionals(composed, params, context)),
+        exact_conditionals(product),
+        atol=1e-5,
+    )
+
+
+def test_a_single_weight_is_an_inverse_temperature():
+    composed = compose([ENUMERABLE], [3.0])
+    sharper = joint_probabilities(3 * np.asarray(TABLE, np.float64))
+    actual = probabilities(conditionals(composed, (TABLE,), NO_TILT))
+    np.testing.assert_allclose(actual, exact_conditionals(sharper), atol=1e-5)
+
+
+ZERO = Energy(
+    lambda params, context: None,
+    lambda params, memory, actions, positions: jnp.zeros((positions.shape[0], ACTIONS)),
+    lambda params, memory, actions: jnp.zeros(()),
+    ACTIONS,
+)
+# Broken on purpose: whoever multiplies it by 0 instead of leaving it out gets NaN.
+INFINITE = Energy(
+    lambda params, context: None,
+    lambda params, memory, actions, positions: jnp.full((positions.shape[0], ACTIONS), jnp.inf),
+    lambda params, memory, actions: jnp.float32(jnp.inf),
+    ACTIONS,
+    accepts_mask=False,
+    violation=lambda params, memory, actions: jnp.ones(()),
+)
+
+
+@pytest.mark.parametrize(
+    ("other", "weights"), [(ZERO, None), (ZERO, (1.0, 5.0)), (ENUMERABLE, (1.0, 0.0)),
+                           (INFINITE, (1.0, 0.0))],
+)  # fmt: skip
+def test_composing_with_nothing_changes_nothing(other, weights):
+    composed = compose([ENUMERABLE, other], weights)
+    params = (TABLE, OTHER_TABLE)
+    np.testing.assert_array_equal(
+        conditionals(composed, params, NO_TILT), conditionals(ENUMERABLE, TABLE, NO_TILT)
+    )
+    np.testing.assert_array_equal(
+        totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
+    )
+    assert (violations(composed, params, NO_TILT) == 0).all()
+    assert composed.accepts_mask
+    assert composed.num_actions == ACTIONS
+
+
+def test_composition_accepts_mask_only_if_all_its_parts_do():
+    plain = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
+    assert compose([ENUMERABLE, ENUMERABLE]).accepts_mask
+    assert not compose([ENUMERABLE, plain]).accepts_mask
+
+
+def test_composition_keeps_constraints():
+    constrained = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
+    both = compose([ENUMERABLE, constrained], [1.0, 0.5])
+    violated = violations(both, (TABLE, OTHER_TABLE), NO_TILT) > 0
+    np.testing.assert_array_equal(violated, PLANS[:, 0] == 1)
+
+
+def test_compose_refuses_different_action_sets():
+    with pytest.raises(ValueError, match=r"one action set, got sizes \[3, 4\]"):
+        compose([ENUMERABLE, enumerable_energy(HORIZON, 4)])
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("inf"), float("nan")])
+def test_compose_refuses_impossible_weights(weight):
+    with pytest.raises(ValueError, match="finite and at least 0"):
+        compose([ENUMERABLE, ENUMERABLE], [1.0, weight])
+
+
+@pytest.mark.parametrize("weights", [[], [1.0], [1.0, 1.0, 1.0]])
+def test_compose_refuses_a_wrong_number_of_weights(weights):
+    with pytest.raises(ValueError, match="2 energies need as many weights"):
+        compose([ENUMERABLE, ENUMERABLE], weights)
+
+
+@pytest.mark.parametrize("weights", [None, []])
+def test_compose_refuses_no_energies(weights):
+    with pytest.raises(ValueError, match="at least one energy"):
+        compose([], weights)
+
+
+# Constraints and views.
+
+
+def repeats(context, actions):
+    """A penalty of the whole plan: `context["price"]` for each repeated action."""
+    count = jnp.sum(actions[1:] == actions[:-1])
+    return jnp.where(count > 0, context["price"] * jnp.maximum(count, 1), 0.0)
+
+
+def repeats_of(plan):
+    return sum(a == b for a, b in zip(plan[1:], plan[:-1], strict=True))
+
+
+CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), repeats)
+
+
+@pytest.mark.parametrize("price", [2.5, np.inf])
+def test_constraint_adds_the_penalty_of_the_changed_plan(price):
+    context = {"tilt": NO_TILT, "price": np.float32(price)}
+    # The truth: the penalty of each plan with each action at each position, by a loop.
+    added = np.zeros((len(PLANS), HORIZON, ACTIONS))
+    for row, plan in enumerate(PLANS):
+        for t in range(HORIZON):
+            for action in range(ACTIONS):
+                changed = plan.copy()
+                changed[t] = action
+                count = repeats_of(changed)
+                added[row, t, action] = count * price if count else 0
+    np.testing.assert_allclose(
+        conditionals(CONSTRAINED, TABLE, context),
+        conditionals(ENUMERABLE, TABLE, NO_TILT) + added,
+        rtol=1e-5,
+        atol=1e-5,
+    )
+    penalties = np.array([repeats_of(p) * price if repeats_of(p) else 0 for p in PLANS])
+    np.testing.assert_allclose(
+        totals(CONSTRAINED, TABLE, context), totals(ENUMERABLE, TABLE, NO_TILT) + penalties,
+        rtol=1e-5,
+    )  # fmt: skip
+    np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
+
+
+def test_constraint_waits_for_a_complete_plan():
+    context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
+    plans = np.array([[MASK, MASK, MASK], [0, 0, MASK], [0, MASK, MASK]], np.int32)
+    constrained = conditionals(CONSTRAINED, TABLE, context, plans)
+    free = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
+    np.testing.assert_array_equal(constrained[0], free[0])
+    np.testing.assert_array_equal(constrained[2], free[2])
+    # In the second plan only the last position completes it, and it repeats already.
+    np.testing.assert_array_equal(constrained[1, :2], free[1, :2])
+    assert np.isposinf(constrained[1, 2]).all()
+
+
+def test_constraints_add_up():
+    twice = constrain(CONSTRAINED, lambda context, actions: 1.0 * (actions[0] == 2))
+    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
+    expected = np.array([repeats_of(plan) + (plan[0] == 2) for plan in PLANS])
+    np.testing.assert_allclose(violations(twice, TABLE, context), expected)
+    np.testing.assert_allclose(
+        totals(twice, TABLE, context), totals(ENUMERABLE, TABLE, NO_TILT) + expected, rtol=1e-5
+    )
+
+
+def test_view_hides_the_rest_of_the_context():
+    seen = np.random.default_rng(8).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
+
+    def first_half(context):
+        return jnp.where(jnp.arange(HORIZON)[:, None] < 2, context, 0.0)
+
+    energy = view(ENUMERABLE, first_half)
+    cut = seen.copy()
+    cut[2] = 0
+    expected = exact_conditionals(joint_probabilities(TABLE, cut))
+    np.testing.assert_allclose(
+        probabilities(conditionals(energy, TABLE, seen)), expected, atol=1e-5
+    )
+    hidden, visible = seen.copy(), seen.copy()
+    hidden[2] += 3.0
+    visible[1, 0] += 3.0
+    before = totals(energy, TABLE, seen)
+    np.testing.assert_array_equal(totals(energy, TABLE, hidden), before)
+    assert np.abs(totals(energy, TABLE, visible) - before).max() > 0.1
+
+
+def test_two_views_make_the_product_of_what_each_sees():
+    context = {
+        "left": np.random.default_rng(9).normal(size=(HORIZON, ACTIONS)).astype(np.float32),
+        "right": np.random.default_rng(10).normal(size=(HORIZON, ACTIONS)).astype(np.float32),
+    }
+    halves = compose(
+        [view(ENUMERABLE, lambda c: c["left"]), view(ENUMERABLE, lambda c: c["right"])]
+    )
+    product = joint_probabilities(TABLE, context["left"]) * joint_probabilities(
+        OTHER_TABLE, context["right"]
+    )
+    actual = probabilities(conditionals(halves, (TABLE, OTHER_TABLE), context))
+    np.testing.assert_allclose(actual, exact_conditionals(product / product.sum()), atol=1e-5)

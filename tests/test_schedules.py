@@ -1,0 +1,87 @@
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leapjax.schedules import MASKINGS, linear_temperatures, sample_masks
+from tests.enumerable import fit_p_value
+
+HORIZON = 4
+DRAWS = 4000
+
+
+@pytest.fixture(scope="module")
+def masks():
+    """Many draws `[DRAWS, copies, T]` of every way of masking."""
+    keys = jax.random.split(jax.random.key(0), DRAWS)
+    return {
+        masking: np.asarray(jax.vmap(lambda k, m=masking: sample_masks(k, HORIZON, m))(keys))
+        for masking in MASKINGS
+    }
+
+
+def test_one_masks_exactly_one_uniformly(masks):
+    one = masks["one"]
+    assert one.shape == (DRAWS, 1, HORIZON)
+    assert one.dtype == bool
+    assert (one.sum(-1) == 1).all()
+    assert fit_p_value(one[:, 0].sum(0), np.full(HORIZON, 1 / HORIZON)) > 1e-3
+
+
+def test_each_masks_every_position_in_turn(masks):
+    assert masks["each"].dtype == bool
+    np.testing.assert_array_equal(masks["each"], np.broadcast_to(np.eye(HORIZON), (DRAWS, 4, 4)))
+
+
+def test_random_draws_a_uniform_count(masks):
+    random = masks["random"]
+    assert random.shape == (DRAWS, 1, HORIZON)
+    counts = np.bincount(random.sum(-1)[:, 0], minlength=HORIZON + 1)
+    assert counts[0] == 0
+    assert fit_p_value(counts[1:], np.full(HORIZON, 1 / HORIZON)) > 1e-3
+
+
+def test_random_draws_uniform_positions_given_the_count(masks):
+    random = masks["random"][:, 0]
+    pairs = random[random.sum(-1) == 2]
+    index = pairs @ (2 ** np.arange(HORIZON))
+    counts = np.bincount(index, minlength=2**HORIZON)
+    possible = np.array([bin(i).count("1") == 2 for i in range(2**HORIZON)])
+    assert fit_p_value(counts, possible / possible.sum()) > 1e-3
+
+
+@pytest.mark.parametrize("masking", MASKINGS)
+def test_a_single_action_is_always_masked(masking):
+    np.testing.assert_array_equal(sample_masks(jax.random.key(3), 1, masking), [[True]])
+
+
+@pytest.mark.parametrize("masking", ["", "One", "all"])
+def test_unknown_masking_is_refused(masking):
+    with pytest.raises(ValueError, match="unknown masking.*one, each, random"):
+        sample_masks(jax.random.key(0), HORIZON, masking)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.floats(0, 100), st.floats(0, 100), st.integers(1, 12))
+def test_temperatures_are_linear(first, last, iterations):
+    # One iteration has nowhere to go: it is the first.
+    steps = max(iterations - 1, 1)
+    expected = [first + (last - first) * i / steps for i in range(iterations)]
+    actual = linear_temperatures(first, last, iterations)
+    assert actual.shape == (iterations,)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5)
+    assert (np.asarray(actual) >= 0).all()
+
+
+@pytest.mark.parametrize("temperature", [-0.1, float("inf"), float("nan")])
+def test_impossible_temperatures_are_refused(temperature):
+    with pytest.raises(ValueError, match="finite and at least 0"):
+        linear_temperatures(temperature, 1.0, 3)
+    with pytest.raises(ValueError, match="finite and at least 0"):
+        linear_temperatures(1.0, temperature, 3)
+
+
+def test_no_iteration_is_refused():
+    with pytest.raises(ValueError, match="iterations"):
+        linear_temperatures(1.0, 1.0, 0)

@@ -1,0 +1,75 @@
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from leapjax.data import seeds
+from leapjax.errors import UserError
+
+TESTS = seeds.VALIDATION_START  # so many test levels
+VALIDATIONS = seeds.TRAINING_START - seeds.VALIDATION_START
+training = st.integers(0, seeds.MAX_TRAINING_SEED - 1)
+few = st.integers(1, 5000)
+
+
+def training_range(seed: int) -> range:
+    """What `training_seeds` runs over, by its first seed and a check that it counts up."""
+    first, *more = itertools.islice(seeds.training_seeds(seed), 5)
+    assert more == [first + 1, first + 2, first + 3, first + 4]
+    return range(first, first + seeds.TRAINING_STRIDE)
+
+
+def overlap(a: range, b: range) -> bool:
+    return max(a.start, b.start) < min(a.stop, b.stop)
+
+
+@given(st.integers(0, TESTS - 5000), st.integers(0, VALIDATIONS - 5000), few, training, training)
+def test_no_level_seed_serves_two_purposes(test_first, validation_first, count, one, other):
+    test = seeds.test_seeds(test_first, count)
+    validation = seeds.validation_seeds(validation_first, count)
+    assert list(test[:2]) == [test_first, test_first + 1][:count]
+    assert len(test) == len(validation) == count
+    demonstrated = training_range(one)
+    assert not overlap(test, validation)
+    assert not overlap(test, demonstrated)
+    assert not overlap(validation, demonstrated)
+    assert one == other or not overlap(demonstrated, training_range(other))
+
+
+def test_training_seeds_end_where_the_next_training_seeds_begin():
+    assert len(list(seeds.training_seeds(3))) == seeds.TRAINING_STRIDE
+    assert training_range(3).stop == training_range(4).start
+    # NumPy's and JAX's 32 bit integers hold the last of all.
+    assert training_range(seeds.MAX_TRAINING_SEED - 1).stop < 2**31
+
+
+@pytest.mark.parametrize(
+    ("make", "limit"), [(seeds.test_seeds, TESTS), (seeds.validation_seeds, VALIDATIONS)]
+)
+def test_episodes_stay_in_their_range(make, limit):
+    assert len(make(limit - 10, 10)) == 10
+    for first, count in [(limit - 10, 11), (limit, 1), (-1, 1), (-5, 10), (limit * 3, 2)]:
+        with pytest.raises(UserError, match="leave their range"):
+            make(first, count)
+    for count in (0, -3):
+        with pytest.raises(UserError, match="at least one"):
+            make(0, count)
+
+
+@pytest.mark.parametrize("seed", [-1, seeds.MAX_TRAINING_SEED, 10**9])
+def test_a_training_seed_out_of_range_is_refused(seed):
+    with pytest.raises(UserError, match="training seed"):
+        seeds.training_seeds(seed)
+
+
+@given(st.lists(st.integers(0, 60), max_size=8), st.integers(0, 40), st.integers(1, 20))
+def test_check_disjoint_refuses_exactly_what_is_shared(demonstrated, first, count):
+    episodes = range(first, first + count)
+    shared = set(demonstrated) & set(episodes)
+    if shared:
+        with pytest.raises(UserError) as raised:
+            seeds.check_disjoint(demonstrated, episodes)
+        assert any(f"level seed {seed} is both" in str(raised.value) for seed in shared)
+    else:
+        seeds.check_disjoint(demonstrated, episodes)

@@ -1,0 +1,86 @@
+"""Imports point one way, and the README says what is true."""
+
+import ast
+import re
+from pathlib import Path
+
+import leapjax
+from experiments import report, results
+
+ROOT = Path(__file__).parent.parent
+LIBRARY = sorted((ROOT / "leapjax").rglob("*.py"))
+
+
+def imports(path):
+    """Modules of this project that a file imports, as dotted names."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.split(".")[0] in ("leapjax", "experiments")}
+
+
+def may_import(path, *allowed):
+    unexpected = {
+        name
+        for name in imports(ROOT / path)
+        if name != "leapjax" and not any(f"{name}.".startswith(f"leapjax.{a}.") for a in allowed)
+    }
+    assert not unexpected, f"{path} imports {sorted(unexpected)}"
+
+
+def test_the_library_never_imports_experiments():
+    for path in LIBRARY:
+        assert not {name for name in imports(path) if name.startswith("experiments")}, path
+
+
+def test_the_core_imports_only_what_is_below_it():
+    may_import("leapjax/types.py")
+    may_import("leapjax/schedules.py", "types")
+    may_import("leapjax/energy.py", "types")
+    may_import("leapjax/planners.py", "types", "schedules")
+    may_import("leapjax/scores.py")
+    may_import("leapjax/training.py", "types")
+
+
+def test_models_and_planners_meet_only_in_agents():
+    for path in LIBRARY:
+        names = imports(path)
+        both = any(n.startswith("leapjax.models") for n in names) and any(
+            n.startswith("leapjax.planners") for n in names
+        )
+        where = path.relative_to(ROOT / "leapjax").parts[0]
+        assert not both or where in ("agents", "pretrained.py"), path
+
+
+def test_the_public_names_are_sorted_and_exist():
+    assert leapjax.__all__ == sorted(leapjax.__all__)
+    assert all(hasattr(leapjax, name) for name in leapjax.__all__)
+
+
+def test_the_readme_snippets_run():
+    readme = (ROOT / "README.md").read_text()
+    snippets = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
+    assert len(snippets) >= 2
+    names: dict = {}
+    for snippet in snippets:
+        exec(compile(snippet, "README.md", "exec"), names)  # one session, as a reader has
+    assert names["plans"].actions.shape == (7, 8)
+    assert bool(names["plans"].satisfied.all())
+    assert not (names["plans"].actions == 0).any()
+
+
+def test_the_readme_table_is_what_the_rows_say():
+    readme = (ROOT / "README.md").read_text()
+    rows = results.read(ROOT / "results" / "babyai.jsonl")
+    assert report.replace_section(readme, report.markdown(rows)) == readme
+
+
+def test_the_readme_names_files_that_exist():
+    readme = (ROOT / "README.md").read_text()
+    for name in re.findall(r"\]\((?!http)([^)#]+)\)", readme):
+        assert (ROOT / name).exists(), name
+    for name in re.findall(r"^(\S+/\S*)  +\S", readme, flags=re.MULTILINE):
+        assert (ROOT / name).exists(), name

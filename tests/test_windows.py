@@ -1,0 +1,205 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from leapjax.data import windows
+from leapjax.data.demonstrations import Demonstration
+from leapjax.data.windows import Steps, Window
+from leapjax.types import Context, Observation
+from tests.oracles import assert_same_observation
+
+SIDE, WORDS = 4, 3
+END, PAD = 6, 8  # of a set of seven actions: MASK, 7, is between them
+LENGTHS = (1, 4, 2, 7)
+
+
+def toy_demonstration(rng: np.random.Generator, steps: int, episode: int) -> Demonstration:
+    """Random numbers; its pose says which episode and which step a state is of."""
+    n = steps + 1
+    pose = np.stack([np.full(n, episode), np.arange(n), rng.integers(0, 4, n)], axis=1)
+    return Demonstration(
+        Observation(
+            rng.integers(1, 11, (n, SIDE, SIDE, 3)).astype(np.uint8),
+            pose.astype(np.int32),
+            rng.integers(1, 6, (n, 2)).astype(np.int32),
+            rng.integers(1, SIDE, (n, 2)).astype(np.int32),
+            rng.integers(1, 30, (n, WORDS)).astype(np.int32),
+        ),
+        rng.integers(0, END, steps).astype(np.int32),
+        seed=episode,
+    )
+
+
+def toy_demonstrations(seed: int = 0) -> list[Demonstration]:
+    rng = np.random.default_rng(seed)
+    return [toy_demonstration(rng, steps, episode) for episode, steps in enumerate(LENGTHS)]
+
+
+def on_device(steps: Steps) -> Steps:
+    return jax.tree.map(jnp.asarray, steps)
+
+
+def slow_window(demonstration: Demonstration, start: int, context: int, horizon: int) -> Window:
+    """What a window is, one element at a time."""
+    states, actions = demonstration.observations, demonstration.actions
+    past, taken = [], []
+    for step in range(start - context, start):
+        known = step >= 0
+        past.append(jax.tree.map(lambda x, s=step, k=known: x[s] if k else 0 * x[0], states))
+        taken.append(actions[step] if known else PAD)
+    blank = jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), states)
+    planned = [actions[i] if i < len(actions) else END for i in range(start, start + horizon)]
+    return Window(
+        Context(
+            jax.tree.map(lambda x: x[start], states),
+            jax.tree.map(lambda *xs: np.stack(xs), *past) if past else blank,
+            np.array(taken, np.int32),
+            np.int32(start),
+        ),
+        np.array(planned, np.int32),
+    )
+
+
+@functools.cache
+def window_at(context: int, horizon: int):
+    return jax.jit(lambda steps, i: windows.window(steps, i, context, horizon, END))
+
+
+def assert_same_window(actual: Window, expected: Window) -> None:
+    assert_same_observation(actual.context.observation, expected.context.observation)
+    assert_same_observation(actual.context.past, expected.context.past)
+    np.testing.assert_array_equal(actual.context.actions, expected.context.actions)
+    np.testing.assert_array_equal(actual.context.step, expected.context.step)
+    np.testing.assert_array_equal(actual.actions, expected.actions)
+    types = jax.tree.map(lambda x: x.dtype, actual)
+    assert types == jax.tree.map(lambda x: x.dtype, expected)
+
+
+@pytest.mark.parametrize("context", [0, 2, 5])
+@pytest.mark.parametrize("horizon", [1, 3, 5])
+def test_every_window_against_the_slow_one(context, horizon):
+    demonstrations = toy_demonstrations()
+    steps = on_device(windows.concatenate(demonstrations))
+    index = 0
+    for demonstration in demonstrations:
+        for start in range(len(demonstration.actions)):
+            expected = slow_window(demonstration, start, context, horizon)
+            assert_same_window(window_at(context, horizon)(steps, index), expected)
+            index += 1
+    assert index == steps.actions.shape[0] == sum(LENGTHS)
+
+
+def test_real_demonstrations_against_the_slow_window(local_demonstrations):
+    steps = on_device(windows.concatenate(local_demonstrations))
+    index = 0
+    for demonstration in local_demonstrations:
+        for start in range(len(demonstration.actions)):
+            expected = slow_window(demonstration, start, 2, 5)
+            assert_same_window(window_at(2, 5)(steps, index), expected)
+            index += 1
+
+
+@pytest.mark.parametrize(("context", "horizon"), [(0, 5), (2, 3)])
+def test_a_window_knows_nothing_but_itself(context, horizon):
+    demonstrations = toy_demonstrations()
+    steps = windows.concatenate(demonstrations)
+    others = windows.concatenate(toy_demonstrations(seed=1))
+    index = 0
+    for demonstration in demonstrations:
+        for start in range(len(demonstration.actions)):
+            # Everything after the start, of other episodes, or older than the context.
+            seen = np.zeros(len(steps.actions), bool)
+            seen[index - min(context, start) : index + 1] = True
+            chosen = seen.copy()
+            chosen[index : index + min(horizon, len(demonstration.actions) - start)] = True
+
+            def mixed(own, other, keep):
+                shape = (-1,) + (1,) * (own.ndim - 1)
+                return np.where(keep.reshape(shape), own, other)
+
+            altered = steps._replace(
+                observations=jax.tree.map(
+                    lambda a, b, keep=seen: mixed(a, b, keep),
+                    steps.observations,
+                    others.observations,
+                ),
+                actions=mixed(steps.actions, others.actions, chosen),
+            )
+            assert not np.array_equal(altered.observations.grid, steps.observations.grid)
+            actual = window_at(context, horizon)(on_device(altered), index)
+            assert_same_window(actual, window_at(context, horizon)(on_device(steps), index))
+            index += 1
+
+
+def test_a_window_depends_on_each_action_and_state_that_it_holds():
+    # The other half of the test above: alterations do show where they should.
+    steps = windows.concatenate(toy_demonstrations())
+    index = sum(LENGTHS[:3]) + 2  # the third step of the last episode
+    before = window_at(2, 3)(on_device(steps), index)
+    for offset in range(-2, 3):
+        actions = steps.actions.copy()
+        actions[index + offset] = (actions[index + offset] + 1) % END
+        after = window_at(2, 3)(on_device(steps._replace(actions=actions)), index)
+        assert not np.array_equal(after.actions, before.actions) or not np.array_equal(
+            after.context.actions, before.context.actions
+        )
+
+
+def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) -> Window:
+    steps = on_device(windows.concatenate(toy_demonstrations()))
+    draw = jax.jit(windows.sample_windows, static_argnums=(2, 3, 4, 5, 6))
+    return draw(jax.random.key(key), steps, batch, context, horizon, END, by)
+
+
+@pytest.mark.parametrize("by", ["episode", "step"])
+def test_a_batch_is_a_function_of_its_key(by):
+    first, same, other = (sample(key, 16, by) for key in (3, 3, 4))
+    jax.tree.map(np.testing.assert_array_equal, first, same)
+    assert not np.array_equal(first.context.observation.pose, other.context.observation.pose)
+    assert first.actions.shape == (16, 3)
+    assert first.context.past.grid.shape == (16, 2, SIDE, SIDE, 3)
+
+
+@pytest.mark.parametrize("by", ["episode", "step"])
+def test_a_batch_holds_windows_of_the_data(by):
+    demonstrations = toy_demonstrations()
+    batch = jax.device_get(sample(5, 32, by))
+    for row in range(32):
+        one = jax.tree.map(lambda leaf, r=row: leaf[r], batch)
+        episode, start, _ = one.context.observation.pose
+        assert_same_window(one, slow_window(demonstrations[episode], int(start), 2, 3))
+
+
+def counts(by: str, draws: int) -> list[np.ndarray]:
+    """How often each step of each episode was drawn."""
+    pose = np.asarray(sample(0, draws, by, 0, 1).context.observation.pose)
+    return [
+        np.bincount(pose[pose[:, 0] == episode, 1], minlength=length)
+        for episode, length in enumerate(LENGTHS)
+    ]
+
+
+def is_uniform(observed) -> bool:
+    return len(observed) == 1 or stats.chisquare(observed).pvalue > 1e-3
+
+
+def test_by_episode_every_demonstration_counts_the_same():
+    found = counts("episode", 20_000)
+    assert is_uniform([c.sum() for c in found])
+    assert all(is_uniform(c) for c in found)
+    assert not is_uniform(np.concatenate(found))
+
+
+def test_by_step_every_step_counts_the_same():
+    found = counts("step", 20_000)
+    assert is_uniform(np.concatenate(found))
+    assert not is_uniform([c.sum() for c in found])
+
+
+def test_another_way_to_draw_is_refused():
+    with pytest.raises(ValueError, match="unknown sampling 'window'"):
+        sample(0, 4, "window")
