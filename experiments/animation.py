@@ -13,10 +13,10 @@ from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.envs.levels import Level
 from leapjax.pretrained import Pretrained
 
-TILE = 32  # pixels per cell
+SIDE = 336  # pixels of a level, about
 CAPTION = 34  # pixels of text below the level
 REFINE_MS, STEP_MS, PAUSE_MS = 250, 220, 900
-MAX_PLANS = 20
+MAX_PLANS = 8  # an episode that needs more is cut off
 GLYPHS = dict(zip(range(len(ACTIONS)), ["L", "R", "F", "pick", "drop", "open", "end"], strict=True))
 
 
@@ -77,23 +77,24 @@ def picture(
 ) -> Image.Image:
     """The level, the goal, the way of a plan if given, and a caption."""
     env = adapter.env
-    level_image = Image.fromarray(env.grid.render(TILE, tuple(env.agent_pos), env.agent_dir))
-    image = Image.new("RGB", (max(level_image.width, 320), level_image.height + CAPTION), "white")
+    tile = SIDE // adapter.side
+    level_image = Image.fromarray(env.grid.render(tile, tuple(env.agent_pos), env.agent_dir))
+    image = Image.new("RGB", (SIDE, SIDE + CAPTION), "white")
     image.paste(level_image, (0, 0))
     pen = ImageDraw.Draw(image)
     if adapter.goal[0] >= 0:
         x, y = adapter.goal
-        box = [x * TILE, y * TILE, (x + 1) * TILE - 1, (y + 1) * TILE - 1]
+        box = [x * tile, y * tile, (x + 1) * tile - 1, (y + 1) * tile - 1]
         pen.rectangle(box, outline="white", width=2)
-    pen.text((4, level_image.height + 2), mission[:52], fill="black")
+    pen.text((4, SIDE + 2), mission[:60], fill="black")
     if actions is not None:
-        points = [((x + 0.5) * TILE, (y + 0.5) * TILE) for x, y in way(env, actions)]
+        points = [((x + 0.5) * tile, (y + 0.5) * tile) for x, y in way(env, actions)]
         if len(points) > 1:
             pen.line(points, fill=(80, 160, 255), width=4, joint="curve")
         last_x, last_y = points[-1]
         pen.ellipse([last_x - 5, last_y - 5, last_x + 5, last_y + 5], fill=(80, 160, 255))
         text = f"{text}: {' '.join(GLYPHS[int(action)] for action in actions)}"
-    pen.text((4, level_image.height + 18), text, fill="black")
+    pen.text((4, SIDE + 18), text, fill="black")
     return image
 
 

@@ -1,5 +1,11 @@
 """What several tests share."""
 
+import os
+
+# Tests compile much and compute little: without LLVM's optimisations they take half the time.
+# XLA reads this when JAX starts, so it comes before every import of JAX.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 import jax
 import pytest
 

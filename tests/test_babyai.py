@@ -15,54 +15,15 @@ from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import LEVELS
 
 LEVEL = "GoToLocalS7N5"
-TOY = [
-    "--demos",
-    "6",
-    "--episodes",
-    "5",
-    "--steps",
-    "4",
-    "--batch",
-    "4",
-    "--width",
-    "16",
-    "--heads",
-    "2",
-    "--layers",
-    "1",
-    "--channels",
-    "4",
-    "--rounds",
-    "1",
-    "--fields",
-    "2",
-    "--sweeps",
-    "2",
-    "--iterations",
-    "3",
-]
-FIELDS = [
-    "experiment",
-    "level",
-    "method",
-    "preset",
-    "seed",
-    "demos",
-    "episodes",
-    "successes",
-    "mean_length",
-    "horizon",
-    "iterations",
-    "executed",
-    "train_steps",
-    "train_seconds",
-    "eval_seconds",
-    "plans_per_second",
-    "params",
-    "versions",
-    "date",
-    "hash",
-]
+TOY = (
+    "--demos 6 --episodes 5 --steps 4 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
+    "--rounds 1 --fields 2 --sweeps 2 --iterations 3"
+).split()
+FIELDS = (
+    "experiment level method preset seed demos episodes successes mean_length horizon "
+    "iterations executed train_steps train_seconds eval_seconds plans_per_second params "
+    "versions date hash"
+).split()
 
 
 @pytest.fixture(scope="module")

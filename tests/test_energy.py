@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from tests.enumerable import (
     enumerable_energy,
     joint_probabilities,
     no_tilt,
+    quick_jit,
     random_table,
 )
 
@@ -21,35 +24,48 @@ PLANS = all_plans(HORIZON, ACTIONS)
 NO_TILT = no_tilt(HORIZON, ACTIONS)
 
 
-def conditionals(energy, params, context, plans=PLANS):
-    """The energies `[plans, T, A]` of every action, one position at a time."""
+@functools.cache
+def evaluator(energy):
+    """Everything that an energy says about many plans, compiled once."""
 
-    @jax.jit
+    @quick_jit
     def evaluate(params, context, plans):
         memory = energy.encode(params, context)
 
         def at(plan, position):
             return energy.conditional(params, memory, plan, position[None])[0]
 
-        return jax.vmap(jax.vmap(at, (None, 0)), (0, None))(plans, jnp.arange(plans.shape[1]))
+        def about(plan):
+            positions = jnp.arange(plan.shape[0])
+            return (
+                jax.vmap(at, (None, 0))(plan, positions),
+                energy.total(params, memory, plan),
+                energy.violation(params, memory, plan),
+            )
 
-    return np.asarray(evaluate(params, context, jnp.asarray(plans)))
+        return jax.vmap(about)(plans)
+
+    return evaluate
+
+
+def evaluate(energy, params, context, plans):
+    # One shape for all, so that an energy is compiled once: the rest repeats the first plan.
+    rows = np.resize(plans, (len(PLANS), HORIZON)).astype(np.int32)
+    results = evaluator(energy)(params, context, rows)
+    return [np.asarray(result)[: len(plans)] for result in results]
+
+
+def conditionals(energy, params, context, plans=PLANS):
+    """The energies `[plans, T, A]` of every action, one position at a time."""
+    return evaluate(energy, params, context, plans)[0]
 
 
 def totals(energy, params, context, plans=PLANS):
-    @jax.jit
-    def evaluate(params, context, plans):
-        memory = energy.encode(params, context)
-        return jax.vmap(lambda plan: energy.total(params, memory, plan))(plans)
-
-    return np.asarray(evaluate(params, context, jnp.asarray(plans)))
+    return evaluate(energy, params, context, plans)[1]
 
 
 def violations(energy, params, context, plans=PLANS):
-    memory = energy.encode(params, context)
-    return np.asarray(
-        jax.vmap(lambda plan: energy.violation(params, memory, plan))(jnp.asarray(plans))
-    )
+    return evaluate(energy, params, context, plans)[2]
 
 
 def probabilities(energies):
@@ -324,6 +340,10 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
                 changed[t] = action
                 count = repeats_of(changed)
                 added[row, t, action] = count * price if count else 0
+    # Where every action is forbidden another position has to change, so none is preferred.
+    hopeless = np.isinf(added).all(-1, keepdims=True)
+    assert hopeless.any() == np.isinf(price)
+    added = np.where(hopeless, 0, added)
     np.testing.assert_allclose(
         conditionals(CONSTRAINED, TABLE, context),
         conditionals(ENUMERABLE, TABLE, NO_TILT) + added,
@@ -340,14 +360,24 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
 
 def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
-    plans = np.array([[MASK, MASK, MASK], [0, 0, MASK], [0, MASK, MASK]], np.int32)
+    plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
     constrained = conditionals(CONSTRAINED, TABLE, context, plans)
     free = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
     np.testing.assert_array_equal(constrained[0], free[0])
     np.testing.assert_array_equal(constrained[2], free[2])
-    # In the second plan only the last position completes it, and it repeats already.
+    # In the second plan only the last position completes it.
     np.testing.assert_array_equal(constrained[1, :2], free[1, :2])
-    assert np.isposinf(constrained[1, 2]).all()
+    assert np.isposinf(constrained[1, 2, 1])
+    np.testing.assert_array_equal(constrained[1, 2, [0, 2]], free[1, 2, [0, 2]])
+
+
+def test_nothing_is_nan_where_everything_is_forbidden():
+    forbidden = constrain(ENUMERABLE, lambda context, actions: jnp.float32(jnp.inf))
+    np.testing.assert_array_equal(
+        conditionals(forbidden, TABLE, NO_TILT), conditionals(ENUMERABLE, TABLE, NO_TILT)
+    )
+    assert np.isposinf(totals(forbidden, TABLE, NO_TILT)).all()
+    assert np.isposinf(violations(forbidden, TABLE, NO_TILT)).all()
 
 
 def test_constraints_add_up():

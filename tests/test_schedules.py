@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from leapjax.schedules import MASKINGS, linear_temperatures, sample_masks
-from tests.enumerable import fit_p_value
+from tests.enumerable import fit_p_value, quick_jit
 
 HORIZON = 4
 DRAWS = 4000
@@ -16,7 +16,9 @@ def masks():
     """Many draws `[DRAWS, copies, T]` of every way of masking."""
     keys = jax.random.split(jax.random.key(0), DRAWS)
     return {
-        masking: np.asarray(jax.vmap(lambda k, m=masking: sample_masks(k, HORIZON, m))(keys))
+        masking: np.asarray(
+            quick_jit(jax.vmap(lambda k, m=masking: sample_masks(k, HORIZON, m)))(keys)
+        )
         for masking in MASKINGS
     }
 
@@ -58,7 +60,7 @@ def test_a_single_action_is_always_masked(masking):
 
 @pytest.mark.parametrize("masking", ["", "One", "all"])
 def test_unknown_masking_is_refused(masking):
-    with pytest.raises(ValueError, match="unknown masking.*one, each, random"):
+    with pytest.raises(ValueError, match=r"unknown masking.*one, each, random"):
         sample_masks(jax.random.key(0), HORIZON, masking)
 
 

@@ -149,9 +149,11 @@ def test_a_window_depends_on_each_action_and_state_that_it_holds():
         )
 
 
+draw = jax.jit(windows.sample_windows, static_argnums=(2, 3, 4, 5, 6))
+
+
 def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) -> Window:
     steps = on_device(windows.concatenate(toy_demonstrations()))
-    draw = jax.jit(windows.sample_windows, static_argnums=(2, 3, 4, 5, 6))
     return draw(jax.random.key(key), steps, batch, context, horizon, END, by)
 
 

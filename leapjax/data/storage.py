@@ -5,6 +5,7 @@ A data set of the user's own, of the same observations, is read in the same way.
 
 import os
 import shutil
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -69,17 +70,20 @@ def save(name: str, collection: Collection, description: str) -> None:
     # Minari writes in place, under an id: write under a temporary id, then rename.
     scratch = f"leapjax/unfinished-{os.getpid()}-v0"
     shutil.rmtree(get_dataset_path(scratch), ignore_errors=True)
-    minari.create_dataset_from_buffers(
-        dataset_id=scratch,
-        buffer=buffers,
-        action_space=gym.spaces.Discrete(NUM_ACTIONS - 1),
-        observation_space=observation_space(first.grid.shape[1], first.instruction.shape[1]),
-        algorithm_name="BabyAI bot",
-        author="leapjax",
-        code_permalink="https://github.com/Farama-Foundation/Minigrid",
-        description=description,
-        jpeg_encoding=False,  # grids are symbols, not pictures
-    )
+    with warnings.catch_warnings():
+        # Minari would have an author's e-mail and an environment that Gymnasium can make.
+        warnings.simplefilter("ignore", UserWarning)
+        minari.create_dataset_from_buffers(
+            dataset_id=scratch,
+            buffer=buffers,
+            action_space=gym.spaces.Discrete(NUM_ACTIONS - 1),
+            observation_space=observation_space(first.grid.shape[1], first.instruction.shape[1]),
+            algorithm_name="BabyAI bot",
+            author="leapjax",
+            code_permalink="https://github.com/Farama-Foundation/Minigrid",
+            description=description,
+            jpeg_encoding=False,  # grids are symbols, not pictures
+        )
     path = get_dataset_path(scratch)
     _rename_id(path, scratch, name)
     if final.exists():

@@ -4,6 +4,8 @@ Convolutions are written as one matrix product over shifted copies: on a CPU thi
 several times faster than XLA's own convolution, above all in the gradient.
 """
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,8 @@ from leapjax.types import Observation
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
 OBJECTS, COLOURS, STATES = 11, 6, 4
 DIRECTIONS = 4
+FAR = 64.0  # the distance of what no way leads to
+_OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
 
 
 def patches(image: jax.Array, side: int, padding: tuple[int, int]) -> jax.Array:
@@ -127,9 +131,10 @@ class GridEncoder(nn.Module):
     """Cell features that know the way: learned distances, then local convolutions.
 
     Distances are value iteration in the min-plus sense (Tamar et al., Value Iteration
-    Networks): what it costs to enter a cell and where a way ends are both learned from
-    the demonstrations, per channel, and a round carries a distance one cell further.
-    A round has no matrix product, so dozens of them, which mazes need, cost little.
+    Networks). What it costs to enter a cell is learned from the demonstrations, per field:
+    nothing says that walls are in the way. Half of the fields measure from the goal, where
+    it is observed; where the others measure from is learned too. A sweep carries a distance
+    one cell further and has no matrix product, so the dozens that mazes need cost little.
     """
 
     channels: int
@@ -138,15 +143,29 @@ class GridEncoder(nn.Module):
     rounds: int  # rounds of convolutions, which share their weights
 
     @nn.compact
-    def __call__(self, cells: jax.Array, agent: jax.Array) -> jax.Array:
-        """Cell features `[S, S, C]`, agent's cell `[2]`, to `[S, S, channels]`."""
+    def __call__(
+        self, cells: jax.Array, agent: jax.Array, goal: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Features `[S, S, channels]` and the agent's distances `[fields]`.
+
+        Args:
+            cells: `[S, S, C]` what is in each cell.
+            agent: `[2]` its cell.
+            goal: `[2]` its cell; (-1, -1) where it is not available.
+        """
         local = nn.relu(Convolution(self.channels, name="local")(cells))
         bias = nn.initializers.constant(1.0)
         cost = nn.softplus(nn.Dense(self.fields, bias_init=bias, name="cost")(local))
+        from_goal = (1 - one_cell(goal, cells.shape[0]))[..., None] * FAR
         far = nn.initializers.constant(10.0)
-        start = nn.softplus(nn.Dense(self.fields, bias_init=far, name="start")(local))
-        distance = min_plus(start, cost, self.sweeps)
-        # Only differences along the way matter: measured from the agent, and squashed.
+        learned = nn.softplus(
+            nn.Dense(self.fields - self.fields // 2, bias_init=far, name="start")(local)
+        )
+        start = jnp.concatenate(
+            [jnp.broadcast_to(from_goal, (*cells.shape[:2], self.fields // 2)), learned], axis=-1
+        )
+        distance = jnp.minimum(min_plus(start, cost, self.sweeps), FAR)
+        # Locally only differences matter: measured from the agent, and squashed.
         here = feature_at(distance, agent)
         relative = jnp.tanh((distance - here) / 4)
         source = Convolution(self.channels, name="source")(
@@ -156,11 +175,15 @@ class GridEncoder(nn.Module):
         h = nn.relu(source)
         for _ in range(self.rounds):
             h = nn.relu(step(h) + source)
-        return h
+        return h, jnp.tanh(here / 16)
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def min_plus(start: jax.Array, cost: jax.Array, sweeps: int) -> jax.Array:
     """Distances `[S, S, F]`: d(c) = min(start(c), cost(c) + min over 4 neighbours of d).
+
+    The gradient is that of the fixed point: it flows back along the shortest ways, which
+    is exact once `sweeps` reaches the longest of them, and stores no sweep.
 
     Args:
         start: `[S, S, F]` the distance of a way that ends in the cell.
@@ -168,16 +191,45 @@ def min_plus(start: jax.Array, cost: jax.Array, sweeps: int) -> jax.Array:
         sweeps: rounds; a way of so many cells is found.
     """
 
-    def sweep(distance: jax.Array, _: None) -> tuple[jax.Array, None]:
-        padded = jnp.pad(distance, ((1, 1), (1, 1), (0, 0)), constant_values=1e3)
-        near = jnp.minimum(
-            jnp.minimum(padded[:-2, 1:-1], padded[2:, 1:-1]),
-            jnp.minimum(padded[1:-1, :-2], padded[1:-1, 2:]),
-        )
-        return jnp.minimum(start, cost + near), None
+    def sweep(_: int, distance: jax.Array) -> jax.Array:
+        return jnp.minimum(start, cost + _neighbours(distance, FAR).min(axis=0))
 
-    distance, _ = jax.lax.scan(sweep, start, None, length=sweeps)
-    return distance
+    return jax.lax.fori_loop(0, sweeps, sweep, start)
+
+
+def _min_plus_forward(
+    start: jax.Array, cost: jax.Array, sweeps: int
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
+    distance = min_plus(start, cost, sweeps)
+    return distance, (start, cost, distance)
+
+
+def _min_plus_backward(
+    sweeps: int, saved: tuple[jax.Array, jax.Array, jax.Array], gradient: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    start, cost, distance = saved
+    near = _neighbours(distance, FAR)  # [4, S, S, F]
+    through = start > cost + near.min(axis=0)  # the way goes on, to the first nearest neighbour
+    onward = jax.nn.one_hot(near.argmin(axis=0), 4, axis=0) * through
+
+    def sweep(_: int, flow: jax.Array) -> jax.Array:
+        """What arrives at a cell, from itself and from the neighbours whose way leads here."""
+        sent = onward * flow
+        return gradient + sum(
+            _neighbours(sent[direction], 0.0)[_OPPOSITE[direction]] for direction in range(4)
+        )
+
+    flow = jax.lax.fori_loop(0, sweeps, sweep, gradient)
+    return jnp.where(through, 0, flow), jnp.where(through, flow, 0)
+
+
+min_plus.defvjp(_min_plus_forward, _min_plus_backward)
+
+
+def _neighbours(image: jax.Array, outside: float) -> jax.Array:
+    """`[4, S, S, F]`: what is at x - 1, x + 1, y - 1 and y + 1 of every cell."""
+    padded = jnp.pad(image, ((1, 1), (1, 1), (0, 0)), constant_values=outside)
+    return jnp.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
 
 
 class CellEmbedding(nn.Module):
@@ -188,15 +240,20 @@ class CellEmbedding(nn.Module):
     @nn.compact
     def __call__(self, observation: Observation) -> jax.Array:
         """`[S, S, channels]`, with the agent's and the goal's cell marked."""
-        grid = observation.grid.astype(jnp.int32)
+        grid = observation.grid
         side = grid.shape[0]
-        cells = nn.Embed(OBJECTS, self.channels, name="object")(grid[..., 0])
-        cells += nn.Embed(COLOURS, self.channels, name="colour")(grid[..., 1])
-        cells += nn.Embed(STATES, self.channels, name="state")(grid[..., 2])
-        marks = jnp.stack(
-            [one_cell(observation.pose[:2], side), one_cell(observation.goal, side)], axis=-1
-        )
-        return cells + nn.Dense(self.channels, use_bias=False, name="marks")(marks)
+        # One-hot and a matrix product: the gradient of a table look-up is a slow scatter.
+        kinds = [
+            jax.nn.one_hot(grid[..., part], size)
+            for part, size in enumerate((OBJECTS, COLOURS, STATES))
+        ]
+        marks = [
+            one_cell(observation.pose[:2], side)[..., None],
+            one_cell(observation.goal, side)[..., None],
+        ]
+        features = jnp.concatenate([*kinds, *marks], axis=-1)
+        init = nn.initializers.normal(1.0)
+        return nn.Dense(self.channels, use_bias=False, kernel_init=init)(features)
 
 
 def one_cell(position: jax.Array, side: int) -> jax.Array:
@@ -206,7 +263,7 @@ def one_cell(position: jax.Array, side: int) -> jax.Array:
     return hit.astype(jnp.float32)
 
 
-def neighbourhood(image: jax.Array, position: jax.Array, radius: int = 1) -> jax.Array:
+def neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Array:
     """The `(2 r + 1)^2 * C` features around a position, zero beyond the border."""
     padded = jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)))
     size = 2 * radius + 1

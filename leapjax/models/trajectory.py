@@ -29,9 +29,10 @@ class ModelConfig:
     width: int = 128  # D, embedding dimension
     dropout: float = 0.1
     channels: int = 32  # leapjax: features per grid cell
-    rounds: int = 4  # leapjax: rounds of convolution over the grid
+    rounds: int = 2  # leapjax: rounds of convolution over the grid
     fields: int = 8  # leapjax: learned distance fields
     sweeps: int = 16  # leapjax: rounds of value iteration that make them
+    radius: int = 3  # leapjax: how far around the agent its cells are read one by one
 
     def __post_init__(self) -> None:
         if self.architecture not in ARCHITECTURES:
@@ -137,6 +138,7 @@ class LeapModel(nn.Module):
         self.visited = nn.Dense(c.channels, use_bias=False)
         self.grid = encoders.GridEncoder(c.channels, c.fields, c.sweeps, c.rounds)
         self.read_agent = encoders.projection(c.width, "read_agent")
+        self.read_distances = encoders.projection(c.width, "read_distances")
         self.read_goal = encoders.projection(c.width, "read_goal")
         self.read_all = encoders.projection(c.width, "read_all")
         self.carried = nn.Embed(encoders.OBJECTS, c.width, embedding_init=_small)
@@ -157,9 +159,12 @@ class LeapModel(nn.Module):
         if self.sizes.context:
             cells += self.visited(self._visits(context, direction))
         scale, shift = jnp.split(self.modulation(instruction), 2)
-        grid = self.grid(cells * (1 + scale) + shift, observation.pose[:2])
+        grid, distances = self.grid(
+            cells * (1 + scale) + shift, observation.pose[:2], observation.goal
+        )
         # The agent's neighbourhood holds what the first steps depend on.
-        agent = self.read_agent(encoders.neighbourhood(grid, observation.pose[:2]))
+        around = encoders.neighbourhood(grid, observation.pose[:2], self.config.radius)
+        agent = self.read_agent(around) + self.read_distances(distances)
         agent += self.carried(observation.carried[0])
         agent += self.carried_colour(observation.carried[1])
         tokens = jnp.stack(

@@ -1,0 +1,224 @@
+"""Plans per second against this machine's limit: `python -m benchmarks.planning --quick`.
+
+Speed does not depend on what a model has learned, so parameters are random. Compilation is
+timed apart; every figure is the best of several runs. FLOPs are those that N passes of the
+token transformer need (see `needed_flops`), set against the matrix-multiply peak measured
+in the same run on the same layer shapes.
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from leapjax import pretrained
+from leapjax.agents import leap
+from leapjax.envs import vocabulary
+from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.models import trajectory
+from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.planners import GibbsConfig, compile_planner, split_batch
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+SETTINGS = ((5, 10, 7), (10, 30, 10), (15, 50, 19))  # T, N, S of the paper's levels
+BATCHES = (1, 4, 16, 64, 256, 1024)
+WORDS = 5
+MODELS = {
+    "paper": ModelConfig("paper"),
+    "leapjax": ModelConfig("leapjax", dropout=0.0, sweeps=14),
+}
+PREFIX_TOKENS = 4  # of the leapjax model
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure batched planning."""
+
+    quick: bool = False
+    """Only (T, N) = (5, 10), at batch 1 and 256."""
+    json: Path | None = None
+    """Write the rows here."""
+    plot: Path | None = None
+    """Draw plans per second and fraction of peak against batch size here."""
+    seconds: float = 1.0
+    """Time to spend on each measurement, at least."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures, prints a table, and writes what was asked for."""
+    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    settings = SETTINGS[:1] if options.quick else SETTINGS
+    batches = (1, 256) if options.quick else BATCHES
+    console = Console()
+    rows = []
+    for horizon, iterations, side in settings:
+        for name in MODELS:
+            rows += measure(name, horizon, iterations, side, batches, options.seconds)
+            console.print(f"measured {name} (T, N) = ({horizon}, {iterations}), side {side}")
+    console.print(table(rows))
+    if options.json:
+        pretrained.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    if options.plot:
+        draw(rows, options.plot)
+    return 0
+
+
+def measure(
+    name: str, horizon: int, iterations: int, side: int, batches: Sequence[int], seconds: float
+) -> list[Row]:
+    """One preset and setting at every batch size."""
+    model = MODELS[name]
+    sizes = Sizes(side, vocabulary.SIZE, NUM_ACTIONS, 0, horizon, 64)
+    config = GibbsConfig(horizon, iterations)
+    agent = leap.make_agent(model, leap.TrainingConfig(), config, sizes, WORDS)
+    assert agent.energy is not None
+    params = jax.jit(agent.init)(jax.random.key(0)).params
+    planner = compile_planner(agent.energy, config)
+    flops = needed_flops(model, horizon, iterations)
+    rows = []
+    for batch in batches:
+        keys = jax.random.split(jax.random.key(1), batch)
+        contexts = random_contexts(sizes, batch)
+        begun = time.perf_counter()
+        jax.block_until_ready(planner(params, keys, contexts))
+        first = time.perf_counter() - begun
+        best = fastest(partial(planner, params, keys, contexts), seconds)
+        chunk = max(size for _, size, _ in split_batch(batch, planner.chunk_sizes))
+        tokens = chunk * (horizon if name == "leapjax" else 2 * horizon)
+        peak = matmul_peak(tokens, model.width, seconds)
+        rows.append(
+            {
+                "preset": name,
+                "horizon": horizon,
+                "iterations": iterations,
+                "side": side,
+                "batch": batch,
+                "chunk": chunk,
+                "compile_seconds": first - best,
+                "seconds": best,
+                "plans_per_second": batch / best,
+                "needed_flops_per_plan": flops,
+                "gflops": batch * flops / best / 1e9,
+                "peak_gflops": peak,
+                "fraction_of_peak": batch * flops / best / 1e9 / peak,
+            }
+        )
+    return rows
+
+
+def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
+    """Floating-point operations of the N passes of one plan, without the encoders.
+
+    A matrix product of `[n, k]` and `[k, m]` counts 2 n k m. The last layer is counted at
+    the queried positions only: all T in the first pass, one in every later pass.
+    """
+    width = model.width
+    if model.architecture == "paper":
+        tokens, seen = 2 * horizon, 2 * horizon
+    else:
+        tokens, seen = horizon, horizon + PREFIX_TOKENS
+
+    def layer(queries: int) -> float:
+        projections = 2 * width**2 * (2 * tokens + 2 * queries)  # keys, values; query, output
+        attention = 4 * queries * seen * width
+        perceptron = 16 * queries * width**2
+        return projections + attention + perceptron
+
+    def one_pass(queried: int) -> float:
+        head = 2 * queried * width * NUM_ACTIONS
+        return (model.layers - 1) * layer(tokens) + layer(queried) + head
+
+    return one_pass(horizon) + (iterations - 1) * one_pass(1)
+
+
+def matmul_peak(tokens: int, width: int, seconds: float) -> float:
+    """GFLOP/s of the perceptron's two matrix products, one after the other, and no more."""
+    x = jax.random.normal(jax.random.key(0), (tokens, width))
+    expand = jax.random.normal(jax.random.key(1), (width, 4 * width)) / width
+    contract = jax.random.normal(jax.random.key(2), (4 * width, width)) / width
+    flops = 2 * 2 * tokens * width * 4 * width
+    repeats = max(1, int(2e9 / flops))  # hides the dispatch
+
+    @jax.jit
+    def multiply(x: jax.Array, expand: jax.Array, contract: jax.Array) -> jax.Array:
+        # Each product needs the one before, so none can be left out.
+        return jax.lax.fori_loop(0, repeats, lambda _, y: (y @ expand) @ contract, x)
+
+    jax.block_until_ready(multiply(x, expand, contract))
+    return repeats * flops / fastest(partial(multiply, x, expand, contract), seconds / 4) / 1e9
+
+
+def fastest(run: Callable[[], Any], seconds: float) -> float:
+    """The shortest of several runs, in seconds."""
+    best, spent = float("inf"), 0.0
+    while spent < seconds:
+        begun = time.perf_counter()
+        jax.block_until_ready(run())
+        taken = time.perf_counter() - begun
+        best, spent = min(best, taken), spent + taken
+    return best
+
+
+def random_contexts(sizes: Sizes, batch: int) -> Any:
+    """`[B]` contexts of the right shapes with random grids and poses."""
+    blank = trajectory.blank_context(sizes, WORDS)
+    contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
+    key = jax.random.key(2)
+    shape = contexts.observation.grid.shape
+    grid = jax.random.randint(key, shape, 0, 4).astype(jnp.uint8)
+    pose = jax.random.randint(key, (batch, 3), 1, 4)
+    observation = contexts.observation._replace(grid=grid, pose=pose, goal=pose[:, 1:])
+    return contexts._replace(observation=observation)
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows for a terminal."""
+    result = Table("preset", "T, N", "batch", "compile s", "plans/s", "GFLOP/s", "peak", "fraction")
+    for row in rows:
+        result.add_row(
+            row["preset"],
+            f"{row['horizon']}, {row['iterations']}",
+            str(row["batch"]),
+            f"{row['compile_seconds']:.1f}",
+            f"{row['plans_per_second']:.0f}",
+            f"{row['gflops']:.1f}",
+            f"{row['peak_gflops']:.0f}",
+            f"{row['fraction_of_peak']:.0%}",
+        )
+    return result
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Plans per second, and fraction of peak, against batch size."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for name in MODELS:
+        for horizon, iterations, _ in SETTINGS:
+            chosen = [r for r in rows if (r["preset"], r["horizon"]) == (name, horizon)]
+            label = f"{name}, T = {horizon}, N = {iterations}"
+            batches = [row["batch"] for row in chosen]
+            left.plot(batches, [r["plans_per_second"] for r in chosen], "o-", label=label)
+            right.plot(batches, [100 * r["fraction_of_peak"] for r in chosen], "o-")
+    left.set(xlabel="batch", ylabel="plans per second", xscale="log", yscale="log")
+    right.set(xlabel="batch", ylabel="% of matrix-multiply peak", xscale="log", ylim=(0, 100))
+    left.legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

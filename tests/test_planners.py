@@ -1,0 +1,705 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leapjax.energy import compose, constrain, from_total, view
+from leapjax.planners import (
+    CrossEntropyConfig,
+    GibbsConfig,
+    ShootingConfig,
+    compile_planner,
+    gibbs,
+    plan_keys,
+    planner_for,
+    split_batch,
+)
+from leapjax.types import Energy
+from tests.enumerable import (
+    all_plans,
+    conditional_by_counting,
+    enumerable_energy,
+    fit_p_value,
+    joint_probabilities,
+    no_tilt,
+    plan_counts,
+    quick_jit,
+    random_table,
+    total_variation,
+)
+
+HORIZON, ACTIONS = 3, 3
+PLANS = all_plans(HORIZON, ACTIONS)
+NO_TILT = no_tilt(HORIZON, ACTIONS)
+ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
+FROM_TOTAL = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
+TABLE = random_table(0, HORIZON, ACTIONS)
+JOINT = joint_probabilities(TABLE)
+CHAINS = 5000
+REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: a sampler that is wrong, one that may be right
+
+
+@functools.cache
+def many_plans(energy, config):
+    """The planner for a batch of keys in one context, compiled once."""
+    planner = planner_for(config)
+
+    def plan(params, keys, context):
+        return jax.vmap(lambda key: planner(energy, params, key, context, config))(keys)
+
+    return quick_jit(plan)
+
+
+def plans_of(energy, config, params=TABLE, context=NO_TILT, chains=CHAINS, seed=0):
+    keys = jax.random.split(jax.random.key(seed), chains)
+    return jax.tree.map(np.asarray, many_plans(energy, config)(params, keys, context))
+
+
+def joint_energies(plans, joint=JOINT):
+    """The exact negative log joint of plans `[..., T]`."""
+    return -np.log(joint[tuple(np.moveaxis(np.asarray(plans), -1, 0))])
+
+
+# Gibbs sampling against the exact joint.
+
+
+@pytest.mark.parametrize(
+    ("energy", "order"),
+    [(ENUMERABLE, "random"), (ENUMERABLE, "sequential"), (FROM_TOTAL, "random")],
+)
+def test_gibbs_at_temperature_one_samples_the_joint(energy, order):
+    config = GibbsConfig(HORIZON, iterations=50, temperature=1.0, order=order)
+    counts = plan_counts(plans_of(energy, config).actions, ACTIONS)
+    assert fit_p_value(counts, JOINT) > ACCEPTED
+    assert total_variation(counts, JOINT) < 0.04
+
+
+def test_temperature_sharpens_the_joint():
+    config = GibbsConfig(HORIZON, iterations=50, temperature=0.5)
+    counts = plan_counts(plans_of(ENUMERABLE, config).actions, ACTIONS)
+    sharper = joint_probabilities(2 * TABLE.astype(np.float64))
+    assert fit_p_value(counts, sharper) > ACCEPTED
+
+
+def _blind_to_other_actions(params, memory, actions, positions):
+    masked = jnp.full_like(actions, ACTIONS)
+    return ENUMERABLE.conditional(params, memory, masked, positions)
+
+
+@pytest.mark.parametrize(
+    ("energy", "temperature"),
+    [
+        (ENUMERABLE, 0.5),
+        (ENUMERABLE, 1.25),
+        (ENUMERABLE._replace(conditional=_blind_to_other_actions), 1.0),
+    ],
+    ids=["cold", "warm", "blind"],
+)
+def test_a_broken_sampler_does_not_pass_for_the_joint(energy, temperature):
+    config = GibbsConfig(HORIZON, iterations=50, temperature=temperature)
+    counts = plan_counts(plans_of(energy, config).actions, ACTIONS)
+    assert fit_p_value(counts, JOINT) < REJECTED
+    assert total_variation(counts, JOINT) > 0.06
+
+
+def test_composed_energies_sample_the_product_of_the_joints():
+    other = random_table(1, HORIZON, ACTIONS)
+    weights = (0.7, 1.5)
+    config = GibbsConfig(HORIZON, iterations=60, temperature=1.0)
+    composed = compose([ENUMERABLE, ENUMERABLE], weights)
+    counts = plan_counts(plans_of(composed, config, (TABLE, other)).actions, ACTIONS)
+    logs = weights[0] * TABLE.astype(np.float64) + weights[1] * other
+    assert fit_p_value(counts, joint_probabilities(logs)) > ACCEPTED
+    assert fit_p_value(counts, JOINT) < REJECTED
+
+
+def test_first_draw_follows_the_marginals_independently():
+    plan = plans_of(ENUMERABLE, GibbsConfig(HORIZON, iterations=50, temperature=1.0))
+    blank = np.full(HORIZON, ACTIONS)
+    marginals = [conditional_by_counting(JOINT, blank, t) for t in range(HORIZON)]
+    for t, marginal in enumerate(marginals):
+        draws = np.bincount(plan.trace[:, 0, t], minlength=ACTIONS)
+        assert fit_p_value(draws, marginal) > ACCEPTED
+    counts = plan_counts(plan.trace[:, 0], ACTIONS)
+    assert fit_p_value(counts, np.einsum("a,b,c->abc", *marginals)) > ACCEPTED
+    # No iteration has joined the positions yet.
+    assert fit_p_value(counts, JOINT) < REJECTED
+
+
+def test_without_mask_the_first_plan_is_uniform():
+    plan = plans_of(FROM_TOTAL, GibbsConfig(HORIZON, iterations=50, temperature=1.0))
+    uniform = np.full(len(PLANS), 1 / len(PLANS))
+    assert fit_p_value(plan_counts(plan.trace[:, 0], ACTIONS), uniform) > ACCEPTED
+
+
+@functools.cache
+def greedy_traces(order):
+    """Traces `[tables, N, T]` at temperature 0, each on a joint of its own, and the joints."""
+    tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(200)])
+    config = GibbsConfig(HORIZON, iterations=16, order=order)
+    keys = jax.random.split(jax.random.key(1), len(tables))
+    plan = quick_jit(jax.vmap(lambda p, k: gibbs(ENUMERABLE, p, k, NO_TILT, config)))(tables, keys)
+    return np.asarray(plan.trace), [joint_probabilities(table) for table in tables]
+
+
+@pytest.mark.parametrize("order", ["random", "sequential"])
+def test_greedy_gibbs_never_raises_the_joint_energy(order):
+    traces, joints = greedy_traces(order)
+    changes = np.array([np.diff(joint_energies(t, j)) for t, j in zip(traces, joints, strict=True)])
+    assert (changes <= 1e-5).all()
+    assert (changes < -0.1).sum() > 50
+
+
+def test_greedy_sweeps_end_where_no_single_action_helps():
+    traces, joints = greedy_traces("sequential")
+    for trace, joint in zip(traces, joints, strict=True):
+        for t in range(HORIZON):
+            conditional = conditional_by_counting(joint, trace[-1], t)
+            assert conditional[trace[-1][t]] == pytest.approx(conditional.max(), rel=1e-5)
+
+
+def test_greedy_start_takes_the_most_likely_action_everywhere():
+    traces, joints = greedy_traces("random")
+    blank = np.full(HORIZON, ACTIONS)
+    for trace, joint in zip(traces, joints, strict=True):
+        for t in range(HORIZON):
+            marginal = conditional_by_counting(joint, blank, t)
+            assert marginal[trace[0][t]] == pytest.approx(marginal.max(), rel=1e-5)
+
+
+def test_temperature_falls_to_the_final_one():
+    # One position: every iteration draws afresh, so the last one alone decides.
+    table = random_table(3, 1, ACTIONS)
+    energy, context = enumerable_energy(1, ACTIONS), no_tilt(1, ACTIONS)
+    config = GibbsConfig(1, iterations=4, temperature=3.0, final_temperature=0.0)
+    trace = plans_of(energy, config, table, context, chains=3000).trace[..., 0]
+    assert (trace[:, -1] == table.argmax()).all()
+    for iteration, temperature in enumerate([3.0, 2.0, 1.0]):
+        counts = np.bincount(trace[:, iteration], minlength=ACTIONS)
+        expected = joint_probabilities(table.astype(np.float64) / temperature)
+        assert fit_p_value(counts, expected) > ACCEPTED
+
+
+# Which positions are resampled.
+
+
+def _next_action(params, memory, actions, positions):
+    wanted = (actions[positions] + 1) % 5
+    return jnp.where(jnp.arange(5) == wanted[:, None], 0.0, 1.0)
+
+
+# Every resampled action goes up by one, so the trace tells which positions were resampled.
+COUNTER = Energy(lambda params, context: None, _next_action, lambda *_: jnp.zeros(()), 5)
+
+
+def resampled_positions(config, chains=1500):
+    trace = plans_of(COUNTER, config, None, None, chains).trace
+    steps = np.diff(trace, axis=1) % 5
+    assert np.isin(steps, (0, 1)).all()
+    return steps.astype(bool)  # [chains, N - 1, T]
+
+
+@pytest.mark.parametrize("resampled", [1, 2, 3])
+def test_random_order_is_uniform_over_sets_of_distinct_positions(resampled):
+    changed = resampled_positions(GibbsConfig(4, iterations=4, resampled=resampled))
+    assert (changed.sum(-1) == resampled).all()
+    sets = changed.reshape(-1, 4) @ (2 ** np.arange(4))
+    possible = np.array([bin(i).count("1") == resampled for i in range(16)])
+    counts = np.bincount(sets, minlength=16)
+    assert fit_p_value(counts, possible / possible.sum()) > ACCEPTED
+    # Iterations choose independently.
+    expected = possible.sum() ** -1.0
+    again = np.mean((changed[:, 0] == changed[:, 1]).all(-1))
+    assert again == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("resampled", "expected"),
+    [(1, [[0], [1], [2], [3], [0], [1]]), (3, [[0, 1, 2], [3, 0, 1], [2, 3, 0], [1, 2, 3]])],
+)
+def test_sequential_order_goes_from_left_to_right_and_around(resampled, expected):
+    iterations = len(expected) + 1
+    config = GibbsConfig(4, iterations=iterations, resampled=resampled, order="sequential")
+    changed = resampled_positions(config, chains=2)
+    for row in changed:
+        assert [set(np.flatnonzero(step)) for step in row] == [set(step) for step in expected]
+
+
+def test_positions_resampled_together_are_masked_together():
+    # All three at once, from all MASK: every iteration is again a draw of the marginals.
+    config = GibbsConfig(HORIZON, iterations=3, resampled=HORIZON, temperature=1.0)
+    trace = plans_of(ENUMERABLE, config).trace
+    blank = np.full(HORIZON, ACTIONS)
+    marginals = [conditional_by_counting(JOINT, blank, t) for t in range(HORIZON)]
+    counts = plan_counts(trace[:, -1], ACTIONS)
+    assert fit_p_value(counts, np.einsum("a,b,c->abc", *marginals)) > ACCEPTED
+    assert fit_p_value(counts, JOINT) < REJECTED
+
+
+# What a plan holds.
+
+CONFIGS = {
+    "gibbs": GibbsConfig(HORIZON, iterations=5, temperature=0.7, score=True),
+    "shooting": ShootingConfig(HORIZON, candidates=6, score=True),
+    "cross entropy": CrossEntropyConfig(HORIZON, iterations=5, candidates=6, elites=2, score=True),
+}
+EACH_PLANNER = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+
+
+@pytest.mark.parametrize(
+    "config", [*CONFIGS.values(), GibbsConfig(HORIZON, 3, score=True, score_trace=True)]
+)
+def test_plan_is_the_end_of_its_trace_with_its_exact_energy(config):
+    plan = plans_of(ENUMERABLE, config, chains=50)
+    iterations = getattr(config, "iterations", 1)
+    assert plan.actions.shape == (50, HORIZON)
+    assert plan.trace.shape == (50, iterations, HORIZON)
+    assert plan.actions.dtype == plan.trace.dtype == np.int32
+    assert ((plan.trace >= 0) & (plan.trace < ACTIONS)).all()
+    np.testing.assert_array_equal(plan.trace[:, -1], plan.actions)
+    np.testing.assert_allclose(plan.energy, joint_energies(plan.actions), rtol=1e-4)
+    assert plan.satisfied.all()
+    assert (plan.trace_energies is None) != getattr(config, "score_trace", False)
+    if plan.trace_energies is not None:
+        assert plan.trace_energies.shape == (50, iterations)
+        np.testing.assert_allclose(plan.trace_energies, joint_energies(plan.trace), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        GibbsConfig(HORIZON, iterations=2),
+        ShootingConfig(HORIZON),
+        CrossEntropyConfig(HORIZON, iterations=2),
+    ],
+)
+def test_energies_are_returned_only_if_asked_for(config):
+    plan = jax.eval_shape(
+        lambda key: planner_for(config)(ENUMERABLE, TABLE, key, NO_TILT, config),
+        jax.random.key(0),
+    )
+    assert plan.energy is None
+    assert plan.trace_energies is None
+
+
+@EACH_PLANNER
+def test_plan_is_a_function_of_its_key(config):
+    plan, again = plans_of(ENUMERABLE, config, chains=50), plans_of(ENUMERABLE, config, chains=50)
+    jax.tree.map(np.testing.assert_array_equal, plan, again)
+    other = plans_of(ENUMERABLE, config, chains=50, seed=1)
+    assert (plan.actions != other.actions).any(-1).mean() > 0.2
+
+
+def test_one_iteration_is_one_draw():
+    plan = plans_of(ENUMERABLE, GibbsConfig(HORIZON, iterations=1), chains=50)
+    assert plan.trace.shape == (50, 1, HORIZON)
+    np.testing.assert_array_equal(plan.trace[:, 0], plan.actions)
+    blank = np.full(HORIZON, ACTIONS)
+    likely = [conditional_by_counting(JOINT, blank, t).argmax() for t in range(HORIZON)]
+    assert (plan.actions == likely).all()
+
+
+def best_of(probabilities, energies, count):
+    """The distribution of the outcome of least energy among independent draws."""
+    probabilities, energies = np.ravel(probabilities), np.ravel(energies)
+    order = np.argsort(energies)
+    # At least this energy: all draws at least this, less all draws at least the next.
+    tail = np.append(np.cumsum(probabilities[order][::-1])[::-1], 0.0)
+    result = np.zeros(len(order))
+    result[order] = tail[:-1] ** count - tail[1:] ** count
+    return result
+
+
+@pytest.mark.parametrize("restarts", [1, 3])
+def test_the_restart_of_least_energy_is_kept(restarts):
+    # With one iteration a restart is a draw of the marginals, so the best is known exactly.
+    config = GibbsConfig(HORIZON, 1, temperature=1.0, restarts=restarts, score=True)
+    plan = plans_of(ENUMERABLE, config)
+    blank = np.full(HORIZON, ACTIONS)
+    marginals = [conditional_by_counting(JOINT, blank, t) for t in range(HORIZON)]
+    start = np.einsum("a,b,c->abc", *marginals)
+    counts = plan_counts(plan.actions, ACTIONS)
+    assert fit_p_value(counts, best_of(start, -np.log(JOINT), restarts)) > ACCEPTED
+    assert fit_p_value(counts, best_of(start, -np.log(JOINT), 4 - restarts)) < REJECTED
+    np.testing.assert_array_equal(plan.trace[:, -1], plan.actions)
+    np.testing.assert_allclose(plan.energy, joint_energies(plan.actions), rtol=1e-4)
+
+
+def test_greedy_search_from_the_total_alone_solves_an_additive_energy():
+    additive = np.random.default_rng(4).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
+    energy = from_total(
+        lambda params, context: None,
+        lambda params, memory, actions: params[jnp.arange(HORIZON), actions].sum(),
+        ACTIONS,
+    )
+    config = GibbsConfig(HORIZON, iterations=HORIZON + 1, order="sequential")
+    plan = plans_of(energy, config, additive, None, chains=100)
+    assert (plan.actions == additive.argmin(-1)).all()
+    assert (plan.trace[:, 0] != additive.argmin(-1)).any()
+
+
+# Random shooting and the cross-entropy method.
+
+
+@functools.cache
+def recording_planner(config):
+    """A planner for one key, and the list of every plan whose total energy it asks for."""
+    scored = []
+
+    def total(params, memory, actions):
+        jax.debug.callback(lambda a: scored.append(tuple(map(int, a))), actions)
+        return ENUMERABLE.total(params, memory, actions)
+
+    energy = ENUMERABLE._replace(total=total)
+    planner = planner_for(config)
+    return quick_jit(lambda key: planner(energy, TABLE, key, NO_TILT, config)), scored
+
+
+def plan_and_scored(config, seed):
+    planner, scored = recording_planner(config)
+    scored.clear()
+    plan = jax.block_until_ready(planner(jax.random.key(seed)))
+    jax.effects_barrier()
+    return plan, list(scored)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_shooting_returns_the_lowest_of_its_draws(seed):
+    plan, draws = plan_and_scored(ShootingConfig(HORIZON, candidates=12, score=True), seed)
+    assert len(draws) == 12
+    assert len(set(draws)) > 1
+    energies = joint_energies(np.array(draws))
+    assert tuple(np.asarray(plan.actions)) == draws[int(np.argmin(energies))]
+    assert float(plan.energy) == pytest.approx(energies.min(), rel=1e-4)
+
+
+@pytest.mark.parametrize("candidates", [1, 6])
+def test_shooting_draws_uniformly(candidates):
+    plan = plans_of(ENUMERABLE, ShootingConfig(HORIZON, candidates))
+    uniform = np.full(len(PLANS), 1 / len(PLANS))
+    expected = best_of(uniform, -np.log(JOINT), candidates)
+    assert fit_p_value(plan_counts(plan.actions, ACTIONS), expected) > ACCEPTED
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cross_entropy_returns_the_best_of_its_last_round(seed):
+    config = CrossEntropyConfig(HORIZON, 3, candidates=7, elites=2, keep_elites=False)
+    plan, scored = plan_and_scored(config, seed)
+    assert len(scored) == 3 * 7
+    last = joint_energies(np.array(scored[-7:]))
+    assert joint_energies(plan.actions) == pytest.approx(last.min())
+    assert last.min() < last.max()
+    np.testing.assert_array_equal(plan.trace[-1], plan.actions)
+
+
+def test_cross_entropy_starts_like_shooting():
+    plan = plans_of(ENUMERABLE, CONFIGS["cross entropy"])
+    uniform = np.full(len(PLANS), 1 / len(PLANS))
+    expected = best_of(uniform, -np.log(JOINT), CONFIGS["cross entropy"].candidates)
+    assert fit_p_value(plan_counts(plan.trace[:, 0], ACTIONS), expected) > ACCEPTED
+
+
+@pytest.mark.parametrize("keep_elites", [True, False])
+def test_kept_elites_never_let_the_best_energy_rise(keep_elites):
+    config = CrossEntropyConfig(HORIZON, 8, candidates=5, elites=2, keep_elites=keep_elites)
+    energies = joint_energies(plans_of(ENUMERABLE, config, chains=300).trace)
+    rises = np.diff(energies, axis=1) > 1e-9
+    # Without the elites it does rise, which shows that this can be seen.
+    assert rises.any() != keep_elites
+    assert (np.diff(energies, axis=1) < -0.1).any()
+
+
+def test_a_child_differs_from_its_parent_in_one_token():
+    config = CrossEntropyConfig(HORIZON, 20, candidates=1, elites=1, keep_elites=False)
+    trace = plans_of(ENUMERABLE, config, chains=200).trace
+    changed = trace[:, 1:] != trace[:, :-1]
+    assert (changed.sum(-1) == 1).all()
+    assert fit_p_value(changed.sum((0, 1)), np.full(HORIZON, 1 / HORIZON)) > ACCEPTED
+    shifts = ((trace[:, 1:] - trace[:, :-1]) % ACTIONS)[changed]
+    assert fit_p_value(np.bincount(shifts, minlength=ACTIONS), [0, 0.5, 0.5]) > ACCEPTED
+
+
+def test_cross_entropy_solves_an_additive_energy():
+    config = CrossEntropyConfig(HORIZON, 20, candidates=8, elites=2)
+    tilt = np.random.default_rng(6).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
+    plan = plans_of(ENUMERABLE, config, np.zeros_like(TABLE), tilt, chains=200)
+    best = tilt.argmax(-1)
+    assert (plan.trace[:, 0] == best).all(-1).mean() < 0.5
+    assert (plan.actions == best).all(-1).mean() > 0.98
+
+
+# Planning under constraints. Context: a tilt and a price for each action at each position.
+
+
+def priced(context, actions):
+    return context["price"][jnp.arange(HORIZON), actions].sum()
+
+
+CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), priced)
+
+
+def prices(*forbidden, price=np.inf):
+    result = np.zeros((HORIZON, ACTIONS), np.float32)
+    for position, action in forbidden:
+        result[position, action] = price
+    return result
+
+
+def breaks(plans, price):
+    return price[np.arange(HORIZON), plans].sum(-1) > 0
+
+
+CONSTRAINED_CONFIGS = {
+    "gibbs": GibbsConfig(HORIZON, iterations=3, temperature=1.0, score=True, score_trace=True),
+    "restarts": GibbsConfig(HORIZON, iterations=3, restarts=2, temperature=0.3, score=True),
+    "shooting": ShootingConfig(HORIZON, candidates=2, score=True),
+    "cross entropy": CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
+}
+EACH_CONSTRAINED = pytest.mark.parametrize(
+    "config", CONSTRAINED_CONFIGS.values(), ids=CONSTRAINED_CONFIGS
+)
+
+
+@EACH_CONSTRAINED
+@pytest.mark.parametrize("price", [0.5, np.inf])
+def test_a_plan_that_breaks_a_constraint_is_never_called_satisfied(config, price):
+    price = prices((0, 0), (0, 1), (1, 1), (1, 2), (2, 0), (2, 2), price=price)
+    plan = plans_of(CONSTRAINED, config, context={"tilt": NO_TILT, "price": price}, chains=300)
+    broken = breaks(plan.actions, price)
+    np.testing.assert_array_equal(plan.satisfied, ~broken)
+    assert broken.any()
+    assert not broken.all()
+    # No NaN either, and an infinite price makes an infinite energy.
+    penalties = price[np.arange(HORIZON), plan.actions].sum(-1)
+    np.testing.assert_allclose(plan.energy, joint_energies(plan.actions) + penalties, rtol=1e-4)
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_gibbs_finds_the_way_around_one_forbidden_action(seed, temperature):
+    """Whatever is forbidden where: single steps lead back from the model's own plan."""
+    config = GibbsConfig(HORIZON, iterations=13, temperature=temperature, order="sequential")
+    position, action = np.random.default_rng(seed).integers(3, size=2)
+    tilt = NO_TILT.copy()
+    tilt[position, action] = 6.0  # the model insists on what is forbidden
+    context = {"tilt": tilt, "price": prices((position, action))}
+    plan = plans_of(CONSTRAINED, config, context=context, chains=100)
+    assert breaks(plan.trace[:, 0], context["price"]).mean() > 0.9
+    assert plan.satisfied.all()
+    assert not breaks(plan.actions, context["price"]).any()
+
+
+def test_a_growing_penalty_leads_out_of_several_violations():
+    forbidden = [(0, 0), (0, 2), (1, 0), (1, 1), (2, 1), (2, 2)]
+    price = prices(*forbidden, price=1e4)
+    tilt = np.where(price > 0, 6.0, 0.0).astype(np.float32)
+    config = GibbsConfig(HORIZON, iterations=1 + HORIZON, order="sequential")
+    context = {"tilt": tilt, "price": price}
+    plan = plans_of(CONSTRAINED, config, context=context, chains=20)
+    assert breaks(plan.trace[:, 0], price).all()
+    assert plan.satisfied.all()
+    np.testing.assert_array_equal(plan.actions, np.broadcast_to([1, 2, 0], (20, HORIZON)))
+
+
+def test_constrained_gibbs_samples_the_joint_given_the_constraint():
+    price = prices((0, 0), (2, 1))
+    config = GibbsConfig(HORIZON, iterations=50, temperature=1.0)
+    plan = plans_of(CONSTRAINED, config, context={"tilt": NO_TILT, "price": price})
+    # Two violations at once cannot be left by single steps: those chains found nothing.
+    found = plan.actions[plan.satisfied]
+    assert len(found) > CHAINS / 2
+    allowed = JOINT.copy()
+    allowed[0] = allowed[:, :, 1] = 0
+    assert fit_p_value(plan_counts(found, ACTIONS), allowed / allowed.sum()) > ACCEPTED
+
+
+@EACH_CONSTRAINED
+def test_if_everything_is_forbidden_no_plan_is_satisfied_and_nothing_is_nan(config):
+    context = {"tilt": NO_TILT, "price": np.full((HORIZON, ACTIONS), np.inf, np.float32)}
+    plan = plans_of(CONSTRAINED, config, context=context, chains=300)
+    assert not plan.satisfied.any()
+    assert np.isposinf(plan.energy).all()
+    assert plan.trace_energies is None or np.isposinf(plan.trace_energies).all()
+    assert ((plan.trace >= 0) & (plan.trace < ACTIONS)).all()
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="where every action has infinite energy, Gibbs draws action 0 instead of keeping "
+    "the action, so +inf in a total leads into plans that no single step leaves",
+)
+def test_infinite_totals_do_not_overwrite_actions_that_cannot_help():
+    """Position 1 has to change; resampling position 0 first must not lose its action."""
+
+    def total(params, memory, actions):
+        return jnp.where(jnp.any(actions == 0), jnp.inf, 0.0)
+
+    energy = from_total(lambda params, context: None, total, ACTIONS)
+    config = GibbsConfig(2, iterations=9, order="sequential")
+    plan = plans_of(energy, config, None, None, chains=100)
+    reachable = (plan.trace[:, 0] == 0).sum(-1) <= 1
+    assert reachable.any()
+    assert not (plan.actions[reachable] == 0).any()
+
+
+# Batches.
+
+
+def batch_of(batch, seed=0):
+    """Keys and contexts, all different, as NumPy arrays."""
+    tilts = np.random.default_rng(seed).normal(size=(batch, HORIZON, ACTIONS)).astype(np.float32)
+    return plan_keys(seed, np.arange(batch), np.zeros(batch, int)), {"tilt": tilts}
+
+
+TILTED = view(ENUMERABLE, lambda context: context["tilt"])
+SIZES = (1, 2, 7, 8, 9, 20)
+
+
+@functools.cache
+def batched(config):
+    sizes = (8, 2) if isinstance(config, GibbsConfig) else (7,)
+    return compile_planner(TILTED, config, sizes)
+
+
+@functools.cache
+def one_by_one(config):
+    """The plans of 20 contexts, each from its own unbatched call."""
+    keys, contexts = batch_of(20)
+    single = quick_jit(lambda k, c: planner_for(config)(TILTED, TABLE, k, c, config))
+    plans = [single(keys[i], {"tilt": contexts["tilt"][i]}) for i in range(20)]
+    return jax.tree.map(lambda *rows: np.stack(rows), *plans)
+
+
+@EACH_PLANNER
+@pytest.mark.parametrize("batch", SIZES)
+def test_a_batch_is_a_loop_over_its_contexts(batch, config):
+    keys, contexts = batch_of(20)
+    contexts = {"tilt": contexts["tilt"][:batch]}
+    plan = batched(config)(TABLE, keys[:batch], contexts)
+    expected = jax.tree.map(lambda leaf: leaf[:batch], one_by_one(config))
+    np.testing.assert_array_equal(plan.actions, expected.actions)
+    np.testing.assert_array_equal(plan.trace, expected.trace)
+    np.testing.assert_array_equal(plan.satisfied, expected.satisfied)
+    np.testing.assert_allclose(plan.energy, expected.energy, rtol=1e-5)
+
+
+@EACH_PLANNER
+def test_a_context_changes_its_own_plan_only(config):
+    keys, contexts = batch_of(9)
+    before = batched(config)(TABLE, keys, contexts)
+    changed = contexts["tilt"].copy()
+    target = (np.asarray(before.actions[4]) + 1) % ACTIONS
+    changed[4, np.arange(HORIZON), target] += 20.0
+    after = batched(config)(TABLE, keys, {"tilt": changed})
+    others = np.arange(9) != 4
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(np.asarray(a)[others], np.asarray(b)[others]),
+        before,
+        after,
+    )
+    assert (after.actions[4] != before.actions[4]).any()
+
+
+def test_parameters_are_an_argument():
+    planner = batched(CONFIGS["gibbs"])
+    keys, contexts = batch_of(8)
+    peaks = np.full((ACTIONS,) * HORIZON, -20.0, np.float32)
+    for peak in ((0, 1, 2), (2, 2, 0)):
+        table = peaks.copy()
+        table[peak] = 20.0
+        assert (np.asarray(planner(table, keys, contexts).actions) == peak).all()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(1, 500), st.sets(st.integers(1, 70), min_size=1, max_size=4))
+def test_chunks_cover_every_row_exactly_once(batch, sizes):
+    sizes = sorted(sizes)
+    chunks = split_batch(batch, sizes)
+    covered = [row for start, _, used in chunks for row in range(start, start + used)]
+    assert covered == list(range(batch))
+    assert all(size in sizes for _, size, _ in chunks)
+    assert all(size == used for _, size, used in chunks[:-1])
+    _, size, used = chunks[-1]
+    assert 1 <= used <= size
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 150), st.sets(st.integers(1, 30), min_size=1, max_size=3))
+def test_sizes_up_to_a_batch_are_those_that_its_chunks_need(batch, sizes):
+    planner = compile_planner(TILTED, CONFIGS["gibbs"], sorted(sizes))
+    needed = {size for b in range(1, batch + 1) for _, size, _ in split_batch(b, sorted(sizes))}
+    assert planner.sizes_up_to(batch) == sorted(needed)
+
+
+def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
+    episodes, replans = np.array([3, 0, 3, 1]), np.array([0, 2, 1, 2])
+    data = np.asarray(jax.random.key_data(plan_keys(7, episodes, replans)))
+    shuffled = jax.random.key_data(plan_keys(7, episodes[::-1], replans[::-1]))
+    np.testing.assert_array_equal(shuffled, data[::-1])
+    alone = jax.random.key_data(plan_keys(7, episodes[1:2], replans[1:2]))
+    np.testing.assert_array_equal(alone, data[1:2])
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
+    keys = [jax.random.key_data(plan_keys(seed, grid[:, 0], grid[:, 1])) for seed in (0, 1)]
+    assert len(np.unique(np.concatenate(keys), axis=0)) == 2 * len(grid)
+
+
+# Mistakes.
+
+
+def test_no_contexts_are_refused():
+    keys, contexts = batch_of(2)
+    with pytest.raises(ValueError, match="no contexts"):
+        batched(CONFIGS["gibbs"])(TABLE, keys[:0], {"tilt": contexts["tilt"][:0]})
+
+
+@pytest.mark.parametrize("shape", [(3, HORIZON, ACTIONS), (1, HORIZON, ACTIONS), ()])
+def test_contexts_that_do_not_match_the_keys_are_refused(shape):
+    keys, _ = batch_of(2)
+    with pytest.raises(ValueError, match=r"context\['tilt'\] has shape .* number of keys, 2"):
+        batched(CONFIGS["gibbs"])(TABLE, keys, {"tilt": np.zeros(shape, np.float32)})
+
+
+@pytest.mark.parametrize("chunk_sizes", [(), (0,), (8, -1), (0, 8)])
+def test_impossible_chunk_sizes_are_refused(chunk_sizes):
+    with pytest.raises(ValueError, match="chunk sizes must be positive"):
+        compile_planner(TILTED, CONFIGS["gibbs"], chunk_sizes)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (GibbsConfig, {"horizon": 0}, "horizon must be at least 1, got 0"),
+        (GibbsConfig, {"iterations": 0}, "iterations must be at least 1, got 0"),
+        (GibbsConfig, {"resampled": 0}, "resampled must be at least 1, got 0"),
+        (GibbsConfig, {"restarts": -1}, "restarts must be at least 1, got -1"),
+        (GibbsConfig, {"horizon": 3, "resampled": 4}, "resampled is 4, .* the horizon 3"),
+        (GibbsConfig, {"order": "backwards"}, "unknown order 'backwards': .*sequential"),
+        (ShootingConfig, {"horizon": -2}, "horizon must be at least 1, got -2"),
+        (ShootingConfig, {"candidates": 0}, "candidates must be at least 1, got 0"),
+        (CrossEntropyConfig, {"horizon": 0}, "horizon must be at least 1"),
+        (CrossEntropyConfig, {"iterations": 0}, "iterations must be at least 1"),
+        (CrossEntropyConfig, {"candidates": 0}, "candidates must be at least 1"),
+        (CrossEntropyConfig, {"elites": 0}, "elites must be at least 1"),
+        (CrossEntropyConfig, {"candidates": 2, "elites": 3}, "3 elites out of 2 candidates"),
+    ],
+)
+def test_impossible_configurations_are_refused(make, options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"temperature": -1.0}, {"final_temperature": float("nan"), "temperature": 1.0}]
+)
+def test_impossible_temperatures_are_refused(options):
+    with pytest.raises(ValueError, match="temperature must be finite and at least 0"):
+        gibbs(ENUMERABLE, TABLE, jax.random.key(0), NO_TILT, GibbsConfig(HORIZON, **options))
+
+
+def test_only_planner_configurations_have_a_planner():
+    with pytest.raises(TypeError, match="no planner takes a dict"):
+        planner_for({"horizon": 3})

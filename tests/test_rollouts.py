@@ -1,0 +1,420 @@
+import functools
+from typing import ClassVar
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import leapjax as leap
+from leapjax.envs.adapter import GymnasiumAdapter, Transition
+from leapjax.planners import GibbsConfig
+from leapjax.rollouts import History, stack_contexts
+from leapjax.types import Context, Plan
+
+LEFT, RIGHT, END = range(3)
+NUM_ACTIONS = 3
+HORIZON, ITERATIONS = 4, 5
+PAD = NUM_ACTIONS + 1
+GOAL, LIMIT = 6, 30
+
+
+class Corridor:
+    """Cells 0 .. 6; an episode starts at (seed mod 7) - 1, or at 0; 6 is success, -1 a fall."""
+
+    num_actions = NUM_ACTIONS
+    made: ClassVar[list["Corridor"]] = []
+
+    def __init__(self) -> None:
+        self.taken: list[int] = []
+        Corridor.made.append(self)
+
+    def reset(self, seed: int):
+        self.position = max(seed % 7 - 1, 0)
+        self.steps = 0
+        return self.observe()
+
+    def observe(self):
+        return {"position": np.array(self.position, np.int32), "goal": np.array([GOAL], np.int32)}
+
+    def step(self, action: int) -> Transition:
+        assert action in (LEFT, RIGHT)
+        assert self.position not in (-1, GOAL), "stepped after the end"
+        self.taken.append(action)
+        self.position += 1 if action == RIGHT else -1
+        self.steps += 1
+        over = self.position in (-1, GOAL)
+        success = self.position == GOAL
+        return Transition(
+            self.observe(), float(success), over, not over and self.steps >= LIMIT, success
+        )
+
+
+@pytest.fixture(autouse=True)
+def no_corridors():
+    Corridor.made = []
+
+
+def scripted_energy(script) -> leap.Energy:
+    """The energy of a plan is how many of its actions differ from `script(params, context)`."""
+
+    def encode(params, context: Context):
+        return script(params, context)
+
+    def total(params, wanted, actions):
+        return jnp.sum(actions != wanted).astype(jnp.float32)
+
+    return leap.from_total(encode, total, NUM_ACTIONS)
+
+
+def compiled(energy: leap.Energy, **options) -> leap.CompiledPlanner:
+    config = GibbsConfig(HORIZON, ITERATIONS, order="sequential", **options)
+    return leap.compile_planner(energy, config, chunk_sizes=(1, 4))
+
+
+def steps_then_end(params, context: Context):
+    """As many steps to the right as `params` says, then end."""
+    return jnp.where(jnp.arange(HORIZON) < params, RIGHT, END)
+
+
+@functools.cache
+def walker() -> leap.CompiledPlanner:
+    return compiled(scripted_energy(steps_then_end))
+
+
+@functools.cache
+def stroller() -> leap.CompiledPlanner:
+    """Draws left or right at random, right more often; the end sometimes, but not first."""
+
+    def total(params, memory, actions):
+        costs = jnp.array([0.6, 0.0, 1.0])[actions]
+        return costs.sum() + jnp.where(actions[0] == END, jnp.inf, 0.0)
+
+    energy = leap.from_total(lambda params, context: (), total, NUM_ACTIONS)
+    return compiled(energy, temperature=1.0)
+
+
+class Recorder:
+    """A planner that remembers what it was asked and what it answered."""
+
+    def __init__(self, plan: leap.CompiledPlanner) -> None:
+        self.plan = plan
+        self.contexts: list[Context] = []
+        self.plans: list[Plan] = []
+
+    def __call__(self, params, keys, contexts) -> Plan:
+        plans = self.plan(params, keys, contexts)
+        self.contexts.append(contexts)
+        self.plans.append(jax.device_get(plans))
+        return plans
+
+
+def start(seed: int) -> int:
+    return max(seed % 7 - 1, 0)
+
+
+@pytest.mark.parametrize("length", [0, 1, 3])
+def test_history_against_everything_that_happened(length):
+    rng = np.random.default_rng(0)
+    states = [
+        {"grid": rng.integers(1, 9, (2, 2)).astype(np.uint8), "x": np.float32(rng.normal())}
+        for _ in range(8)
+    ]
+    actions = rng.integers(0, 3, 7).tolist()
+    history = History(states[0], length, NUM_ACTIONS)
+    contexts = [history.context()]
+    for action, state in zip(actions, states[1:], strict=True):
+        history.advance(action, state)
+        contexts.append(history.context())
+    # Compared at the end, so that a later step that changes an earlier context shows.
+    for now, context in enumerate(contexts):
+        assert context.step == now == int(context.step)
+        assert context.observation is states[now]
+        assert context.past["grid"].shape == (length, 2, 2)
+        assert context.past["x"].shape == context.actions.shape == (length,)
+        assert context.past["grid"].dtype == np.uint8 and context.actions.dtype == np.int32
+        for slot in range(length):
+            step = now - length + slot
+            if step < 0:
+                assert context.actions[slot] == PAD
+                assert not context.past["grid"][slot].any() and context.past["x"][slot] == 0
+            else:
+                assert context.actions[slot] == actions[step]
+                np.testing.assert_array_equal(context.past["grid"][slot], states[step]["grid"])
+                assert context.past["x"][slot] == states[step]["x"]
+
+
+@pytest.mark.parametrize("length", [0, 2])
+def test_stacked_contexts_are_the_contexts_one_after_the_other(length):
+    histories = []
+    for episode in range(4):
+        history = History({"x": np.array([10 * episode])}, length, NUM_ACTIONS)
+        for step in range(episode):
+            history.advance(step, {"x": np.array([10 * episode + step + 1])})
+        histories.append(history)
+    stacked = stack_contexts(histories)
+    assert stacked.actions.shape == (4, length)
+    np.testing.assert_array_equal(stacked.step, [0, 1, 2, 3])
+    for row, history in enumerate(histories):
+        jax.tree.map(
+            lambda whole, one, r=row: np.testing.assert_array_equal(whole[r], one),
+            stacked,
+            history.context(),
+        )
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_the_end_action_stops_a_plan_and_makes_the_next(steps):
+    seeds = [0, 3, 6, 4]
+    episodes = leap.evaluate(Corridor, seeds, walker(), jnp.int32(steps), context=0)
+    distances = np.array([GOAL - start(seed) for seed in seeds])
+    np.testing.assert_array_equal(episodes.seeds, seeds)
+    assert episodes.successes.all()
+    np.testing.assert_array_equal(episodes.lengths, distances)
+    # Every plan is good for so many steps, and an episode that is over asks for none.
+    assert episodes.plans == np.ceil(distances / steps).sum()
+    assert 0 < episodes.planning_seconds <= episodes.seconds
+
+
+@pytest.mark.parametrize("executed", [1, 2, 3, 4, None])
+def test_only_so_many_actions_are_executed(executed):
+    seeds = [0, 5]
+    episodes = leap.evaluate(
+        Corridor, seeds, walker(), jnp.int32(HORIZON), context=0, executed=executed
+    )
+    distances = np.array([GOAL - start(seed) for seed in seeds])
+    assert episodes.plans == np.ceil(distances / (executed or HORIZON)).sum()
+    np.testing.assert_array_equal(episodes.lengths, distances)
+
+
+@pytest.mark.parametrize("iteration", [1, 2, ITERATIONS, None])
+def test_the_plan_is_executed_as_it_stood_after_an_iteration(iteration):
+    differ = 0
+    for seed in (1, 2, 8):
+        recorder = Recorder(stroller())
+        leap.evaluate(Corridor, [seed], recorder, None, context=0, iteration=iteration, executed=3)
+        planned = []
+        for plans in recorder.plans:
+            [trace], [final] = plans.trace, plans.actions
+            chosen = trace[-1 if iteration is None else iteration - 1, :3].tolist()
+            planned += chosen[: chosen.index(END)] if END in chosen else chosen
+            differ += chosen != final[:3].tolist()
+        taken = Corridor.made[-1].taken
+        assert taken == planned[: len(taken)]
+        assert len(planned) - len(taken) < 3  # the episode may be over before its last plan is
+    assert (differ > 0) == (iteration in (1, 2))
+
+
+def test_finished_episodes_leave_the_batch():
+    seeds = [0, 6, 3, 4]
+    distances = [GOAL - start(seed) for seed in seeds]
+    recorder = Recorder(walker())
+    reported = []
+    leap.evaluate(
+        Corridor,
+        seeds,
+        recorder,
+        jnp.int32(1),
+        context=2,
+        progress=lambda *numbers: reported.append(numbers),
+    )
+    assert len(recorder.contexts) == max(distances)
+    for call, contexts in enumerate(recorder.contexts):
+        left = [seed for seed, distance in zip(seeds, distances, strict=True) if distance > call]
+        positions = np.array([start(seed) + call for seed in left])
+        np.testing.assert_array_equal(contexts.observation["position"], positions)
+        np.testing.assert_array_equal(contexts.step, np.full(len(left), call))
+        for back in (1, 2):
+            known = call >= back
+            past = contexts.past["position"][:, -back]
+            np.testing.assert_array_equal(past, positions - back if known else 0 * positions)
+            assert (contexts.actions[:, -back] == (RIGHT if known else PAD)).all()
+    over = [sum(distance <= call + 1 for distance in distances) for call in range(max(distances))]
+    assert reported == [(number, number) for number in over]
+
+
+def test_an_episode_is_a_success_only_where_the_environment_says_so():
+    def always_left(params, context):
+        return jnp.full(HORIZON, LEFT)
+
+    def there_and_back(params, context):
+        return jnp.where((context.step + jnp.arange(HORIZON)) % 2 == 0, RIGHT, LEFT)
+
+    fallen = leap.evaluate(
+        Corridor, [2, 5], compiled(scripted_energy(always_left)), None, context=0
+    )
+    assert not fallen.successes.any()
+    np.testing.assert_array_equal(fallen.lengths, [2, 5])
+    late = leap.evaluate(Corridor, [2], compiled(scripted_energy(there_and_back)), None, context=0)
+    assert not late.successes.any()
+    assert late.lengths == [LIMIT]
+    assert late.plans == np.ceil(LIMIT / HORIZON)
+
+
+def play(seeds, **options):
+    episodes = leap.evaluate(Corridor, seeds, stroller(), None, context=1, **options)
+    made = Corridor.made[-len(seeds) :]
+    return {
+        seed: (bool(success), int(length), adapter.taken)
+        for seed, success, length, adapter in zip(
+            seeds, episodes.successes, episodes.lengths, made, strict=True
+        )
+    }
+
+
+def test_an_episode_plays_the_same_way_alone_or_in_any_batch():
+    seeds = list(range(20, 33))
+    together = play(seeds)
+    assert len({str(result) for result in together.values()}) > 6
+    for subset in ([20], seeds[::-1], seeds[3:9]):
+        assert play(subset) == {seed: together[seed] for seed in subset}
+    for result, length, taken in together.values():
+        assert length == len(taken) and (not result or length >= 1)
+
+
+def test_the_seed_of_the_planner_matters_and_suffices():
+    seeds = list(range(20, 33))
+    assert play(seeds, seed=1) == play(seeds, seed=1)
+    assert play(seeds, seed=1) != play(seeds, seed=2)
+
+
+def ends_at_once(params, context):
+    return jnp.full(HORIZON, END)
+
+
+class StuckError(Exception):
+    pass
+
+
+def give_up_after(rounds: int):
+    calls = []
+
+    def progress(over: int, succeeded: int) -> None:
+        calls.append(over)
+        if len(calls) > rounds:
+            raise StuckError
+
+    return progress
+
+
+@pytest.mark.xfail(
+    strict=True, raises=StuckError, reason="rollouts.evaluate replans forever: no step, no limit"
+)
+def test_plans_that_end_at_once_do_not_go_on_for_ever():
+    plan = compiled(scripted_energy(ends_at_once))
+    leap.evaluate(Corridor, [0], plan, None, context=0, progress=give_up_after(50))
+
+
+@pytest.mark.xfail(
+    strict=True, raises=StuckError, reason="rollouts.evaluate replans forever with executed=0"
+)
+def test_to_execute_nothing_is_refused():
+    with pytest.raises(ValueError, match="executed"):
+        leap.evaluate(
+            Corridor,
+            [0],
+            walker(),
+            jnp.int32(1),
+            context=0,
+            executed=0,
+            progress=give_up_after(50),
+        )
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="rollouts.evaluate indexes the trace with iteration - 1: 0 is taken for the last "
+    "iteration, and one beyond N too",
+)
+@pytest.mark.parametrize("iteration", [0, ITERATIONS + 1])
+def test_an_iteration_that_there_is_not_is_refused(iteration):
+    with pytest.raises(ValueError, match="iteration"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), context=0, iteration=iteration)
+
+
+class Line(gym.Env):
+    """Gymnasium's view of a corridor: action 0 stays, 1 goes on, 2 gives up."""
+
+    observation_space = gym.spaces.Box(0, 10, (1,), np.float32)
+
+    def __init__(self, action_space: gym.Space | None = None) -> None:
+        self.action_space = action_space or gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position = int(self.np_random.integers(0, 3))
+        self.taken = []
+        return np.array([self.position], np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.taken.append(action)
+        self.position += action == 1
+        arrived = self.position == 4
+        reward = 2.0 if arrived else -1.0
+        over = bool(arrived or action == 2)
+        return np.array([self.position], np.float32), reward, over, len(self.taken) >= 9, {}
+
+
+def test_any_gymnasium_environment_with_discrete_actions():
+    adapter = GymnasiumAdapter(Line())
+    assert adapter.num_actions == 4  # the end action is ours
+    first = adapter.reset(3)
+    np.testing.assert_array_equal(adapter.reset(3), first)
+    assert {float(adapter.reset(seed)[0]) for seed in range(20)} == {0.0, 1.0, 2.0}
+    adapter.env.position = 3
+    stay = adapter.step(0)
+    assert (stay.reward, stay.terminated, stay.truncated, stay.success) == (-1, False, False, False)
+    arrive = adapter.step(1)
+    assert (arrive.reward, arrive.terminated, arrive.success) == (2.0, True, True)
+    np.testing.assert_array_equal(arrive.observation, [4.0])
+    adapter.reset(0)
+    given_up = adapter.step(2)
+    assert given_up.terminated and not given_up.success
+    adapter.reset(0)
+    late = [adapter.step(0) for _ in range(9)][-1]
+    assert late.truncated and not late.terminated and not late.success
+
+
+def test_evaluation_in_a_gymnasium_environment():
+    made = []
+
+    def make() -> GymnasiumAdapter:
+        made.append(GymnasiumAdapter(Line()))
+        return made[-1]
+
+    def on_or_up(params, context):
+        return jnp.where(context.observation[0] < params, 1, 2) * jnp.ones(HORIZON, jnp.int32)
+
+    def total(params, wanted, actions):
+        return jnp.sum(actions != wanted).astype(jnp.float32)
+
+    plan = compiled(leap.from_total(on_or_up, total, 4))
+    seeds = [0, 1, 2, 3, 4]
+    starts = np.array([int(GymnasiumAdapter(Line()).reset(seed)[0]) for seed in seeds])
+    assert len(set(starts.tolist())) > 1
+    episodes = leap.evaluate(make, seeds, plan, jnp.float32(1.5), context=0)
+    np.testing.assert_array_equal(episodes.successes, starts < 1.5)
+    np.testing.assert_array_equal(episodes.lengths, np.where(starts < 1.5, 4 - starts, 1))
+    assert len(made) == len(seeds)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary(2)],
+)
+def test_other_action_spaces_are_refused(space):
+    with pytest.raises(ValueError, match="Discrete action space"):
+        GymnasiumAdapter(Line(space))
+
+
+@pytest.mark.xfail(
+    strict=True, reason="GymnasiumAdapter passes 0 .. n - 1 whatever the space's first action is"
+)
+def test_actions_that_do_not_start_at_zero():
+    adapter = GymnasiumAdapter(Line(gym.spaces.Discrete(2, start=1)))
+    adapter.reset(0)
+    for action in range(adapter.num_actions - 1):
+        adapter.step(action)
+    assert adapter.env.taken == [1, 2]

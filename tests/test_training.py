@@ -1,0 +1,342 @@
+import dataclasses
+import functools
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from leapjax import training
+from leapjax.agents import leap
+from leapjax.agents.leap import TrainingConfig
+from leapjax.checkpoints import Checkpoints
+from leapjax.data import windows
+from leapjax.envs import vocabulary
+from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.models import trajectory
+from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.planners import GibbsConfig
+from leapjax.training import NonFiniteLoss
+from leapjax.types import Agent, TrainState
+
+WORDS, SIDE = 5, 7
+SIZES = Sizes(SIDE, vocabulary.SIZE, NUM_ACTIONS, context=0, horizon=4, max_steps=49)
+MODEL = ModelConfig(
+    layers=1, heads=2, width=16, channels=4, rounds=1, sweeps=2, fields=2, dropout=0.0
+)
+TRAINING = TrainingConfig(steps=400, batch=8, warmup=20, learning_rate=1e-2)
+AUGMENTED = dataclasses.replace(TRAINING, augment=True)
+
+
+@functools.cache
+def tiny() -> tuple[Agent, object]:
+    """An agent and its train step, compiled once for all tests."""
+    agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS)
+    step = training.make_train_step(
+        agent, lambda key, data: leap.make_batch(key, data, TRAINING, SIZES)
+    )
+    return agent._replace(init=jax.jit(agent.init)), step
+
+
+@pytest.fixture
+def data(local_demonstrations):
+    return jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations))
+
+
+def ignore(step, state, means):
+    pass
+
+
+def assert_identical(a, b) -> None:
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(a), jax.device_get(b))
+
+
+def test_a_run_that_is_stopped_and_continued_is_the_run_that_was_not(data, tmp_path):
+    agent, step = tiny()
+    key = jax.random.key(7)
+    whole = training.train(step, agent.init(jax.random.key(0)), data, key, 6, ignore)
+    assert int(whole.step) == 6
+
+    first = training.train(step, agent.init(jax.random.key(0)), data, key, 3, ignore)
+    saved = Checkpoints(tmp_path / "checkpoints")
+    saved.save(first)
+    saved.close()
+    reopened = Checkpoints(tmp_path / "checkpoints")
+    assert reopened.latest == 3
+    restored = reopened.restore(agent.init(jax.random.key(1)))
+    reopened.close()
+    assert_identical(restored, first)
+    second = training.train(step, restored, data, key, 6, ignore)
+    assert_identical(second, whole)
+
+    other = training.train(step, agent.init(jax.random.key(0)), data, jax.random.key(8), 6, ignore)
+    differences = jax.tree.map(lambda a, b: not np.array_equal(a, b), other.params, whole.params)
+    assert any(jax.tree.leaves(differences))
+
+
+def recording_agent() -> Agent:
+    """Learns nothing, but reports the batch and the key that it was given."""
+
+    def init(key):
+        return TrainState({"w": jnp.zeros(3)}, (), jnp.int32(0))
+
+    def update(state, batch, key):
+        params = jax.tree.map(lambda w: w + jax.random.normal(key, w.shape), state.params)
+        metrics = {"loss": jnp.zeros(()), "batch": batch, "key": jax.random.key_data(key)}
+        return TrainState(params, (), state.step + 1), metrics
+
+    return Agent(init, update, None, lambda params, key, context: None)
+
+
+def test_batch_k_is_a_function_of_the_key_and_k(data):
+    agent = recording_agent()
+    step = training.make_train_step(
+        agent, lambda key, data: leap.make_batch(key, data, AUGMENTED, SIZES)
+    )
+    key = jax.random.key(3)
+
+    def at(k: int, weight: float = 0.0, key=key):
+        state = TrainState({"w": jnp.full(3, weight)}, (), jnp.int32(k))
+        return step(state, data, key)[1]
+
+    shapes = jax.tree.map(jnp.shape, at(0)["batch"])
+    assert shapes.actions == (8, 4)
+    assert shapes.context.observation.grid == (8, SIDE, SIDE, 3)
+    assert shapes.context.past.grid == (8, 0, SIDE, SIDE, 3)
+
+    state, seen = agent.init(key), []
+    for k in range(4):
+        state, metrics = step(state, data, key)
+        assert int(state.step) == k + 1
+        seen.append(metrics)
+    # In any order and whatever the parameters are.
+    for k in (3, 0, 2, 1):
+        assert_identical(at(k, weight=float(k)), seen[k])
+
+    def fingerprint(metrics) -> tuple[bytes, bytes]:
+        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(metrics["batch"])]
+        return b"".join(leaves), np.asarray(metrics["key"]).tobytes()
+
+    others = [at(0, key=jax.random.key(4)), at(1000)]
+    for prints in zip(*map(fingerprint, [*seen, *others]), strict=True):
+        assert len(set(prints)) == 6  # no two batches and no two keys are the same
+    # Nor does the update's noise come from the key that drew the batch.
+    batch_key = jax.random.fold_in(jax.random.fold_in(key, training.BATCH_STREAM), 0)
+    assert not np.array_equal(seen[0]["key"], jax.random.key_data(batch_key))
+
+
+def entropy_of_positions(data) -> float:
+    """The least loss of a model that looks at nothing but the position in the plan."""
+    many = dataclasses.replace(TRAINING, batch=1000)
+    draw = jax.jit(lambda key: leap.make_batch(key, data, many, SIZES).actions)
+    actions = np.asarray(draw(jax.random.key(0)))
+    shares = np.stack([(actions == action).mean(axis=0) for action in range(NUM_ACTIONS)])
+    return float(-(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=0).mean())
+
+
+def test_it_learns_a_few_demonstrations_by_heart(data):
+    agent, step = tiny()
+    losses, accuracies = [], []
+
+    def report(done, state, means):
+        losses.append(means["loss"])
+        accuracies.append(means["accuracy"])
+
+    training.train(
+        step, agent.init(jax.random.key(0)), data, jax.random.key(1), 400, report, report_every=50
+    )
+    assert len(losses) == 8
+    assert losses[-1] < 0.6 * losses[0]
+    assert losses[-1] < 0.7 * entropy_of_positions(data)
+    assert accuracies[-1] > accuracies[0] + 0.15
+
+
+def made_up_step(losses):
+    """A train step whose losses are given."""
+
+    def step(state, data, key):
+        loss = np.float32(losses[int(state.step)])
+        return state._replace(step=state.step + 1), {"loss": loss, "twice": 2 * loss}
+
+    return step
+
+
+def run(losses, report_every: int, begin: int = 0) -> list[tuple[int, dict[str, float]]]:
+    reports = []
+    training.train(
+        made_up_step(losses),
+        TrainState({}, (), np.int32(begin)),
+        None,
+        None,
+        len(losses),
+        lambda step, state, means: reports.append((step, int(state.step), means)),
+        report_every,
+    )
+    return reports
+
+
+def test_reports_hold_the_means_since_the_last():
+    assert run([1, 2, 3, 4, 5, 6, 7], 3) == [
+        (3, 3, {"loss": 2, "twice": 4}),
+        (6, 6, {"loss": 5, "twice": 10}),
+        (7, 7, {"loss": 7, "twice": 14}),
+    ]
+    # A run that is continued reports at the same steps.
+    assert run([1, 2, 3, 4, 5, 6, 7], 3, begin=4) == [
+        (6, 6, {"loss": 5.5, "twice": 11}),
+        (7, 7, {"loss": 7, "twice": 14}),
+    ]
+    assert run([1, 2], 3, begin=2) == []
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(("step", "reported"), [(1, 0), (5, 0), (6, 1), (8, 1), (12, 2)])
+def test_a_loss_that_is_not_finite_names_its_step(bad, step, reported):
+    losses = [1.0] * 12
+    losses[step - 1] = bad
+    losses[step:] = [math.nan] * (12 - step)  # as it goes: it never recovers
+    reports = []
+    with pytest.raises(NonFiniteLoss, match=rf"step {step} is "):
+        training.train(
+            made_up_step(losses),
+            TrainState({}, (), np.int32(0)),
+            None,
+            None,
+            12,
+            lambda *report: reports.append(report),
+            report_every=5,
+        )
+    assert len(reports) == reported
+
+
+def test_a_real_run_whose_parameters_break_is_stopped(data):
+    agent, step = tiny()
+    state = training.train(step, agent.init(jax.random.key(0)), data, jax.random.key(1), 2, ignore)
+    broken = state._replace(params=jax.tree.map(lambda p: p * jnp.nan, state.params))
+    with pytest.raises(NonFiniteLoss, match="step 3 is nan"):
+        training.train(step, broken, data, jax.random.key(1), 5, ignore)
+
+
+def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
+    """A model's parameters, and the paths of the modules that are embeddings or norms."""
+    model = ModelConfig(
+        architecture, layers=1, heads=2, width=16, channels=4, rounds=1, sweeps=2, fields=2
+    )
+    sizes = Sizes(SIDE, vocabulary.SIZE, NUM_ACTIONS, context=2, horizon=3, max_steps=49)
+    module = trajectory.build(model, sizes)
+    found = set()
+
+    def note(call, args, kwargs, context):
+        if isinstance(context.module, nn.Embed | nn.LayerNorm | nn.GroupNorm):
+            found.add(context.module.path)
+        return call(*args, **kwargs)
+
+    def init(key):
+        context = trajectory.blank_context(sizes, WORDS)
+        with nn.intercept_methods(note):
+            actions = jnp.zeros(sizes.horizon, jnp.int32)
+            return module.init(key, context, actions, method=leap._encode_and_score)
+
+    return jax.eval_shape(init, jax.random.key(0)), found
+
+
+@pytest.mark.parametrize("architecture", trajectory.ARCHITECTURES)
+def test_weight_decay_leaves_embeddings_norms_and_biases(architecture):
+    params, special = parameters_of(architecture)
+    assert len(special) > 4
+    mask = leap.decayed_parameters(params)
+    assert jax.tree.structure(mask) == jax.tree.structure(params)
+    decayed = 0
+    for path, is_decayed in jax.tree_util.tree_leaves_with_path(mask):
+        _, *names = (entry.key for entry in path)
+        in_special_module = tuple(names[:-1]) in special
+        expected = not in_special_module and names[-1] != "bias"
+        assert is_decayed == expected, names
+        decayed += is_decayed
+    assert decayed > 10
+
+
+def test_weight_decay_shrinks_what_has_no_gradient():
+    config = TrainingConfig(steps=100, warmup=0, learning_rate=0.5, weight_decay=0.1)
+    optimizer = leap.make_optimizer(config)
+    params = {
+        "dense": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)},
+        "norm": {"scale": jnp.ones(2)},
+        "words": {"embedding": jnp.ones((3, 2))},
+    }
+    gradients = jax.tree.map(jnp.zeros_like, params)
+    state = optimizer.init(params)
+    updates, _ = jax.jit(optimizer.update)(gradients, state, params)
+    after = optax.apply_updates(params, updates)
+    np.testing.assert_allclose(after["dense"]["kernel"], 1 - 0.5 * 0.1, rtol=1e-6)
+    for name, leaf in [("dense", "bias"), ("norm", "scale"), ("words", "embedding")]:
+        np.testing.assert_array_equal(after[name][leaf], 1)
+
+
+def learning_rates(config: TrainingConfig) -> np.ndarray:
+    """What each step really moves: Adam's update of a constant gradient is the rate itself."""
+    optimizer = leap.make_optimizer(config)
+    params = {"bias": jnp.zeros(())}
+
+    def step(state, _):
+        updates, state = optimizer.update({"bias": jnp.float32(0.5)}, state, params)
+        return state, -updates["bias"]
+
+    return np.asarray(jax.lax.scan(step, optimizer.init(params), None, length=config.steps)[1])
+
+
+def test_the_learning_rate_warms_up_and_decays():
+    config = TrainingConfig(steps=200, warmup=10, learning_rate=1e-2, final_fraction=0.1)
+    rates = learning_rates(config)
+    assert rates[0] == pytest.approx(1e-3, rel=1e-3)  # not zero: the first step counts too
+    assert (np.diff(rates[:11]) > 0).all()
+    assert rates.max() == rates[10] == pytest.approx(1e-2, rel=1e-3)
+    assert (np.diff(rates[10:]) < 0).all()
+    assert rates[-1] == pytest.approx(1e-3, rel=0.01)
+    # A cosine: half way down in the middle.
+    assert rates[105] == pytest.approx((1e-2 + 1e-3) / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("steps", [1, 5, 30])
+def test_a_short_run_warms_up_for_a_tenth_of_it_at_most(steps):
+    rates = learning_rates(TrainingConfig(steps=steps, warmup=100, learning_rate=1e-2))
+    assert rates.argmax() == steps // 10
+    assert rates.max() == pytest.approx(1e-2, rel=1e-3)
+    assert (rates > 0).all()
+
+
+def test_gradients_are_clipped_by_their_global_norm():
+    config = TrainingConfig(steps=10, warmup=0, clip=1.0)
+    # Adam forgets the scale of a gradient, so look at what it remembers of the first.
+    optimizer = leap.make_optimizer(config)
+    params = {"bias": jnp.zeros(2)}
+    start, update = optimizer.init(params), jax.jit(optimizer.update)
+
+    def first_moment(gradient: list[float]) -> np.ndarray:
+        _, state = update({"bias": jnp.array(gradient)}, start, params)
+        [adam] = [s for s in jax.tree.leaves(state, is_leaf=is_adam) if is_adam(s)]
+        return np.asarray(adam.mu["bias"]) / (1 - config.betas[0])
+
+    def is_adam(state) -> bool:
+        return isinstance(state, optax.ScaleByAdamState)
+
+    np.testing.assert_allclose(first_moment([0.3, 0.4]), [0.3, 0.4], rtol=1e-5)
+    np.testing.assert_allclose(first_moment([30.0, 40.0]), [0.6, 0.8], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"batch": 0}, "batch must be at least 1"),
+        ({"masking": "all"}, "unknown masking 'all'"),
+        ({"windows": "window"}, "unknown windows 'window'"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(setting, says):
+    with pytest.raises(ValueError, match=says):
+        TrainingConfig(**setting)

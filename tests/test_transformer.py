@@ -1,0 +1,173 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.models.transformer import KeysValues, Transformer
+from tests.enumerable import quick_jit
+
+LAYERS, WIDTH, HEADS = 2, 16, 2
+PREFIX, TOKENS = 4, 5
+MODULE = Transformer(LAYERS, WIDTH, HEADS)
+
+
+def random_like(shapes, seed=0):
+    """Parameters large enough that a wrong mask shows."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda s: rng.normal(scale=0.5, size=s.shape).astype(np.float32), shapes)
+
+
+EVERYWHERE = np.arange(TOKENS)
+RNG = np.random.default_rng(1)
+X = RNG.normal(size=(TOKENS, WIDTH)).astype(np.float32)
+FIXED = RNG.normal(size=(PREFIX, WIDTH)).astype(np.float32)
+PARAMS = random_like(jax.eval_shape(MODULE.init, jax.random.key(0), X, EVERYWHERE))
+
+
+@quick_jit
+def run(params, x, queried):
+    return MODULE.apply(params, x, queried)
+
+
+@quick_jit
+def run_with_prefix(params, fixed, x, queried, prefix_mask):
+    memory = MODULE.apply(params, fixed, prefix_mask, method="prefix")
+    return MODULE.apply(params, x, queried, memory, prefix_mask)
+
+
+@quick_jit
+def run_with_unmasked_prefix(params, fixed, x, queried):
+    memory = MODULE.apply(params, fixed, method="prefix")
+    return MODULE.apply(params, x, queried, memory)
+
+
+# The oracle: all tokens together, an explicit mask, one head at a time, in float64.
+
+
+def norm(p, x):
+    centred = x - x.mean(-1, keepdims=True)
+    return centred / np.sqrt(x.var(-1, keepdims=True) + 1e-6) * p["scale"] + p["bias"]
+
+
+def linear(p, x):
+    return x @ np.asarray(p["kernel"], np.float64) + p.get("bias", 0.0)
+
+
+def gelu(x):
+    return 0.5 * x * (1 + np.tanh(np.sqrt(2 / np.pi) * (x + 0.044715 * x**3)))
+
+
+def oracle(params, x, mask):
+    """Outputs at every token, where token i attends to token j if `mask[i, j]`."""
+    params = params["params"]
+    x = x.astype(np.float64)
+    size = WIDTH // HEADS
+    for index in range(LAYERS):
+        p = params[f"blocks_{index}"]
+        h = norm(p["norm_attention"], x)
+        queries, keys, values = (linear(p[name], h) for name in ("query", "key", "value"))
+        attended = np.zeros_like(x)
+        for head in range(HEADS):
+            part = slice(head * size, (head + 1) * size)
+            for i in range(len(x)):
+                seen = np.flatnonzero(mask[i])
+                scores = keys[seen, part] @ queries[i, part] / np.sqrt(size)
+                weights = np.exp(scores - scores.max())
+                attended[i, part] = weights / weights.sum() @ values[seen, part]
+        x = x + linear(p["output"], attended)
+        h = linear(p["expand"], norm(p["norm_perceptron"], x))
+        x = x + linear(p["contract"], gelu(h))
+    return norm(params["norm"], x)
+
+
+def joint_mask(prefix_mask=None):
+    """The prefix sees itself; the tokens see the prefix and each other."""
+    mask = np.zeros((PREFIX + TOKENS, PREFIX + TOKENS), bool)
+    mask[:, :PREFIX] = True if prefix_mask is None else prefix_mask
+    mask[PREFIX:, PREFIX:] = True
+    return mask
+
+
+ALL = np.ones((PREFIX + TOKENS, PREFIX + TOKENS), bool)
+CLOSE = {"rtol": 1e-4, "atol": 1e-4}
+JOINED = np.concatenate([FIXED, X])
+
+
+def test_bidirectional_attention_equals_the_oracle():
+    expected = oracle(PARAMS, X, np.ones((TOKENS, TOKENS), bool))
+    np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE), expected, **CLOSE)
+
+
+def test_cached_prefix_equals_running_all_tokens_together():
+    actual = run_with_unmasked_prefix(PARAMS, FIXED, X, EVERYWHERE)
+    expected = oracle(PARAMS, JOINED, joint_mask())[PREFIX:]
+    np.testing.assert_allclose(actual, expected, **CLOSE)
+    # The mask matters: a prefix that saw the tokens would give something else.
+    assert np.abs(oracle(PARAMS, JOINED, ALL)[PREFIX:] - expected).max() > 0.01
+
+
+def test_masked_prefix_equals_running_all_tokens_together():
+    prefix_mask = np.array([True, False, True, False])
+    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, prefix_mask)
+    expected = oracle(PARAMS, JOINED, joint_mask(prefix_mask))[PREFIX:]
+    np.testing.assert_allclose(actual, expected, **CLOSE)
+    assert np.abs(oracle(PARAMS, JOINED, joint_mask())[PREFIX:] - expected).max() > 0.05
+
+
+def test_masked_prefix_tokens_change_nothing():
+    prefix_mask = np.array([True, False, True, False])
+    changed = FIXED + np.where(prefix_mask, 0.0, 3.0)[:, None].astype(np.float32)
+    before = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, prefix_mask)
+    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, prefix_mask)
+    np.testing.assert_array_equal(after, before)
+    changed[0] += RNG.normal(size=WIDTH)
+    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, prefix_mask)
+    assert np.abs(after - before).max() > 0.05
+
+
+def test_a_prefix_that_is_masked_everywhere_is_no_prefix():
+    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, np.zeros(PREFIX, bool))
+    np.testing.assert_allclose(actual, run(PARAMS, X, EVERYWHERE), **CLOSE)
+
+
+@pytest.mark.parametrize("queried", [[2], [4, 0], [3, 3, 1]])
+def test_last_layer_at_queried_positions_is_the_full_output_there(queried):
+    queried = np.array(queried)
+    np.testing.assert_allclose(
+        run(PARAMS, X, queried), run(PARAMS, X, EVERYWHERE)[queried], rtol=1e-5, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        run_with_unmasked_prefix(PARAMS, FIXED, X, queried),
+        run_with_unmasked_prefix(PARAMS, FIXED, X, EVERYWHERE)[queried],
+        rtol=1e-5,
+        atol=1e-5,
+    )
+
+
+def test_attention_without_positions_is_equivariant_to_order():
+    order = np.array([3, 0, 4, 1, 2])
+    np.testing.assert_allclose(
+        run(PARAMS, X[order], EVERYWHERE), run(PARAMS, X, EVERYWHERE)[order], **CLOSE
+    )
+
+
+def test_prefix_holds_keys_and_values_of_every_layer():
+    memory = jax.eval_shape(lambda p, x: MODULE.apply(p, x, method="prefix"), PARAMS, FIXED)
+    shape = (PREFIX, HEADS, WIDTH // HEADS)
+    assert [(type(m), m.keys.shape, m.values.shape) for m in memory] == [
+        (KeysValues, shape, shape)
+    ] * LAYERS
+
+
+def test_dropout_is_random_in_training_only():
+    module = Transformer(LAYERS, WIDTH, HEADS, dropout=0.5)
+
+    @quick_jit
+    def train(key):
+        return module.apply(PARAMS, X, EVERYWHERE, deterministic=False, rngs={"dropout": key})
+
+    first, second = train(jax.random.key(0)), train(jax.random.key(1))
+    np.testing.assert_array_equal(train(jax.random.key(0)), first)
+    assert np.abs(first - second).max() > 0.05
+    plain = quick_jit(lambda x: module.apply(PARAMS, x, EVERYWHERE))(jnp.asarray(X))
+    np.testing.assert_allclose(plain, run(PARAMS, X, EVERYWHERE), rtol=1e-6, atol=1e-6)
