@@ -264,17 +264,17 @@ def play(seeds, **options):
 
 
 def test_an_episode_plays_the_same_way_alone_or_in_any_batch():
-    seeds = list(range(20, 33))
+    seeds = list(range(20, 29))
     together = play(seeds)
-    assert len({str(result) for result in together.values()}) > 6
-    for subset in ([20], seeds[::-1], seeds[3:9]):
+    assert len({str(result) for result in together.values()}) > 4
+    for subset in ([20], seeds[::-1], seeds[3:6]):
         assert play(subset) == {seed: together[seed] for seed in subset}
     for result, length, taken in together.values():
         assert length == len(taken) and (not result or length >= 1)
 
 
 def test_the_seed_of_the_planner_matters_and_suffices():
-    seeds = list(range(20, 33))
+    seeds = list(range(20, 29))
     assert play(seeds, seed=1) == play(seeds, seed=1)
     assert play(seeds, seed=1) != play(seeds, seed=2)
 
