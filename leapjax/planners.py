@@ -38,8 +38,14 @@ class GibbsConfig:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
+        schedules.linear_temperatures(self.temperature, self.last_temperature, 1)  # checks them
         if self.order not in ORDERS:
             raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
+
+    @property
+    def last_temperature(self) -> float:
+        """The temperature of the last iteration."""
+        return self.temperature if self.final_temperature is None else self.final_temperature
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +116,7 @@ def _gibbs_chain(
     """One chain: the final actions `[T]` and the actions after every iteration `[N, T]`."""
     horizon, iterations = config.horizon, config.iterations
     order_key, noise_key, start_key = jax.random.split(key, 3)
-    last = config.temperature if config.final_temperature is None else config.final_temperature
+    last = config.last_temperature
     temperatures = schedules.linear_temperatures(config.temperature, last, iterations)
     positions = _scan_order(order_key, config)  # [N - 1, P]
     noisy = max(config.temperature, last) > 0
@@ -135,7 +141,10 @@ def _gibbs_chain(
     ) -> tuple[jax.Array, jax.Array]:
         where, gumbel, temperature = inputs
         energies = energy.conditional(params, memory, actions, where)  # [P, A]
-        actions = actions.at[where].set(_draw(energies, gumbel, temperature))
+        drawn = _draw(energies, gumbel, temperature)
+        # Where every action is forbidden another position has to change: leave this one.
+        hopeless = jnp.all(jnp.isinf(energies), axis=-1)
+        actions = actions.at[where].set(jnp.where(hopeless, actions[where], drawn))
         return actions, actions
 
     inputs = (
@@ -246,12 +255,13 @@ class CompiledPlanner:
             raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
         planner = planner_for(config)
 
-        def plan_chunk(params: Params, keys: jax.Array, contexts: PyTree) -> Plan:
+        def plan_chunk(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
+            keys = jax.random.wrap_key_data(key_data, impl=kind)
             return jax.vmap(lambda key, context: planner(energy, params, key, context, config))(
                 keys, contexts
             )
 
-        self.plan_chunk = jax.jit(plan_chunk)
+        self.plan_chunk = jax.jit(plan_chunk, static_argnums=0)
 
     def __call__(self, params: Params, keys: jax.Array, contexts: PyTree) -> Plan:
         """Plans for B contexts.
@@ -262,7 +272,7 @@ class CompiledPlanner:
             contexts: leaves with a leading `[B]`.
 
         Returns:
-            A `Plan` whose fields have a leading `[B]`.
+            A `Plan` of NumPy arrays with a leading `[B]`.
 
         Raises:
             ValueError: no contexts, or not as many as keys.
@@ -276,18 +286,22 @@ class CompiledPlanner:
                     f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
                     f"dimension must be the number of keys, {batch}"
                 )
+        # Cut with NumPy: each slice of a device array would be a program of its own.
+        inputs = jax.tree.map(np.asarray, (jax.random.key_data(keys), contexts))
+        kind = str(jax.random.key_impl(keys))
+        chunks = split_batch(batch, self.chunk_sizes)
         plans = []
-        for start, size, used in split_batch(batch, self.chunk_sizes):
+        for start, size, _ in chunks:
             # A last chunk that is not full repeats its last row, which is then cut off.
             rows = np.minimum(np.arange(start, start + size), batch - 1)
-            window = slice(start, start + size) if used == size else rows
-            chunk = self.plan_chunk(
-                params, keys[window], jax.tree.map(lambda leaf, w=window: leaf[w], contexts)
+            plans.append(
+                self.plan_chunk(kind, params, *jax.tree.map(lambda leaf, r=rows: leaf[r], inputs))
             )
-            plans.append(jax.tree.map(lambda leaf, n=used: leaf[:n], chunk))
-        if len(plans) == 1:
-            return plans[0]
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
+        parts = [
+            jax.tree.map(lambda leaf, n=used: np.asarray(leaf)[:n], plan)
+            for plan, (_, _, used) in zip(plans, chunks, strict=True)
+        ]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     def sizes_up_to(self, batch: int) -> list[int]:
         """The chunk sizes that batches of at most so many plans can need."""

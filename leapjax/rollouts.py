@@ -78,7 +78,8 @@ def evaluate(
 ) -> Episodes:
     """Plays one episode per level seed, all in lockstep, replanning when a plan is used up.
 
-    Finished episodes leave the batch. A plan's randomness derives from (seed, level seed,
+    Finished episodes leave the batch; one whose plan ends before its first action has given
+    up. A plan's randomness derives from (seed, level seed,
     replan index), so an episode plays the same way whatever else is in the batch.
 
     Args:
@@ -91,7 +92,12 @@ def evaluate(
         executed: actions to execute before replanning; None for all T.
         iteration: execute the plan as it stood after this many iterations; None: the last.
         progress: called with (episodes over, successes) after every round.
+
+    Raises:
+        ValueError: nothing to execute, or an iteration that there is not.
     """
+    if executed is not None and executed < 1:
+        raise ValueError(f"executed must be at least 1, got {executed}")
     begun = time.perf_counter()
     adapters = [make_adapter() for _ in seeds]
     end = adapters[0].num_actions - 1
@@ -108,13 +114,15 @@ def evaluate(
         episodes = np.array([seeds[i] for i in active], np.uint32)
         keys = planners.plan_keys(seed, episodes, np.full(len(active), replan, np.uint32))
         plans = plan(params, keys, stack_contexts([histories[i] for i in active]))
+        if iteration is not None and not 1 <= iteration <= plans.trace.shape[1]:
+            raise ValueError(f"iteration {iteration} is not in 1 .. {plans.trace.shape[1]}")
         chosen = plans.actions if iteration is None else plans.trace[:, iteration - 1]
         actions = np.asarray(chosen)[:, :executed]  # [B, executed]
         planning_seconds += time.perf_counter() - before
         planned += len(active)
         survivors = []
         for row, episode in enumerate(active):
-            over = False
+            over = actions[row, 0] == end
             for action in actions[row]:
                 if action == end:
                     break

@@ -2,9 +2,11 @@
 
 import os
 
-# Tests compile much and compute little: without LLVM's optimisations they take half the time.
+# Tests compile much and compute little: without optimisations they take a fraction of the time.
 # XLA reads this when JAX starts, so it comes before every import of JAX.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
 
 import jax
 import pytest

@@ -38,6 +38,12 @@ def workplace(tmp_path_factory):
         yield folder
 
 
+@pytest.fixture(autouse=True)
+def minari_folder(workplace, monkeypatch):
+    """All tests here share the data sets of the toy run."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(workplace / "datasets"))
+
+
 def run_folder(workplace):
     (folder,) = (p for p in (workplace / "runs").iterdir() if p.is_dir() and "leapjax" in p.name)
     return folder

@@ -331,10 +331,6 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
     assert_same(storage.load(NAME, LEVEL, SIDE), [expected])
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="storage._observation converts before anything is checked: a plain ValueError",
-)
 def test_fields_of_text_instead_of_numbers(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     space = storage.observation_space(SIDE, LEVEL.words)
@@ -345,10 +341,6 @@ def test_fields_of_text_instead_of_numbers(local_demonstrations):
     refused()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="storage._check_episode does not look at the shape and type of actions",
-)
 def test_continuous_actions(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     steps = len(demonstration.actions)
@@ -361,10 +353,6 @@ def test_continuous_actions(local_demonstrations):
     refused()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="storage._observation converts to uint8 before the ranges are checked",
-)
 def test_numbers_that_wrap_around_are_out_of_range(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     space = storage.observation_space(SIDE, LEVEL.words)
@@ -375,10 +363,6 @@ def test_numbers_that_wrap_around_are_out_of_range(local_demonstrations):
     assert "grid objects" in refused()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="storage._observation truncates fractions to whole numbers",
-)
 def test_numbers_that_are_not_whole(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     space = storage.observation_space(SIDE, LEVEL.words)
@@ -389,10 +373,6 @@ def test_numbers_that_are_not_whole(local_demonstrations):
     refused()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="storage.dataset_id gives the paper's GoToLocalS7N5 and BabyAI-GoToLocalS7N5-v0 one id",
-)
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
     ids = [storage.dataset_id(level, 500, 0) for level in known]

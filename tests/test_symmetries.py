@@ -435,11 +435,6 @@ def test_the_past_is_transformed_with_the_present():
             np.testing.assert_array_equal(before.goal, after.goal)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="windows.reflect moves the blank states before an episode's start: pose and goal "
-    "(0, 0) become (0, S - 1), which planning never shows",
-)
 def test_what_was_before_the_start_stays_blank():
     level = levels.find_level("GoToLocalS7N5")
     collected = demonstrations.collect(level, 1, seed=1).demonstrations

@@ -27,8 +27,7 @@ FORMAT = 1  # raised whenever what a demonstration holds changes: old caches are
 
 def dataset_id(level: Level, count: int, seed: int) -> str:
     """The id under which `count` demonstrations for a training seed are cached."""
-    name = level.name.removeprefix("BabyAI-").removesuffix("-v0")
-    return f"leapjax/{name}/bot-{count}-seed{seed}-v{FORMAT}"
+    return f"leapjax/{level.name}/bot-{count}-seed{seed}-v{FORMAT}"
 
 
 def observation_space(side: int, words: int) -> gym.spaces.Dict:
@@ -115,32 +114,40 @@ def load(name: str, level: Level, side: int) -> list[Demonstration]:
         raise UserError(f"the Minari data set {name!r} has no episodes")
     demonstrations = []
     for episode, details in zip(episodes, metadata, strict=True):
-        states = _observation(episode.observations, name)
-        actions = np.asarray(episode.actions)
-        _check_episode(states, actions, name, episode.id, level, side)
+        where = f"episode {episode.id} of the Minari data set {name!r}"
+        states = _observation(episode.observations, where)
+        actions = _integers(episode.actions, f"{where}: actions")
+        _check_episode(states, actions, where, level, side)
+        states = Observation(*(field.astype(np.int32) for field in states))
+        states = states._replace(grid=states.grid.astype(np.uint8))
         seed = int(details.get("seed", UNKNOWN_SEED))
         demonstrations.append(Demonstration(states, actions.astype(np.int32), seed))
     return demonstrations
 
 
-def _observation(fields: object, name: str) -> Observation:
+def _observation(fields: object, where: str) -> Observation:
     missing = [f for f in Observation._fields if not isinstance(fields, dict) or f not in fields]
     if missing:
         raise UserError(
-            f"the Minari data set {name!r} has no observation {missing[0]!r}: "
+            f"{where} has no observation {missing[0]!r}: "
             f"expected a dictionary of {', '.join(Observation._fields)}"
         )
     assert isinstance(fields, dict)
-    values = {f: np.asarray(fields[f]) for f in Observation._fields}
-    return Observation(
-        **{f: v.astype(np.uint8 if f == "grid" else np.int32) for f, v in values.items()}
-    )
+    return Observation(**{f: _integers(fields[f], f"{where}: {f}") for f in Observation._fields})
+
+
+def _integers(values: object, what: str) -> np.ndarray:
+    array = np.asarray(values)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise UserError(f"{what} must be integers, got {array.dtype}")
+    return array.astype(np.int64)  # wide enough for what the range check must still see
 
 
 def _check_episode(
-    states: Observation, actions: np.ndarray, name: str, episode: int, level: Level, side: int
+    states: Observation, actions: np.ndarray, where: str, level: Level, side: int
 ) -> None:
-    where = f"episode {episode} of the Minari data set {name!r}"
+    if actions.ndim != 1:
+        raise UserError(f"{where}: actions have shape {actions.shape}, expected one per step")
     steps = len(actions)
     expected = {
         "grid": (steps + 1, side, side, 3),

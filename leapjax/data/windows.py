@@ -152,10 +152,18 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
 def reflect(window: Window, mirrored_words: jax.Array) -> Window:
     """The mirror image of one window."""
     context = window.context
+    past = jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past)
+    # Blank states before the start have no mirror image.
+    length = context.actions.shape[0]
+    known = jnp.arange(length, 0, -1) <= context.step
+
+    def keep_blank(mirrored: jax.Array, original: jax.Array) -> jax.Array:
+        return jnp.where(known.reshape(length, *(1,) * (mirrored.ndim - 1)), mirrored, original)
+
     return Window(
         context._replace(
             observation=symmetries.reflect(context.observation, mirrored_words),
-            past=jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past),
+            past=jax.tree.map(keep_blank, past, context.past),
             actions=symmetries.reflect_actions(context.actions),
         ),
         symmetries.reflect_actions(window.actions),

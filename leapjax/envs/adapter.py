@@ -50,6 +50,7 @@ class GymnasiumAdapter:
             raise ValueError(f"a Discrete action space is needed, got {env.action_space}")
         self.env = env
         self.num_actions = int(env.action_space.n) + 1
+        self._first_action = int(env.action_space.start)
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed."""
@@ -57,7 +58,7 @@ class GymnasiumAdapter:
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
+        observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
         success = bool(terminated and float(reward) > 0)
         return Transition(observation, float(reward), terminated, truncated, success)
 

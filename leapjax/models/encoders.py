@@ -116,7 +116,8 @@ class PaperStateEncoder(nn.Module):
         h = nn.relu(channel_norm()(Convolution(self.width, 2)(image)))
         h = nn.max_pool(h, (2, 2), (2, 2))
         h = nn.relu(channel_norm()(Convolution(self.width, 3)(h)))
-        h = nn.max_pool(h, (2, 2), (2, 2))
+        if self.side >= 7:  # of a smaller grid no map would be left
+            h = nn.max_pool(h, (2, 2), (2, 2))
         if self.side >= 16:  # "may vary a little depending on the environment size"
             h = nn.max_pool(nn.relu(channel_norm()(Convolution(self.width, 3)(h))), (2, 2), (2, 2))
         for _ in range(2):
