@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from leapjax.errors import UserError
@@ -82,7 +83,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
     except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         raise UserError(f"the checkpoint {path} cannot be read ({reason})") from None
-    return restored["params"]
+    return jax.tree.map(jnp.asarray, restored["params"])
 
 
 def _check_shapes(saved: PyTree, like: PyTree, folder: Path) -> None:

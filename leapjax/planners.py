@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax import schedules
-from leapjax.types import Energy, Params, Plan, PyTree, mask_token
+from leapjax.types import Array, Energy, Params, Plan, PyTree, mask_token
 
 ORDERS = ("random", "sequential")
 
@@ -263,12 +263,12 @@ class CompiledPlanner:
 
         self.plan_chunk = jax.jit(plan_chunk, static_argnums=0)
 
-    def __call__(self, params: Params, keys: jax.Array, contexts: PyTree) -> Plan:
+    def __call__(self, params: Params, keys: Array, contexts: PyTree) -> Plan:
         """Plans for B contexts.
 
         Args:
             params: of the energy.
-            keys: `[B]`, see `plan_keys`.
+            keys: `[B]`, or raw `[B, 2]` from `plan_keys`.
             contexts: leaves with a leading `[B]`.
 
         Returns:
@@ -287,8 +287,10 @@ class CompiledPlanner:
                     f"dimension must be the number of keys, {batch}"
                 )
         # Cut with NumPy: each slice of a device array would be a program of its own.
-        inputs = jax.tree.map(np.asarray, (jax.random.key_data(keys), contexts))
-        kind = str(jax.random.key_impl(keys))
+        kind = str(jax.config.jax_default_prng_impl)  # type: ignore[attr-defined]
+        if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
+            kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
+        inputs = jax.tree.map(np.asarray, (keys, contexts))
         chunks = split_batch(batch, self.chunk_sizes)
         plans = []
         for start, size, _ in chunks:
@@ -348,15 +350,29 @@ def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
     return chunks
 
 
-def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> jax.Array:
-    """Keys `[B]` that depend on (seed, episode, replan index) and not on the batch row."""
-    return _plan_keys(jax.random.key(seed), jnp.asarray(episodes), jnp.asarray(replans))
+def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarray:
+    """Raw keys `[B, 2]` uint32: functions of (seed, episode, replan index), not of the row.
+
+    Args:
+        seed: of all plans.
+        episodes: `[B]` whose plan it is, such as a level seed.
+        replans: `[B]` how many plans the episode has had.
+    """
+    batch = len(episodes)
+    # Padded to a power of two, so that a shrinking batch does not compile at every size.
+    rows = np.minimum(np.arange(1 << max(batch - 1, 0).bit_length()), batch - 1)
+    folded = np.stack([episodes, replans]).astype(np.uint32)[:, rows]
+    return np.asarray(_fold_in(jax.random.key(seed), folded))[:batch]
 
 
 @jax.jit
-def _plan_keys(key: jax.Array, episodes: jax.Array, replans: jax.Array) -> jax.Array:
-    fold = jax.vmap(lambda e, r: jax.random.fold_in(jax.random.fold_in(key, e), r))
-    return fold(episodes, replans)
+def _fold_in(key: jax.Array, indices: jax.Array) -> jax.Array:
+    """Key data `[B, 2]` of one key and indices `[2, B]`."""
+
+    def fold(episode: jax.Array, replan: jax.Array) -> jax.Array:
+        return jax.random.key_data(jax.random.fold_in(jax.random.fold_in(key, episode), replan))
+
+    return jax.vmap(fold)(*indices)
 
 
 def _check_positive(config: PlannerConfig, *names: str) -> None:

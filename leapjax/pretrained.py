@@ -16,7 +16,7 @@ from leapjax.envs.levels import Level
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import CompiledPlanner, GibbsConfig
-from leapjax.types import Agent, Context, Energy, Params, Plan
+from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
 CHECKPOINTS = "checkpoints"
@@ -44,7 +44,7 @@ class Pretrained:
     params: Params
     plan: CompiledPlanner
 
-    def __call__(self, keys: jax.Array, contexts: Context) -> Plan:
+    def __call__(self, keys: Array, contexts: Context) -> Plan:
         """Plans for B contexts (see `leapjax.rollouts.stack_contexts`)."""
         return self.plan(self.params, keys, contexts)
 

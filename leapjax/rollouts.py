@@ -28,7 +28,7 @@ class History:
     """The last K states and actions of one episode, as a planner's context."""
 
     def __init__(self, observation: PyTree, length: int, num_actions: int) -> None:
-        self.current = observation
+        self.current = _copy(observation)
         self.step = 0
         self._length = length
         self._past: list[PyTree] = []
@@ -41,7 +41,7 @@ class History:
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
-        self.current = observation
+        self.current = _copy(observation)
         self.step += 1
 
     def context(self) -> Context:
@@ -56,6 +56,11 @@ class History:
         return Context(
             self.current, stacked, np.array(actions, np.int32), np.array(self.step, np.int32)
         )
+
+
+def _copy(observation: PyTree) -> PyTree:
+    """Environments may write the next observation into the arrays of the last."""
+    return jax.tree.map(np.array, observation)
 
 
 def stack_contexts(histories: Sequence[History]) -> Context:

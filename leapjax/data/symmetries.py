@@ -17,7 +17,8 @@ from leapjax.types import Observation
 DIRECTION_VECTORS = jnp.array([[1, 0], [0, 1], [-1, 0], [0, -1]], jnp.int32)  # [4, 2]
 LEFT, RIGHT = 0, 1  # MiniGrid's turn actions
 FIRST_COLOURED, LAST_COLOURED = 4, 7  # MiniGrid's object indices: door, key, ball, box
-INTERCHANGEABLE = (5, 6, 7)  # key, ball, box: alike where no door is locked
+# Key, ball and box: alike where no door is locked and nobody toggles a box, which would vanish.
+INTERCHANGEABLE = (5, 6, 7)
 AGENT = 10  # MiniGrid's object index of the agent; the state of its cell is its direction
 
 

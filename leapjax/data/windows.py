@@ -123,8 +123,8 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
         key: chooses.
         window: one training example.
         words: which word names what.
-        exchange_objects: whether key, ball and box are alike, which they are in levels
-            without locked doors.
+        exchange_objects: whether key, ball and box are alike, which they are in
+            demonstrations that unlock no door and toggle no box.
     """
     flip_key, colour_key, object_key = jax.random.split(key, 3)
     colours = jax.random.permutation(colour_key, len(words.colours))
