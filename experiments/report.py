@@ -1,6 +1,5 @@
 """Tables of the README, made from the committed rows: `python -m experiments.report`."""
 
-import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,15 +21,14 @@ def markdown(rows: Sequence[Row]) -> str:
     number of seeds.
     """
     lines = [
-        "| level | paper | preset `paper` | preset `leapjax` | training of `leapjax` |",
-        "| --- | --- | --- | --- | --- |",
+        "| level | paper | preset `paper` | preset `leapjax` |",
+        "| --- | --- | --- | --- |",
     ]
     for level in LEVELS.values():
         cells = {name: _select(rows, level.name, name) for name in PRESETS}
-        seconds = [row["train_seconds"] for row in cells["leapjax"]]
         lines.append(
             f"| {level.name} | {level.paper_success:.1f}% | {_cell(cells['paper'])} "
-            f"| {_cell(cells['leapjax'])} | {_seconds(seconds)} |"
+            f"| {_cell(cells['leapjax'])} |"
         )
     return "\n".join(lines)
 
@@ -48,10 +46,6 @@ def _cell(rows: Sequence[Row]) -> str:
     seeds = len({row["seed"] for row in rows})
     counted = f"{seeds} seed{'s' if seeds > 1 else ''}"
     return f"{100 * successes / episodes:.1f}% [{100 * low:.1f}, {100 * high:.1f}], {counted}"
-
-
-def _seconds(values: Sequence[float]) -> str:
-    return f"{statistics.mean(values):.0f} s" if values else "-"
 
 
 def replace_section(text: str, section: str) -> str:
