@@ -116,6 +116,7 @@ def fit(
     pretrained.save_specification(folder, specification)
     pretrained.write_text(folder / "config.json", json.dumps(resolved(config, seed), indent=1))
     saved = Checkpoints(folder / pretrained.CHECKPOINTS)
+    begun = time.perf_counter()
     key = jax.random.key(seed)
     state = jax.jit(agent.init)(key)
     metrics = read_metrics(folder)
@@ -123,8 +124,6 @@ def fit(
         state = saved.restore(state)
         metrics = [m for m in metrics if m["step"] <= saved.latest]
         console.print(f"continuing at step {saved.latest} of {config.training.steps}")
-
-    begun = time.perf_counter()
     step = training.make_train_step(
         agent, lambda k, d: leap.make_batch(k, d, config.training, specification.sizes)
     )
@@ -148,7 +147,7 @@ def fit(
 
         state = training.train(compiled, state, steps, key, total, report)
     saved.close()
-    seconds["train"] = metrics[-1]["seconds"]
+    seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
     assert agent.energy is not None
     plan = compile_planner(agent.energy, config.planner)
     return Pretrained(specification, agent.energy, state.params, plan), metrics, total

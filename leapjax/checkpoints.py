@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
-from leapjax.errors import UserError
+from leapjax.errors import UserError, first_line
 from leapjax.types import PyTree, TrainState
 
 T = TypeVar("T")
@@ -40,9 +40,19 @@ class Checkpoints:
         self._manager.save(int(state.step), args=ocp.args.StandardSave(state._asdict()))
 
     def restore(self, like: TrainState) -> TrainState:
-        """The newest state; `like` gives structure, shapes and placement."""
+        """The newest state; `like` gives structure, shapes and placement.
+
+        Raises:
+            UserError: it cannot be read.
+        """
         target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict())
-        restored = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
+        try:
+            restored = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
+        except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+            raise UserError(
+                f"the checkpoint {self._manager.directory / str(self.latest)} cannot be read "
+                f"({first_line(error)}): delete it to continue from the one before"
+            ) from None
         return TrainState(**restored)
 
     def wait(self) -> None:
@@ -81,8 +91,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
     except UserError:
         raise
     except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise UserError(f"the checkpoint {path} cannot be read ({reason})") from None
+        raise UserError(f"the checkpoint {path} cannot be read ({first_line(error)})") from None
     return jax.tree.map(jnp.asarray, restored["params"])
 
 

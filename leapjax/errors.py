@@ -3,3 +3,8 @@
 
 class UserError(ValueError):
     """Input that cannot be used: says what was wrong, what was expected, what to do."""
+
+
+def first_line(error: Exception) -> str:
+    """What another library's error says, short enough for one line of ours."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

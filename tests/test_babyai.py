@@ -170,6 +170,16 @@ def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
         load(copy)
 
 
+def test_a_damaged_training_state_is_one_line(workplace, tmp_path, capsys):
+    shutil.copytree(run_folder(workplace), tmp_path / "runs" / run_folder(workplace).name)
+    for file in (tmp_path / "runs").rglob("*"):
+        if file.is_file() and "/default/" in str(file):
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs"), "--no-pictures"]) == 2
+    error = capsys.readouterr().err
+    assert "cannot be read" in error and error.count("\n") == 1
+
+
 def test_a_data_set_of_the_users_own_is_trained_on(workplace):
     mine = storage.dataset_id(LEVELS[LEVEL], 6, 0)
     arguments = ["--demonstrations", mine, "--runs", "mine", "--no-pictures"]

@@ -18,7 +18,7 @@ from leapjax.data.demonstrations import Collection, Demonstration
 from leapjax.envs import vocabulary
 from leapjax.envs.adapter import NUM_ACTIONS
 from leapjax.envs.levels import Level
-from leapjax.errors import UserError
+from leapjax.errors import UserError, first_line
 from leapjax.types import Observation
 
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
@@ -107,7 +107,7 @@ def load(name: str, level: Level, side: int) -> list[Demonstration]:
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
     except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
         raise UserError(
-            f"the Minari data set {name!r} cannot be read ({_first_line(error)}): "
+            f"the Minari data set {name!r} cannot be read ({first_line(error)}): "
             "delete it and it is made again, or restore it"
         ) from None
     if not episodes:
@@ -194,11 +194,6 @@ def _rename_id(path: Path, old: str, new: str) -> None:
 
         with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
             file.attrs["dataset_id"] = new
-
-
-def _first_line(error: Exception) -> str:
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0][:200]
 
 
 def exists(name: str) -> bool:
