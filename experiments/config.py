@@ -1,5 +1,6 @@
 """The configuration of an experiment: presets, the command line, the hash that names it."""
 
+import argparse
 import dataclasses
 import hashlib
 import json
@@ -112,12 +113,15 @@ def parse(arguments: Sequence[str]) -> list[Config]:
     Raises:
         UserError: an unknown level or preset.
     """
-    # Level and preset come first, because they decide the defaults of everything else.
-    flags = _parse(arguments, Config())
-    names = list(levels.LEVELS) if flags.level == "all" else [flags.level]
+    # Level and preset come first: they decide the defaults of all the rest, and of --help.
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--level", default=Config.level)
+    first.add_argument("--preset", default=Config.preset)
+    chosen, _ = first.parse_known_args(list(arguments))
+    names = list(levels.LEVELS) if chosen.level == "all" else [chosen.level]
     configs = []
     for name in names:
-        default = preset(levels.find_level(name), flags.preset)
+        default = preset(levels.find_level(name), chosen.preset)
         config = dataclasses.replace(_parse(arguments, default), level=name)
         check(config)
         configs.append(config)
