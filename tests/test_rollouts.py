@@ -130,7 +130,7 @@ def test_history_against_everything_that_happened(length):
     # Compared at the end, so that a later step that changes an earlier context shows.
     for now, context in enumerate(contexts):
         assert context.step == now == int(context.step)
-        assert context.observation is states[now]
+        jax.tree.map(np.testing.assert_array_equal, context.observation, states[now])
         assert context.past["grid"].shape == (length, 2, 2)
         assert context.past["x"].shape == context.actions.shape == (length,)
         assert context.past["grid"].dtype == np.uint8 and context.actions.dtype == np.int32
@@ -331,6 +331,16 @@ def test_to_execute_nothing_is_refused():
 def test_an_iteration_that_there_is_not_is_refused(iteration):
     with pytest.raises(ValueError, match="iteration"):
         leap.evaluate(Corridor, [0], walker(), jnp.int32(1), context=0, iteration=iteration)
+
+
+def test_an_environment_may_reuse_its_buffers():
+    buffer = {"x": np.zeros(2)}
+    history = History(buffer, 2, NUM_ACTIONS)
+    for step in (1.0, 2.0):
+        buffer["x"][:] = step
+        history.advance(0, buffer)
+    np.testing.assert_array_equal(history.context().past["x"], [[0, 0], [1, 1]])
+    np.testing.assert_array_equal(history.context().observation["x"], [2, 2])
 
 
 class Line(gym.Env):
