@@ -27,7 +27,7 @@ class ModelConfig:
     layers: int = 3  # transformer layers
     heads: int = 4  # attention heads
     width: int = 128  # D, embedding dimension
-    dropout: float = 0.1
+    dropout: float = 0.1  # of embeddings, attention and residuals
     channels: int = 32  # leapjax: features per grid cell
     rounds: int = 2  # leapjax: rounds of convolution over the grid
     fields: int = 8  # leapjax: learned distance fields

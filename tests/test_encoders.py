@@ -1,0 +1,108 @@
+"""The grid's building blocks against slow or independent oracles."""
+
+import heapq
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.models import encoders
+
+SIDE = 6
+
+
+@pytest.fixture(scope="module")
+def field():
+    """Random starts and costs `[SIDE, SIDE, 2]`, without ties."""
+    start = jax.random.uniform(jax.random.key(0), (SIDE, SIDE, 2)) * 20
+    cost = jax.random.uniform(jax.random.key(1), (SIDE, SIDE, 2)) + 0.1
+    return start, cost
+
+
+def dijkstra(start, cost):
+    """Distances of one field, by a priority queue."""
+    distance = start.copy()
+    queue = [(float(start[cell]), cell) for cell in np.ndindex(start.shape)]
+    heapq.heapify(queue)
+    while queue:
+        length, (x, y) = heapq.heappop(queue)
+        if length > distance[x, y]:
+            continue
+        for near in ((x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)):
+            if 0 <= near[0] < SIDE and 0 <= near[1] < SIDE:
+                longer = length + cost[near]
+                if longer < distance[near]:
+                    distance[near] = longer
+                    heapq.heappush(queue, (float(longer), near))
+    return distance
+
+
+def unrolled(start, cost, sweeps):
+    """The recursion as it is written, for autodiff."""
+    distance = start
+    for _ in range(sweeps):
+        padded = jnp.pad(distance, ((1, 1), (1, 1), (0, 0)), constant_values=encoders.FAR)
+        near = [padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]]
+        distance = jnp.minimum(start, cost + jnp.stack(near).min(axis=0))
+    return distance
+
+
+def test_distances_are_dijkstras(field):
+    start, cost = map(np.asarray, field)
+    distance = encoders.min_plus(*field, SIDE**2)
+    for channel in range(start.shape[-1]):
+        expected = dijkstra(start[..., channel], cost[..., channel])
+        np.testing.assert_allclose(distance[..., channel], expected, rtol=1e-5)
+
+
+def test_a_way_is_found_only_within_the_sweeps():
+    start = jnp.full((SIDE, SIDE, 1), encoders.FAR).at[0, 0].set(0.0)
+    distance = encoders.min_plus(start, jnp.ones((SIDE, SIDE, 1)), 3)
+    x, y = np.indices((SIDE, SIDE))
+    expected = np.where(x + y <= 3, x + y, encoders.FAR)
+    np.testing.assert_array_equal(distance[..., 0], expected)
+
+
+def test_the_gradient_is_autodiffs(field):
+    weights = jax.random.normal(jax.random.key(2), (SIDE, SIDE, 2))
+
+    def gradient(function):
+        def loss(start, cost):
+            return (weights * function(start, cost, SIDE**2)).sum()
+
+        return jax.jit(jax.grad(loss, argnums=(0, 1)))(*field)
+
+    for ours, expected in zip(gradient(encoders.min_plus), gradient(unrolled), strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("side", "padding"), [(3, (1, 1)), (2, (1, 1)), (2, (0, 0))])
+def test_a_convolution_is_xlas(side, padding):
+    image = jax.random.normal(jax.random.key(0), (5, 7, 3))
+    layer = encoders.Convolution(4, side, padding)
+    params = layer.init(jax.random.key(1), image)
+    kernel = params["params"]["Dense_0"]["kernel"].reshape(side, side, 3, 4)
+    expected = jax.lax.conv_general_dilated(
+        image[None], kernel, (1, 1), (padding, padding), dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )[0]
+    np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
+
+
+def test_reading_around_and_at_a_cell():
+    image = jnp.arange(SIDE * SIDE * 2, dtype=jnp.float32).reshape(SIDE, SIDE, 2)
+    padded = np.pad(np.asarray(image), ((2, 2), (2, 2), (0, 0)))
+    for x, y in ((0, 0), (3, 2), (5, 5)):
+        around = encoders.neighbourhood(image, jnp.array([x, y]), 2)
+        np.testing.assert_array_equal(around, padded[x : x + 5, y : y + 5].reshape(-1))
+        np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([x, y])), image[x, y])
+    np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([-1, -1])), [0, 0])
+
+
+def test_the_state_after_the_last_word_ignores_padding():
+    encoder = encoders.InstructionEncoder(10, 8)
+    words = jnp.array([3, 1, 4, 0, 0])
+    params = encoder.init(jax.random.key(0), words)
+    short = encoder.apply(params, words[:3])
+    np.testing.assert_allclose(encoder.apply(params, words), short, atol=1e-6)
+    assert not np.allclose(encoder.apply(params, words[jnp.array([1, 0, 2])]), short)
