@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from leapjax import pretrained
 from leapjax.agents.leap import TrainingConfig
 from leapjax.envs import levels
 from leapjax.envs.levels import Level
@@ -45,7 +46,7 @@ class Config:
     executed: int | None = None
     """Actions to execute before replanning; None: the whole plan, as in the paper."""
     checkpoint: Path | None = None
-    """Folder of an earlier run to evaluate instead of training."""
+    """Folder of an earlier run to evaluate instead of training; sets the other defaults."""
     record: bool = False
     """Append the row to results/, which is committed, and skip what is recorded already."""
     force: bool = False
@@ -115,14 +116,26 @@ def parse(arguments: Sequence[str]) -> list[Config]:
     """
     # Level and preset come first: they decide the defaults of all the rest, and of --help.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--level", default=Config.level)
-    first.add_argument("--preset", default=Config.preset)
+    for name in ("--level", "--preset", "--checkpoint"):
+        first.add_argument(name)
     chosen, _ = first.parse_known_args(list(arguments))
-    names = list(levels.LEVELS) if chosen.level == "all" else [chosen.level]
+    trained = None
+    if chosen.checkpoint is not None:
+        trained = pretrained.read_specification(Path(chosen.checkpoint))
+    level = chosen.level or (trained.level if trained else Config.level)
+    name = chosen.preset or (trained.model.architecture if trained else Config.preset)
     configs = []
-    for name in names:
-        default = preset(levels.find_level(name), chosen.preset)
-        config = dataclasses.replace(_parse(arguments, default), level=name)
+    for each in list(levels.LEVELS) if level == "all" else [level]:
+        default = preset(levels.find_level(each), name)
+        if trained:
+            default = dataclasses.replace(
+                default,
+                model=trained.model,
+                training=trained.training,
+                planner=trained.planner,
+                context=trained.sizes.context,
+            )
+        config = dataclasses.replace(_parse(arguments, default), level=each)
         check(config)
         configs.append(config)
     return configs

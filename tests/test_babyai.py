@@ -80,6 +80,15 @@ def test_the_checkpoint_evaluates_again_without_training(workplace, capsys):
     )
 
 
+def test_a_checkpoint_needs_no_other_setting(workplace):
+    arguments = ["--checkpoint", str(run_folder(workplace)), "--episodes", "5", "--no-pictures"]
+    assert babyai.main([*arguments, "--runs", "alone"]) == 0
+    (before,) = results.read(workplace / "runs" / "babyai.jsonl")
+    (after,) = results.read(workplace / "alone" / "babyai.jsonl")
+    assert after["successes"] == before["successes"]
+    assert after["configuration"]["model"] == before["configuration"]["model"]
+
+
 def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
     assert babyai.main([*TOY, "--no-pictures"]) == 0
     assert "continuing at step 4 of 4" in capsys.readouterr().out
