@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import results
+from experiments.config import PRESETS
 from experiments.results import Row
 from leapjax import scores
 from leapjax.envs.levels import LEVELS
 from leapjax.pretrained import write_text
 
 BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
-PRESETS = ("paper", "leapjax")
 
 
 def markdown(rows: Sequence[Row]) -> str:

@@ -84,8 +84,8 @@ def evaluate(
     """Plays one episode per level seed, all in lockstep, replanning when a plan is used up.
 
     Finished episodes leave the batch; one whose plan ends before its first action has given
-    up. A plan's randomness derives from (seed, level seed,
-    replan index), so an episode plays the same way whatever else is in the batch.
+    up. A plan's randomness derives from (seed, level seed, replan index), so an episode plays
+    the same way whatever else is in the batch.
 
     Args:
         make_adapter: makes one environment; called once per episode.

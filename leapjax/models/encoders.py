@@ -10,7 +10,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from leapjax.models.transformer import dense
 from leapjax.types import Observation
 
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
@@ -275,9 +274,3 @@ def neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Arr
 def feature_at(image: jax.Array, position: jax.Array) -> jax.Array:
     """The features `[C]` of a cell, zero where the position is -1 (not available)."""
     return jnp.einsum("xyc,xy->c", image, one_cell(position, image.shape[0]))
-
-
-def projection(features: int, name: str) -> nn.Dense:
-    """A linear read-out into the transformer's width."""
-    layer = dense(features, scale=0.1)
-    return layer.clone(name=name)
