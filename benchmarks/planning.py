@@ -10,7 +10,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.timing import fastest, matmul_peak
+from experiments import runtime
 from leapjax import pretrained
 from leapjax.agents import leap
 from leapjax.envs import vocabulary
@@ -60,6 +62,7 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
+    runtime.start()
     options = tyro.cli(Options, args=None if arguments is None else list(arguments))
     settings = SETTINGS[:1] if options.quick else SETTINGS
     batches = (1, 256) if options.quick else BATCHES
@@ -143,34 +146,6 @@ def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
         return (model.layers - 1) * layer(tokens) + layer(queried) + head
 
     return one_pass(horizon) + (iterations - 1) * one_pass(1)
-
-
-def matmul_peak(tokens: int, width: int, seconds: float) -> float:
-    """GFLOP/s of the perceptron's two matrix products, one after the other, and no more."""
-    x = jax.random.normal(jax.random.key(0), (tokens, width))
-    expand = jax.random.normal(jax.random.key(1), (width, 4 * width)) / width
-    contract = jax.random.normal(jax.random.key(2), (4 * width, width)) / width
-    flops = 2 * 2 * tokens * width * 4 * width
-    repeats = max(1, int(2e9 / flops))  # hides the dispatch
-
-    @jax.jit
-    def multiply(x: jax.Array, expand: jax.Array, contract: jax.Array) -> jax.Array:
-        # Each product needs the one before, so none can be left out.
-        return jax.lax.fori_loop(0, repeats, lambda _, y: (y @ expand) @ contract, x)
-
-    jax.block_until_ready(multiply(x, expand, contract))
-    return repeats * flops / fastest(partial(multiply, x, expand, contract), seconds / 4) / 1e9
-
-
-def fastest(run: Callable[[], Any], seconds: float) -> float:
-    """The shortest of several runs, in seconds."""
-    best, spent = float("inf"), 0.0
-    while spent < seconds:
-        begun = time.perf_counter()
-        jax.block_until_ready(run())
-        taken = time.perf_counter() - begun
-        best, spent = min(best, taken), spent + taken
-    return best
 
 
 def random_contexts(sizes: Sizes, batch: int) -> Any:

@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from experiments import animation, plots, results
-from experiments.cache import use_compilation_cache
+from experiments import animation, plots, results, runtime
 from experiments.config import Config, configuration_hash, parse, resolved
 from experiments.progress import Meter
-from leapjax import pretrained, rollouts, training
+from leapjax import pretrained, rollouts, sharding, training
 from leapjax.agents import leap
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import demonstrations, seeds, storage, windows
@@ -46,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     try:
         configs = parse(sys.argv[1:] if arguments is None else arguments)
-        use_compilation_cache()
+        runtime.start()
         rows = []
         for config in configs:
             for seed in config.seeds:
@@ -108,24 +106,25 @@ def fit(
     begun = time.perf_counter()
     data = gather(config, level, specification.sizes.side, seed, console)
     seeds.check_disjoint([d.seed for d in data], episode_seeds)
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
+    mesh = sharding.data_mesh(config.training.batch)
+    steps = sharding.replicate(windows.concatenate(data), mesh)
     seconds["demos"] = time.perf_counter() - begun
 
-    agent = pretrained.make_agent(specification)
+    agent = pretrained.make_agent(specification, sharding.DATA)
     folder.mkdir(parents=True, exist_ok=True)
     pretrained.save_specification(folder, specification)
     pretrained.write_text(folder / "config.json", json.dumps(resolved(config, seed), indent=1))
     saved = Checkpoints(folder / pretrained.CHECKPOINTS)
     begun = time.perf_counter()
-    key = jax.random.key(seed)
-    state = jax.jit(agent.init)(key)
+    key = sharding.replicate(jax.random.key(seed), mesh)
+    state = sharding.replicate(jax.jit(agent.init)(jax.random.key(seed)), mesh)
     metrics = read_metrics(folder)
     if saved.latest is not None:
         state = saved.restore(state)
         metrics = [m for m in metrics if m["step"] <= saved.latest]
         console.print(f"continuing at step {saved.latest} of {config.training.steps}")
     step = training.make_train_step(
-        agent, lambda k, d: leap.make_batch(k, d, config.training, specification.sizes)
+        agent, lambda k, d: leap.make_batch(k, d, config.training, specification.sizes), mesh
     )
     compiled = step.lower(state, steps, key).compile()  # type: ignore[attr-defined]
     seconds["compile"] = time.perf_counter() - begun

@@ -4,7 +4,7 @@ An `Energy` is a few pure functions of one trajectory; a planner finds a plan of
 energy; `compile_planner` makes it plan for any number of contexts at once.
 """
 
-from leapjax.energy import compose, constrain, from_total, pseudo_likelihood, view
+from leapjax.energy import classifier, compose, constrain, from_total, pseudo_likelihood, view
 from leapjax.errors import UserError
 from leapjax.planners import (
     CompiledPlanner,
@@ -36,6 +36,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "classifier",
     "compile_planner",
     "compose",
     "constrain",

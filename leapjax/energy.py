@@ -1,13 +1,17 @@
 """Energies over plans and their algebra: every function here returns an `Energy`.
 
 An energy is written for one trajectory. Parameters are always an argument and varying
-data lives in the context, so an energy is built once and compiled once.
+data lives in the context, so an energy is built once and compiled once. Outside of `jit`,
+where values can be seen, actions or positions out of range and energies that are NaN raise
+`ValueError`; inside, shapes are checked, and a plan says whether it is `valid`.
 """
 
 from collections.abc import Callable, Sequence
 
+import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from leapjax.types import Energy, Params, PyTree, mask_token
 
@@ -36,8 +40,11 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
+        _check_query(actions, positions, num_actions)
         tokens = actions.at[positions].set(mask)
-        return -jax.nn.log_softmax(logits(params, memory, tokens, positions), axis=-1)
+        scores = logits(params, memory, tokens, positions)
+        chex.assert_shape(scores, (positions.shape[0], num_actions))
+        return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         def term(position: jax.Array) -> jax.Array:
@@ -68,11 +75,27 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
-        return _try_every_action(
+        _check_query(actions, positions, num_actions)
+        energies = _try_every_action(
             lambda plan: guarded_total(params, memory, plan), actions, positions, num_actions
         )
+        return _check_energies(energies, positions)
 
     return Energy(encode, conditional, guarded_total, _checked(num_actions), accepts_mask=False)
+
+
+def classifier(encode: EncodeFn, degree: TotalFn, num_actions: int) -> Energy:
+    """The energy of a sequence classifier (paper, appendix, ablation).
+
+    It is trained to say how corrupted a whole plan is, so that what a demonstrator would do
+    has the least energy; `leapjax.agents.classifier` trains the paper's LSTM.
+
+    Args:
+        encode: (params, context) -> memory.
+        degree: (params, memory, actions `[T]`) -> `[]`, the degree of corruption.
+        num_actions: A.
+    """
+    return from_total(encode, degree, num_actions)
 
 
 def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
@@ -195,6 +218,31 @@ def _try_every_action(
     over_actions = jax.vmap(at, in_axes=(None, 0))
     choices = jnp.arange(num_actions, dtype=actions.dtype)
     return jax.vmap(over_actions, in_axes=(0, None))(positions, choices)
+
+
+def _check_query(actions: jax.Array, positions: jax.Array, num_actions: int) -> None:
+    chex.assert_rank([actions, positions], 1)
+    for name, values, end in (
+        ("positions", positions, actions.shape[0]),
+        ("actions", actions, num_actions + 1),
+    ):
+        if isinstance(values, jax.core.Tracer) or values.size == 0:
+            continue
+        least, most = int(np.min(values)), int(np.max(values))
+        if least < 0 or most >= end:
+            what = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
+            expected = what if name == "actions" else f"0 .. {end - 1}, the horizon is {end}"
+            raise ValueError(f"{name} {np.asarray(values)} are not all in {expected}")
+
+
+def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:
+    if not isinstance(energies, jax.core.Tracer) and bool(jnp.isnan(energies).any()):
+        rows = np.flatnonzero(np.isnan(energies).any(axis=-1))
+        raise ValueError(
+            f"the energies at positions {np.asarray(positions)[rows]} are NaN: the model's "
+            "scores there are NaN, hold +inf, or are all -inf"
+        )
+    return energies
 
 
 def _infinite_if_incomplete(energy: jax.Array, actions: jax.Array, num_actions: int) -> jax.Array:

@@ -5,17 +5,25 @@ that plans for any number of contexts at once.
 """
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from leapjax import schedules
+from leapjax import schedules, sharding
 from leapjax.types import Array, Energy, Params, Plan, PyTree, mask_token
 
-ORDERS = ("random", "sequential")
+ORDERS = ("random", "sequential", "uncertain")
+
+
+class NotANumber(ValueError):
+    """An energy that was minimised is NaN somewhere."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +33,10 @@ class GibbsConfig:
     horizon: int = 5  # T, planned actions
     iterations: int = 10  # N, passes of the model; the first fills every position
     resampled: int = 1  # P, positions resampled together in every later iteration
-    order: str = "random"  # which positions: "random", or "sequential" from left to right
+    order: str = "random"  # which positions: "random", "sequential" or "uncertain"
     temperature: float = 0.0  # of the first iteration; 0 takes the most likely action
     final_temperature: float | None = None  # of the last, linear between; None: the same
+    early_stop: bool = False  # stop once every position was looked at and nothing changed
     restarts: int = 1  # R independent plans, of which the one of least energy is kept
     score: bool = False  # also return the energy of the plan (T more passes)
     score_trace: bool = False  # also return the energy after every iteration (N * T passes)
@@ -38,7 +47,7 @@ class GibbsConfig:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
-        schedules.linear_temperatures(self.temperature, self.last_temperature, 1)  # checks them
+        schedules.check_temperatures(self.temperature, self.last_temperature)
         if self.order not in ORDERS:
             raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
 
@@ -89,18 +98,25 @@ def gibbs(
     that does not accept MASK); iterations 2 to N mask P positions, read the energy of
     every action there, and draw actions with probability proportional to
     `exp(-energy / temperature)`.
+
+    Which positions, by `config.order`: "random"; "sequential", from left to right and around;
+    "uncertain", those whose action was least likely when last looked at, among the ones not
+    looked at since something changed. With `early_stop` the chain ends when there are none
+    of these left: at temperature 0 and P = 1 nothing could change any more, so the plan is
+    the same and the rest of its trace repeats it. A batch stops with its slowest plan.
     """
     memory = energy.encode(params, context)
+    chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
-        actions, trace = _gibbs_chain(energy, params, memory, key, config)
+        actions, trace, valid = chain(key)
         least = None
     else:
-        keys = jax.random.split(key, config.restarts)
-        plans, traces = jax.vmap(lambda k: _gibbs_chain(energy, params, memory, k, config))(keys)
+        plans, traces, valids = jax.vmap(chain)(jax.random.split(key, config.restarts))
         energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
         best = jnp.argmin(energies)
         actions, trace, least = plans[best], traces[best], energies[best]
-    plan = Plan(actions, trace, energy.violation(params, memory, actions) <= 0)
+        valid = jnp.all(valids) & ~jnp.any(jnp.isnan(energies))
+    plan = Plan(actions, trace, energy.violation(params, memory, actions) <= 0, valid)
     if config.score:
         least = energy.total(params, memory, actions) if least is None else least
         plan = plan._replace(energy=least)
@@ -110,15 +126,23 @@ def gibbs(
     return plan
 
 
+class _Chain(NamedTuple):
+    """What a Gibbs chain carries from iteration to iteration."""
+
+    actions: jax.Array  # [T] int32
+    doubt: jax.Array  # [T] -log p of each action when it was last looked at
+    settled: jax.Array  # [T] bool: looked at since something changed
+    valid: jax.Array  # [] bool: no energy was NaN
+
+
 def _gibbs_chain(
     energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
-) -> tuple[jax.Array, jax.Array]:
-    """One chain: the final actions `[T]` and the actions after every iteration `[N, T]`."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """One chain: final actions `[T]`, the actions after every iteration `[N, T]`, `valid`."""
     horizon, iterations = config.horizon, config.iterations
     order_key, noise_key, start_key = jax.random.split(key, 3)
     last = config.last_temperature
     temperatures = schedules.linear_temperatures(config.temperature, last, iterations)
-    positions = _scan_order(order_key, config)  # [N - 1, P]
     noisy = max(config.temperature, last) > 0
 
     # All randomness is drawn at once, before the loop: inside it costs more than the draws.
@@ -127,33 +151,78 @@ def _gibbs_chain(
             return jax.random.gumbel(k, (*shape, energy.num_actions))
         return jnp.zeros((*shape, 1))
 
+    def draw(
+        tokens: jax.Array, where: jax.Array, gumbel: jax.Array, temperature: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Actions `[P]` at positions, -log p of them `[P]`, and whether no energy was NaN."""
+        energies = energy.conditional(params, memory, tokens, where)
+        chex.assert_shape(energies, (where.shape[0], energy.num_actions))
+        # Gumbel-max. Noise times temperature, not energy over temperature: exact at 0, and
+        # +inf stays +inf.
+        drawn = jnp.argmin(energies - temperature * gumbel, axis=-1).astype(jnp.int32)
+        # Where every action is forbidden another position has to change: leave this one
+        # (and 0 for MASK, which is the number of actions).
+        hopeless = jnp.all(jnp.isinf(energies), axis=-1)
+        drawn = jnp.where(hopeless, tokens[where] % energy.num_actions, drawn)
+        chosen = jnp.take_along_axis(energies, drawn[:, None], axis=1)[:, 0]
+        doubt = jnp.where(hopeless, 0.0, chosen + jax.nn.logsumexp(-energies, axis=-1))
+        return drawn, doubt, ~jnp.any(jnp.isnan(energies))
+
     if energy.accepts_mask:
         everywhere = jnp.arange(horizon)
         blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
-        energies = energy.conditional(params, memory, blank, everywhere)
-        chex.assert_shape(energies, (horizon, energy.num_actions))
-        start = _draw(energies, noise(start_key, horizon), temperatures[0])
+        first = draw(blank, everywhere, noise(start_key, horizon), temperatures[0])
     else:
-        start = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
+        uniform = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
+        first = uniform, jnp.full(horizon, jnp.inf), jnp.bool_(True)
+    start = _Chain(first[0], first[1], jnp.zeros(horizon, bool), first[2])
 
-    def resample(
-        actions: jax.Array, inputs: tuple[jax.Array, jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
+    def iterate(
+        chain: _Chain, inputs: tuple[jax.Array, jax.Array, jax.Array]
+    ) -> tuple[_Chain, jax.Array]:
         where, gumbel, temperature = inputs
-        energies = energy.conditional(params, memory, actions, where)  # [P, A]
-        drawn = _draw(energies, gumbel, temperature)
-        # Where every action is forbidden another position has to change: leave this one.
-        hopeless = jnp.all(jnp.isinf(energies), axis=-1)
-        actions = actions.at[where].set(jnp.where(hopeless, actions[where], drawn))
-        return actions, actions
+        if config.order == "uncertain":
+            doubt = jnp.where(chain.settled, -1.0, chain.doubt)
+            where = jax.lax.top_k(doubt, config.resampled)[1]
+        drawn, doubt, valid = draw(chain.actions, where, gumbel, temperature)
+        changed = jnp.any(drawn != chain.actions[where])
+        settled = jnp.where(changed, False, chain.settled).at[where].set(True)
+        actions = chain.actions.at[where].set(drawn)
+        doubts = chain.doubt.at[where].set(doubt)
+        return _Chain(actions, doubts, settled, chain.valid & valid), actions
 
     inputs = (
-        positions,
+        _scan_order(order_key, config),  # [N - 1, P]
         noise(noise_key, iterations - 1, config.resampled),
         temperatures[1:],
     )
-    actions, later = jax.lax.scan(resample, start, inputs)
-    return actions, jnp.concatenate([start[None], later])
+    if config.early_stop:
+        chain, later = _scan_until_settled(iterate, start, inputs)
+    else:
+        chain, later = jax.lax.scan(iterate, start, inputs)
+    return chain.actions, jnp.concatenate([start.actions[None], later]), chain.valid
+
+
+def _scan_until_settled(
+    iterate: Callable[..., tuple[_Chain, jax.Array]], start: _Chain, inputs: PyTree
+) -> tuple[_Chain, jax.Array]:
+    """`lax.scan` that ends early; what it did not come to in the trace is the final plan."""
+    length = inputs[0].shape[0]
+
+    def going(state: tuple[jax.Array, _Chain, jax.Array]) -> jax.Array:
+        index, chain, _ = state
+        return (index < length) & ~jnp.all(chain.settled)
+
+    def step(
+        state: tuple[jax.Array, _Chain, jax.Array],
+    ) -> tuple[jax.Array, _Chain, jax.Array]:
+        index, chain, trace = state
+        chain, actions = iterate(chain, jax.tree.map(lambda x: x[index], inputs))
+        return index + 1, chain, trace.at[index].set(actions)
+
+    trace = jnp.zeros((length, *start.actions.shape), start.actions.dtype)
+    done, chain, trace = jax.lax.while_loop(going, step, (jnp.int32(0), start, trace))
+    return chain, jnp.where(jnp.arange(length)[:, None] < done, trace, chain.actions)
 
 
 def _scan_order(key: jax.Array, config: GibbsConfig) -> jax.Array:
@@ -167,14 +236,6 @@ def _scan_order(key: jax.Array, config: GibbsConfig) -> jax.Array:
     return jnp.argsort(scores, axis=-1)[:, : config.resampled]
 
 
-def _draw(energies: jax.Array, gumbel: jax.Array, temperature: jax.Array) -> jax.Array:
-    """Actions `[P]` from energies `[P, A]`, by the Gumbel-max trick; least energy at 0.
-
-    Noise times temperature, not energy over temperature: exact at 0, and +inf stays +inf.
-    """
-    return jnp.argmin(energies - temperature * gumbel, axis=-1).astype(jnp.int32)
-
-
 def random_shooting(
     energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
 ) -> Plan:
@@ -183,7 +244,12 @@ def random_shooting(
     plans = jax.random.randint(key, (config.candidates, config.horizon), 0, energy.num_actions)
     energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
     best = jnp.argmin(energies)
-    plan = Plan(plans[best], plans[best][None], energy.violation(params, memory, plans[best]) <= 0)
+    plan = Plan(
+        plans[best],
+        plans[best][None],
+        energy.violation(params, memory, plans[best]) <= 0,
+        ~jnp.any(jnp.isnan(energies)),
+    )
     return plan._replace(energy=energies[best]) if config.score else plan
 
 
@@ -203,7 +269,7 @@ def cross_entropy_method(
 
     def breed(
         carry: tuple[jax.Array, jax.Array], round_key: jax.Array
-    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
         plans, energies = carry
         parents = plans[jnp.argsort(energies)[: config.elites]]
         place_key, action_key = jax.random.split(round_key)
@@ -217,19 +283,20 @@ def cross_entropy_method(
         if config.keep_elites:
             children = children.at[: config.elites].set(parents)
         energies = score(children)
-        return (children, energies), children[jnp.argmin(energies)]
+        return (children, energies), (children[jnp.argmin(energies)], jnp.isnan(energies).any())
 
     first_key, loop_key = jax.random.split(key)
     plans = jax.random.randint(first_key, (count, horizon), 0, energy.num_actions)
     energies = score(plans)
-    first = plans[jnp.argmin(energies)]
+    first, first_invalid = plans[jnp.argmin(energies)], jnp.isnan(energies).any()
     keys = jax.random.split(loop_key, config.iterations)[1:]
-    (plans, energies), later = jax.lax.scan(breed, (plans, energies), keys)
+    (plans, energies), (later, invalid) = jax.lax.scan(breed, (plans, energies), keys)
     best = jnp.argmin(energies)
     plan = Plan(
         plans[best],
         jnp.concatenate([first[None], later]),
         energy.violation(params, memory, plans[best]) <= 0,
+        ~(first_invalid | invalid.any()),
     )
     return plan._replace(energy=energies[best]) if config.score else plan
 
@@ -249,19 +316,31 @@ def planner_for(config: PlannerConfig) -> Callable[..., Plan]:
 class CompiledPlanner:
     """A jitted planner for batches of any size; made by `compile_planner`."""
 
-    def __init__(self, energy: Energy, config: PlannerConfig, chunk_sizes: Sequence[int]) -> None:
+    def __init__(
+        self,
+        energy: Energy,
+        config: PlannerConfig,
+        chunk_sizes: Sequence[int],
+        devices: Sequence[jax.Device] | None,
+    ) -> None:
         self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
         if not self.chunk_sizes or self.chunk_sizes[0] < 1:
             raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
         planner = planner_for(config)
 
-        def plan_chunk(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
+        def plan_rows(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
             keys = jax.random.wrap_key_data(key_data, impl=kind)
             return jax.vmap(lambda key, context: planner(energy, params, key, context, config))(
                 keys, contexts
             )
 
-        self.plan_chunk = jax.jit(plan_chunk, static_argnums=0)
+        self._last: list[Array] = []
+        self._placed: dict[int, Params] = {}
+        # Plans have nothing to say to each other: each device plans its rows by itself.
+        self._meshes = {size: sharding.data_mesh(size, devices) for size in self.chunk_sizes}
+        self._programs = {
+            mesh.size: sharding.split_batches(plan_rows, mesh) for mesh in self._meshes.values()
+        }
 
     def __call__(self, params: Params, keys: Array, contexts: PyTree) -> Plan:
         """Plans for B contexts.
@@ -276,6 +355,7 @@ class CompiledPlanner:
 
         Raises:
             ValueError: no contexts, or not as many as keys.
+            NotANumber: the energy of some action was NaN.
         """
         batch = keys.shape[0]
         if batch == 0:
@@ -292,18 +372,42 @@ class CompiledPlanner:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
         inputs = jax.tree.map(np.asarray, (keys, contexts))
         chunks = split_batch(batch, self.chunk_sizes)
+        placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
         plans = []
         for start, size, _ in chunks:
             # A last chunk that is not full repeats its last row, which is then cut off.
             rows = np.minimum(np.arange(start, start + size), batch - 1)
-            plans.append(
-                self.plan_chunk(kind, params, *jax.tree.map(lambda leaf, r=rows: leaf[r], inputs))
-            )
+            count = self._meshes[size].size
+            chunk = jax.tree.map(lambda leaf, r=rows: leaf[r], inputs)
+            plans.append(self._programs[count](kind, placed[count], *chunk))
         parts = [
             jax.tree.map(lambda leaf, n=used: np.asarray(leaf)[:n], plan)
             for plan, (_, _, used) in zip(plans, chunks, strict=True)
         ]
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        plan = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        if not plan.valid.all():
+            raise NotANumber(
+                f"the energy is NaN for {np.sum(~plan.valid)} of {batch} contexts (the first is "
+                f"context {np.argmin(plan.valid)}): look at the parameters, and at logits that "
+                "are +inf or all -inf"
+            )
+        return plan
+
+    def _place(self, params: Params, meshes: set[Mesh]) -> dict[int, Params]:
+        """The parameters on the devices of each mesh, by its size.
+
+        Remembered while they are the very same arrays, which is what a caller passes call
+        after call: placing them costs more than a single plan. Arrays of NumPy may be
+        written to, so they are placed each time.
+        """
+        leaves = jax.tree.leaves(params)
+        same = len(leaves) == len(self._last) and all(map(operator.is_, leaves, self._last))
+        if not same or not all(isinstance(leaf, jax.Array) for leaf in leaves):
+            self._last, self._placed = leaves, {}
+        for mesh in meshes:
+            if mesh.size not in self._placed:
+                self._placed[mesh.size] = sharding.replicate(params, mesh)
+        return self._placed
 
     def sizes_up_to(self, batch: int) -> list[int]:
         """The chunk sizes that batches of at most so many plans can need."""
@@ -312,7 +416,10 @@ class CompiledPlanner:
 
 
 def compile_planner(
-    energy: Energy, config: PlannerConfig, chunk_sizes: Sequence[int] = (1, 8, 64)
+    energy: Energy,
+    config: PlannerConfig,
+    chunk_sizes: Sequence[int] = (1, 16, 128),
+    devices: Sequence[jax.Device] | None = None,
 ) -> CompiledPlanner:
     """Builds, once, the planner that serves batches of any size.
 
@@ -323,9 +430,11 @@ def compile_planner(
     Args:
         energy: what to minimise.
         config: of `gibbs`, `random_shooting` or `cross_entropy_method`, and which of them.
-        chunk_sizes: allowed numbers of plans per call of the compiled function.
+        chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
+            split over as many of the devices as divide it.
+        devices: to plan on; all of this process, if not given.
     """
-    return CompiledPlanner(energy, config, chunk_sizes)
+    return CompiledPlanner(energy, config, chunk_sizes, devices)
 
 
 def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:

@@ -59,11 +59,11 @@ def sizes_for(level: Level, context: int, horizon: int) -> Sizes:
     return Sizes(side, vocabulary.SIZE, NUM_ACTIONS, context, horizon, longest)
 
 
-def make_agent(specification: Specification) -> Agent:
-    """The agent of a specification."""
+def make_agent(specification: Specification, axis: str | None = None) -> Agent:
+    """The agent of a specification; for `axis` see `leapjax.agents.leap.make_agent`."""
     return leap.make_agent(
         specification.model, specification.training, specification.planner,
-        specification.sizes, specification.words,
+        specification.sizes, specification.words, axis,
     )  # fmt: skip
 
 

@@ -14,10 +14,15 @@ def linear_temperatures(first: float, last: float, iterations: int) -> jax.Array
     """
     if iterations < 1:
         raise ValueError(f"iterations must be at least 1, got {iterations}")
-    for value in (first, last):
+    check_temperatures(first, last)
+    return jnp.linspace(first, last, iterations, dtype=jnp.float32)
+
+
+def check_temperatures(*temperatures: float) -> None:
+    """Refuses, with `ValueError`, what is negative or not finite."""
+    for value in temperatures:
         if not 0 <= value < float("inf"):
             raise ValueError(f"a temperature must be finite and at least 0, got {value}")
-    return jnp.linspace(first, last, iterations, dtype=jnp.float32)
 
 
 def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:

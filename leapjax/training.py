@@ -5,7 +5,9 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
+from leapjax import sharding
 from leapjax.types import Agent, PyTree, TrainState
 
 BATCH_STREAM, UPDATE_STREAM = 0, 1
@@ -16,7 +18,7 @@ class NonFiniteLoss(RuntimeError):
 
 
 def make_train_step(
-    agent: Agent, make_batch: Callable[[jax.Array, PyTree], PyTree]
+    agent: Agent, make_batch: Callable[[jax.Array, PyTree], PyTree], mesh: Mesh | None = None
 ) -> Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]:
     """The jitted step `(state, data, key) -> (state, metrics)`; it consumes `state`.
 
@@ -26,14 +28,24 @@ def make_train_step(
     Args:
         agent: what is trained.
         make_batch: (key, data) -> batch; pure.
+        mesh: splits every batch over its devices; the state is on all of them (see
+            `sharding.replicate`) and `agent` averages over the axis `sharding.DATA`. None
+            for one device.
     """
+    update = agent.update
+    if mesh is not None:
+        everywhere, split = sharding.REPLICATED, sharding.SPLIT
+        update = jax.shard_map(
+            update, mesh=mesh, in_specs=(everywhere, split, everywhere), out_specs=everywhere,
+            check_vma=False,  # the mean over devices is taken by the agent
+        )  # fmt: skip
 
     def step(
         state: TrainState, data: PyTree, key: jax.Array
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         batch_key = jax.random.fold_in(jax.random.fold_in(key, BATCH_STREAM), state.step)
         update_key = jax.random.fold_in(jax.random.fold_in(key, UPDATE_STREAM), state.step)
-        return agent.update(state, make_batch(batch_key, data), update_key)
+        return update(state, make_batch(batch_key, data), update_key)
 
     return jax.jit(step, donate_argnums=0)
 

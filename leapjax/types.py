@@ -41,6 +41,7 @@ class Plan(NamedTuple):
     actions: jax.Array  # [T] int32
     trace: jax.Array  # [N, T] int32: the actions after every iteration
     satisfied: jax.Array  # [] bool: no constraint of the energy is violated
+    valid: jax.Array  # [] bool: no energy met on the way was NaN
     energy: jax.Array | None = None  # [] float32, only if asked for: it costs T passes
     trace_energies: jax.Array | None = None  # [N] float32, only if asked for: N * T passes
 

@@ -424,3 +424,51 @@ def test_two_views_make_the_product_of_what_each_sees():
     )
     actual = probabilities(conditionals(halves, (TABLE, OTHER_TABLE), context))
     np.testing.assert_allclose(actual, exact_conditionals(product / product.sum()), atol=1e-5)
+
+
+# What is refused where values can be seen.
+
+
+def scoring(scores):
+    """The energy of fixed scores `[T, A]`, whatever the context."""
+    return pseudo_likelihood(
+        lambda params, context: None,
+        lambda params, memory, tokens, positions: jnp.asarray(scores)[positions],
+        ACTIONS,
+    )
+
+
+ENERGIES = [
+    scoring(np.zeros((HORIZON, ACTIONS))),
+    from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS),
+]
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("positions", [[HORIZON], [-1], [0, HORIZON + 3]])
+def test_a_position_out_of_range_is_refused(energy, positions):
+    actions = jnp.zeros(HORIZON, jnp.int32)
+    with pytest.raises(ValueError, match=r"positions .* are not all in 0 \.\. 2, the horizon is 3"):
+        energy.conditional(TABLE, jnp.asarray(TABLE), actions, jnp.array(positions))
+
+
+@pytest.mark.parametrize("energy", ENERGIES)
+@pytest.mark.parametrize("action", [-1, ACTIONS + 1])
+def test_an_action_that_there_is_not_is_refused(energy, action):
+    actions = jnp.zeros(HORIZON, jnp.int32).at[1].set(action)
+    with pytest.raises(ValueError, match=r"actions .* are not all in 0 \.\. 2, or 3 for MASK"):
+        energy.conditional(TABLE, jnp.asarray(TABLE), actions, jnp.array([0]))
+
+
+@pytest.mark.parametrize("row", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf] * 3])
+def test_scores_without_a_distribution_are_refused(row):
+    scores = np.zeros((HORIZON, ACTIONS), np.float32)
+    scores[1] = row
+    energy = scoring(scores)
+    actions = jnp.zeros(HORIZON, jnp.int32)
+    assert np.isfinite(energy.conditional(None, None, actions, jnp.array([0, 2]))).all()
+    with pytest.raises(ValueError, match=r"energies at positions \[1\] are NaN"):
+        energy.conditional(None, None, actions, jnp.array([2, 1]))
+    with pytest.raises(AssertionError):
+        wrong = pseudo_likelihood(lambda p, c: None, lambda *_: jnp.zeros((1, 2)), ACTIONS)
+        jax.jit(wrong.conditional)(None, None, actions, jnp.array([0]))

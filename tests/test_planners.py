@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import jax
@@ -9,8 +10,10 @@ from hypothesis import strategies as st
 
 from leapjax.energy import compose, constrain, from_total, view
 from leapjax.planners import (
+    ORDERS,
     CrossEntropyConfig,
     GibbsConfig,
+    NotANumber,
     ShootingConfig,
     compile_planner,
     gibbs,
@@ -146,7 +149,7 @@ def greedy_traces(order):
     return np.asarray(plan.trace), [joint_probabilities(table) for table in tables]
 
 
-@pytest.mark.parametrize("order", ["random", "sequential"])
+@pytest.mark.parametrize("order", ORDERS)
 def test_greedy_gibbs_never_raises_the_joint_energy(order):
     traces, joints = greedy_traces(order)
     changes = np.array([np.diff(joint_energies(t, j)) for t, j in zip(traces, joints, strict=True)])
@@ -160,6 +163,71 @@ def test_greedy_sweeps_end_where_no_single_action_helps():
         for t in range(HORIZON):
             conditional = conditional_by_counting(joint, trace[-1], t)
             assert conditional[trace[-1][t]] == pytest.approx(conditional.max(), rel=1e-5)
+
+
+def test_looking_at_the_most_uncertain_first_is_not_slower():
+    ends = {order: greedy_traces(order) for order in ORDERS}
+    settled_after = {
+        order: np.mean([(trace != trace[-1]).any(-1).sum() for trace in traces])
+        for order, (traces, _) in ends.items()
+    }
+    assert settled_after["uncertain"] < settled_after["random"]
+
+
+def test_the_position_looked_at_is_the_most_uncertain_one():
+    # Positions do not interact here, so a later look changes no action at temperature 0 and
+    # what was looked at shows in who is asked.
+    table = np.log(np.array([[0.9, 0.1], [0.6, 0.4], [0.7, 0.3], [0.55, 0.45]], np.float32))
+    asked = []
+
+    def conditional(params, memory, actions, positions):
+        jax.debug.callback(lambda p: asked.append(p.tolist()), positions, ordered=True)
+        return -jnp.asarray(table)[positions]
+
+    energy = Energy(lambda p, c: None, conditional, lambda p, m, a: jnp.zeros(()), 2)
+    for resampled, expected in ((1, [[3], [1], [2], [0]]), (2, [[3, 1], [2, 0]])):
+        asked.clear()
+        config = GibbsConfig(4, 1 + len(expected), resampled=resampled, order="uncertain")
+        gibbs(energy, None, jax.random.key(0), None, config)
+        jax.effects_barrier()
+        assert asked[0] == [0, 1, 2, 3]
+        assert asked[1:] == expected
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_chain_that_stops_early_has_the_plan_of_one_that_does_not(order):
+    iterations = 30  # enough for a random order to look at every position after its last change
+    config = GibbsConfig(HORIZON, iterations, order=order)
+    stopping = dataclasses.replace(config, early_stop=True)
+    tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(100)])
+    keys = jax.random.split(jax.random.key(2), len(tables))
+
+    def plans(config):
+        one = lambda p, k: gibbs(ENUMERABLE, p, k, NO_TILT, config)  # noqa: E731
+        return quick_jit(jax.vmap(one))(tables, keys)
+
+    whole, stopped = plans(config), plans(stopping)
+    np.testing.assert_array_equal(stopped.trace, whole.trace)
+    np.testing.assert_array_equal(stopped.actions, whole.actions)
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_an_early_stop_saves_passes(temperature):
+    calls = []
+
+    def conditional(params, memory, actions, positions):
+        jax.debug.callback(lambda: calls.append(1))
+        return ENUMERABLE.conditional(params, memory, actions, positions)
+
+    counting = ENUMERABLE._replace(conditional=conditional)
+    config = GibbsConfig(HORIZON, 200, order="sequential", temperature=temperature, early_stop=True)
+    plan = gibbs(counting, TABLE, jax.random.key(0), NO_TILT, config)
+    jax.effects_barrier()
+    changes = np.flatnonzero((np.diff(plan.trace, axis=0) != 0).any(-1))
+    last = changes[-1] + 2 if len(changes) else 1  # the iteration of the last change
+    # A scan of the other positions, after the last change, finds nothing to change.
+    assert last + HORIZON - 1 <= len(calls) <= last + HORIZON
+    assert (plan.trace[len(calls) :] == plan.actions).all()
 
 
 def test_greedy_start_takes_the_most_likely_action_everywhere():
@@ -662,6 +730,85 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
 
 
 # Mistakes.
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.data())
+def test_plans_of_any_shape(data):
+    """Actions in range, the trace ends with the plan, and the key decides it."""
+    horizon, actions = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 4))
+    batch = data.draw(st.integers(1, 9))
+    config = data.draw(
+        st.one_of(
+            st.builds(
+                GibbsConfig,
+                horizon=st.just(horizon),
+                iterations=st.integers(1, 5),
+                resampled=st.integers(1, horizon),
+                order=st.sampled_from(ORDERS),
+                temperature=st.sampled_from([0.0, 0.7]),
+                early_stop=st.booleans(),
+                restarts=st.integers(1, 2),
+            ),
+            st.builds(ShootingConfig, horizon=st.just(horizon), candidates=st.integers(1, 5)),
+            st.builds(
+                CrossEntropyConfig,
+                horizon=st.just(horizon),
+                iterations=st.integers(1, 3),
+                candidates=st.integers(3, 6),
+                elites=st.integers(1, 3),
+                keep_elites=st.booleans(),
+            ),
+        )
+    )
+    energy = enumerable_energy(horizon, actions)
+    planner = compile_planner(energy, config, (4,))
+    table = random_table(0, horizon, actions)
+    tilts = np.zeros((batch, horizon, actions), np.float32)
+    keys = plan_keys(1, np.arange(batch), np.zeros(batch, int))
+    plan = planner(table, keys, tilts)
+    assert plan.actions.shape == (batch, horizon)
+    assert plan.trace.shape[::2] == (batch, horizon)
+    np.testing.assert_array_equal(plan.trace[:, -1], plan.actions)
+    assert ((plan.trace >= 0) & (plan.trace < actions)).all()
+    assert plan.satisfied.all()
+    assert plan.valid.all()
+    again = planner(table, keys, tilts)
+    jax.tree.map(np.testing.assert_array_equal, plan, again)
+
+
+@pytest.mark.parametrize("devices", [1, 2, 8])
+def test_plans_do_not_depend_on_how_many_devices_share_them(devices):
+    keys, contexts = batch_of(20)
+    config = CONFIGS["gibbs"]
+    planner = compile_planner(TILTED, config, (2, 8), jax.devices()[:devices])
+    plan = planner(TABLE, keys, contexts)
+    expected = one_by_one(config)
+    np.testing.assert_array_equal(plan.trace, expected.trace)
+    np.testing.assert_allclose(plan.energy, expected.energy, rtol=1e-5)
+
+
+def test_parameters_are_placed_again_only_when_they_change():
+    keys, contexts = batch_of(8)
+    planner = compile_planner(TILTED, CONFIGS["gibbs"], (8,))
+    first, second = jnp.asarray(TABLE), jnp.asarray(random_table(5, HORIZON, ACTIONS))
+    expected = [np.asarray(planner(table, keys, contexts).actions) for table in (first, second)]
+    assert (expected[0] != expected[1]).any()
+    for table, plan in ((first, 0), (first, 0), (second, 1), (first, 0)):
+        np.testing.assert_array_equal(planner(table, keys, contexts).actions, expected[plan])
+    # An array of NumPy that its owner writes to is not remembered.
+    table = np.array(first)
+    np.testing.assert_array_equal(planner(table, keys, contexts).actions, expected[0])
+    table[...] = second
+    np.testing.assert_array_equal(planner(table, keys, contexts).actions, expected[1])
+
+
+@EACH_PLANNER
+def test_an_energy_that_is_nan_is_an_error_and_not_a_plan(config):
+    keys, contexts = batch_of(20)
+    contexts["tilt"][3, 1] = np.nan
+    with pytest.raises(NotANumber, match=r"1 of 20 contexts \(the first is context 3\)"):
+        batched(config)(TABLE, keys, contexts)
 
 
 def test_no_contexts_are_refused():

@@ -1,7 +1,10 @@
 """Imports point one way, and the README says what is true."""
 
 import ast
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import leapjax
@@ -40,9 +43,10 @@ def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/types.py")
     may_import("leapjax/schedules.py", "types")
     may_import("leapjax/energy.py", "types")
-    may_import("leapjax/planners.py", "types", "schedules")
+    may_import("leapjax/sharding.py", "types")
+    may_import("leapjax/planners.py", "types", "schedules", "sharding")
     may_import("leapjax/scores.py")
-    may_import("leapjax/training.py", "types")
+    may_import("leapjax/training.py", "types", "sharding")
 
 
 def test_models_and_planners_meet_only_in_agents():
@@ -84,3 +88,25 @@ def test_the_readme_names_files_that_exist():
         assert (ROOT / name).exists(), name
     for name in re.findall(r"^(\S+/\S*)  +\S", readme, flags=re.MULTILINE):
         assert (ROOT / name).exists(), name
+
+
+def test_importing_starts_no_backend():
+    """Devices are chosen when a program starts, which is after its imports."""
+    modules = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for folder in ("leapjax", "experiments", "benchmarks")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if path.name != "__init__.py"
+    ]
+    program = (
+        "import importlib, jax\n"
+        f"for name in {modules}:\n"
+        "    importlib.import_module(name)\n"
+        "from experiments import runtime\n"
+        "runtime.start()\n"
+        "import os\n"
+        "assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
+    environment["LEAPJAX_COMPILATION_CACHE"] = "off"
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment, cwd=ROOT)

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from leapjax import training
+from leapjax import sharding, training
 from leapjax.agents import leap
 from leapjax.agents.leap import TrainingConfig
 from leapjax.checkpoints import Checkpoints
@@ -28,6 +28,7 @@ MODEL = ModelConfig(
     layers=1, heads=2, width=16, channels=4, rounds=1, sweeps=2, fields=2, dropout=0.0
 )
 TRAINING = TrainingConfig(steps=400, batch=8, warmup=20, learning_rate=1e-2)
+DROPOUT = dataclasses.replace(MODEL, dropout=0.1)
 AUGMENTED = dataclasses.replace(TRAINING, augment=True)
 
 
@@ -340,3 +341,44 @@ def test_gradients_are_clipped_by_their_global_norm():
 def test_settings_that_cannot_work_are_refused(setting, says):
     with pytest.raises(ValueError, match=says):
         TrainingConfig(**setting)
+
+
+# Batches that are split over devices.
+
+
+def gradient_step(devices, data, batch=16):
+    """The gradient, the metrics and the batch of one step on so many devices."""
+    config = dataclasses.replace(AUGMENTED, batch=batch)
+    axis = sharding.DATA if devices else None
+    agent = leap.make_agent(DROPOUT, config, GibbsConfig(4, 4), SIZES, WORDS, axis)
+    mesh = sharding.data_mesh(batch, jax.devices()[:devices]) if devices else None
+    step = training.make_train_step(
+        agent, lambda key, data: leap.make_batch(key, data, config, SIZES), mesh
+    )
+    state, key = jax.jit(agent.init)(jax.random.key(0)), jax.random.key(4)
+    if mesh is not None:
+        assert mesh.size == devices
+        state, data, key = sharding.replicate((state, data, key), mesh)
+    state, metrics = step(state, data, key)
+    # Adam's first moment after one step from zero is the gradient times 1 - beta.
+    moments = optax.tree.get(state.optimizer, "mu")
+    return jax.device_get((moments, metrics))
+
+
+@pytest.mark.parametrize("devices", [1, 8])
+def test_a_step_split_over_devices_is_the_step_of_one(devices, data):
+    expected, expected_metrics = gradient_step(0, data)
+    actual, metrics = gradient_step(devices, data)
+    assert any(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(expected))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), actual, expected
+    )
+    assert metrics.keys() == expected_metrics.keys() >= {"loss", "accuracy", "gradient_norm"}
+    for name, value in expected_metrics.items():
+        assert metrics[name] == pytest.approx(value, rel=1e-4)
+
+
+def test_a_mesh_has_as_many_devices_as_split_the_batch():
+    assert len(jax.devices()) == 8
+    sizes = {batch: sharding.data_mesh(batch).size for batch in (1, 2, 7, 12, 64)}
+    assert sizes == {1: 1, 2: 2, 7: 1, 12: 4, 64: 8}

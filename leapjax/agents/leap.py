@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import optax
 
 from leapjax import planners, schedules
+from leapjax.agents.gradients import make_update
 from leapjax.data import symmetries, windows
 from leapjax.data.windows import Steps, Window
 from leapjax.energy import pseudo_likelihood
@@ -70,6 +71,7 @@ def make_agent(
     planner: planners.PlannerConfig,
     sizes: Sizes,
     words: int,
+    axis: str | None = None,
 ) -> Agent:
     """LEAP as an `Agent`.
 
@@ -79,6 +81,8 @@ def make_agent(
         planner: the search.
         sizes: of environment and plan.
         words: L, instruction length.
+        axis: the mesh axis that batches are split over, inside `jax.shard_map`; None
+            outside of it.
     """
     module = trajectory.build(model, sizes)
     optimizer = make_optimizer(training)
@@ -91,7 +95,9 @@ def make_agent(
         params = module.init(key, context, actions, method=_encode_and_score)
         return TrainState(params, optimizer.init(params), jnp.int32(0))
 
-    def window_loss(params: Params, window: Window, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def window_loss(
+        params: Params, window: Window, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Masked cross-entropy of one window (paper, equation 1), and its accuracy."""
         mask_key, encode_key, *_ = keys = jax.random.split(key, 2 + sizes.horizon)
         masks = schedules.sample_masks(mask_key, sizes.horizon, training.masking)  # [C, T]
@@ -116,32 +122,13 @@ def make_agent(
         # Unmasked positions are not predicted: their terms are left out, not zeroed after
         # the fact, so that a -inf there cannot become NaN.
         count = masks.sum()
-        return -jnp.where(masks, chosen, 0).sum() / count, jnp.where(masks, hits, 0).sum() / count
-
-    def loss(params: Params, batch: Window, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        keys = jax.random.split(key, batch.actions.shape[0])
-        losses, accuracies = jax.vmap(lambda w, k: window_loss(params, w, k))(batch, keys)
-        return losses.mean(), accuracies.mean()
-
-    def update(
-        state: TrainState, batch: Window, key: jax.Array
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
-        (value, accuracy), gradients = jax.value_and_grad(loss, has_aux=True)(
-            state.params, batch, key
-        )
-        updates, opt_state = optimizer.update(gradients, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
-        metrics = {
-            "loss": value,
-            "accuracy": accuracy,
-            "gradient_norm": optax.global_norm(gradients),
-        }
-        return TrainState(params, opt_state, state.step + 1), metrics
+        accuracy = jnp.where(masks, hits, 0).sum() / count
+        return -jnp.where(masks, chosen, 0).sum() / count, {"accuracy": accuracy}
 
     def act(params: Params, key: jax.Array, context: Context) -> Plan:
         return planners.planner_for(planner)(energy, params, key, context, planner)
 
-    return Agent(init, update, energy, act)
+    return Agent(init, make_update(window_loss, optimizer, axis), energy, act)
 
 
 def make_batch(key: jax.Array, steps: Steps, training: TrainingConfig, sizes: Sizes) -> Window:

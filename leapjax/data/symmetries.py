@@ -14,7 +14,7 @@ import numpy as np
 
 from leapjax.types import Observation
 
-DIRECTION_VECTORS = jnp.array([[1, 0], [0, 1], [-1, 0], [0, -1]], jnp.int32)  # [4, 2]
+DIRECTION_VECTORS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], np.int32)  # [4, 2]
 LEFT, RIGHT = 0, 1  # MiniGrid's turn actions
 FIRST_COLOURED, LAST_COLOURED = 4, 7  # MiniGrid's object indices: door, key, ball, box
 # Key, ball and box: alike where no door is locked and nobody toggles a box, which would vanish.

@@ -1,7 +1,8 @@
 """Encoders of grids, poses and instructions, for one state.
 
-Convolutions are written as one matrix product over shifted copies: on a CPU this is
-several times faster than XLA's own convolution, above all in the gradient.
+Which convolution is fastest on a CPU depends on the map (docs/performance.md): on whole
+grids of few channels XLA's own is, on the small and deep maps of the paper's encoder one
+matrix product over shifted copies.
 """
 
 import functools
@@ -28,7 +29,7 @@ def patches(image: jax.Array, side: int, padding: tuple[int, int]) -> jax.Array:
 
 
 class Convolution(nn.Module):
-    """A convolution of stride 1 as a matrix product."""
+    """A convolution of stride 1 as one matrix product, for small maps of many channels."""
 
     features: int
     side: int = 3
@@ -127,6 +128,11 @@ class PaperStateEncoder(nn.Module):
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
 
 
+def _convolution(features: int, name: str) -> nn.Conv:
+    """A 3x3 convolution with padding, by XLA."""
+    return nn.Conv(features, (3, 3), kernel_init=nn.initializers.he_normal(), name=name)
+
+
 class GridEncoder(nn.Module):
     """Cell features that know the way: learned distances, then local convolutions.
 
@@ -153,7 +159,7 @@ class GridEncoder(nn.Module):
             agent: `[2]` its cell.
             goal: `[2]` its cell; (-1, -1) where it is not available.
         """
-        local = nn.relu(Convolution(self.channels, name="local")(cells))
+        local = nn.relu(_convolution(self.channels, "local")(cells))
         bias = nn.initializers.constant(1.0)
         cost = nn.softplus(nn.Dense(self.fields, bias_init=bias, name="cost")(local))
         from_goal = (1 - one_cell(goal, cells.shape[0]))[..., None] * FAR
@@ -168,10 +174,8 @@ class GridEncoder(nn.Module):
         # Locally only differences matter: measured from the agent, and squashed.
         here = feature_at(distance, agent)
         relative = jnp.tanh((distance - here) / 4)
-        source = Convolution(self.channels, name="source")(
-            jnp.concatenate([cells, relative], axis=-1)
-        )
-        step = Convolution(self.channels, name="step")
+        source = _convolution(self.channels, "source")(jnp.concatenate([cells, relative], axis=-1))
+        step = _convolution(self.channels, "step")
         h = nn.relu(source)
         for _ in range(self.rounds):
             h = nn.relu(step(h) + source)

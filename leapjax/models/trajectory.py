@@ -77,7 +77,7 @@ class PaperModel(nn.Module):
         c, sizes = self.config, self.sizes
         self.instruction = encoders.InstructionEncoder(sizes.vocabulary, c.width)
         self.state = encoders.PaperStateEncoder(sizes.side, c.width)
-        self.action = nn.Embed(sizes.num_actions + 2, c.width, embedding_init=_small)
+        self.action = _embed(sizes.num_actions + 2, c.width)
         tokens = 2 * (sizes.context + sizes.horizon)
         self.position = nn.Embed(tokens, c.width, embedding_init=nn.initializers.zeros)
         steps = sizes.max_steps + sizes.horizon + 1
@@ -118,13 +118,72 @@ class PaperModel(nn.Module):
         return forbid_early_end(self.head(h), positions)
 
 
-class LeapModel(nn.Module):
-    """Ours: a canonical frame, the state once, and a cached context.
+class ContextTokens(nn.Module):
+    """Ours: what a plan must know of its context, in a few tokens.
 
-    The grid is turned so that the agent faces right; learned distances spread over it;
-    what the plan needs is read at the agent, at the goal and over the whole grid.
-    These few tokens are a prefix that never attends to the plan, so its keys and values
-    are computed once per plan, and a pass runs over T action tokens only.
+    The grid is turned so that the agent faces right; learned distances spread over it; it is
+    read at the agent, at the goal and as a whole.
+    """
+
+    config: ModelConfig
+    sizes: Sizes
+
+    @nn.compact
+    def __call__(self, context: Context) -> jax.Array:
+        """Tokens `[4, D]`: the agent, the goal, the whole grid, the instruction."""
+        c, side = self.config, self.sizes.side
+        direction = context.observation.pose[2]
+        observation = symmetries.rotate(context.observation, direction)
+        words = encoders.InstructionEncoder(self.sizes.vocabulary, c.width, name="instruction")
+        instruction = words(observation.instruction)
+        cells = encoders.CellEmbedding(c.channels, name="cells")(observation)
+        if self.sizes.context:
+            visits = self._visits(context, direction)
+            cells += nn.Dense(c.channels, use_bias=False, name="visited")(visits)
+        scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction), 2)
+        encoder = encoders.GridEncoder(c.channels, c.fields, c.sweeps, c.rounds, name="grid")
+        grid, distances = encoder(
+            cells * (1 + scale) + shift, observation.pose[:2], observation.goal
+        )
+
+        def read(features: jax.Array, name: str) -> jax.Array:
+            return dense(c.width, scale=0.1, name=name)(features)
+
+        # The agent's neighbourhood holds what the first steps depend on.
+        around = encoders.neighbourhood(grid, observation.pose[:2], c.radius)
+        kind, colour = observation.carried
+        agent = read(around, "read_agent") + read(distances, "read_distances")
+        agent += _embed(encoders.OBJECTS, c.width, "carried")(kind)
+        agent += _embed(encoders.COLOURS, c.width, "carried_colour")(colour)
+        goal = read(encoders.feature_at(grid, observation.goal), "read_goal")
+        whole = read(grid.reshape(side * side, -1).max(axis=0), "read_all")
+        return jnp.stack([agent, goal, whole, instruction])
+
+    def _visits(self, context: Context, direction: jax.Array) -> jax.Array:
+        """When the agent last stood in, and last faced, each cell: `[S, S, 4]`.
+
+        The context drawn on the grid: each mark once as 1, once as its recency in (0, 1].
+        """
+        side, past = self.sizes.side, self.sizes.context
+        valid = context.actions <= self.sizes.num_actions  # PAD before the start
+        recency = jnp.arange(1, past + 1) / past
+
+        def marks(pose: jax.Array) -> jax.Array:
+            turned = symmetries.rotate_pose(pose, direction, side)
+            front = turned[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[turned[2]]
+            cells = [encoders.one_cell(turned[:2], side), encoders.one_cell(front, side)]
+            return jnp.stack(cells, axis=-1)  # [S, S, 2]
+
+        drawn = jax.vmap(marks)(context.past.pose) * valid[:, None, None, None]
+        latest = (drawn * recency[:, None, None, None]).max(axis=0)
+        return jnp.concatenate([drawn.max(axis=0), latest], axis=-1)
+
+
+class LeapModel(nn.Module):
+    """Ours: the state once, and a cached context.
+
+    The tokens of the context are a prefix that never attends to the plan, so its keys and
+    values are computed once per plan, and a pass runs over T action tokens only.
     """
 
     config: ModelConfig
@@ -132,50 +191,16 @@ class LeapModel(nn.Module):
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
-        self.instruction = encoders.InstructionEncoder(sizes.vocabulary, c.width)
-        self.cells = encoders.CellEmbedding(c.channels)
-        self.modulation = dense(2 * c.channels)
-        self.visited = nn.Dense(c.channels, use_bias=False)
-        self.grid = encoders.GridEncoder(c.channels, c.fields, c.sweeps, c.rounds)
-        self.read_agent = dense(c.width, scale=0.1)
-        self.read_distances = dense(c.width, scale=0.1)
-        self.read_goal = dense(c.width, scale=0.1)
-        self.read_all = dense(c.width, scale=0.1)
-        self.carried = nn.Embed(encoders.OBJECTS, c.width, embedding_init=_small)
-        self.carried_colour = nn.Embed(encoders.COLOURS, c.width, embedding_init=_small)
-        self.action = nn.Embed(sizes.num_actions + 2, c.width, embedding_init=_small)
-        self.position = nn.Embed(sizes.horizon, c.width, embedding_init=_small)
+        self.context = ContextTokens(c, sizes)
+        self.action = _embed(sizes.num_actions + 2, c.width)
+        self.position = _embed(sizes.horizon, c.width)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode(self, context: Context, deterministic: bool = True) -> PyTree:
         """Keys and values of the prefix tokens, per layer."""
-        direction = context.observation.pose[2]
-        observation = symmetries.rotate(context.observation, direction)
-        side = self.sizes.side
-        instruction = self.instruction(observation.instruction)
-        cells = self.cells(observation)
-        if self.sizes.context:
-            cells += self.visited(self._visits(context, direction))
-        scale, shift = jnp.split(self.modulation(instruction), 2)
-        grid, distances = self.grid(
-            cells * (1 + scale) + shift, observation.pose[:2], observation.goal
-        )
-        # The agent's neighbourhood holds what the first steps depend on.
-        around = encoders.neighbourhood(grid, observation.pose[:2], self.config.radius)
-        agent = self.read_agent(around) + self.read_distances(distances)
-        agent += self.carried(observation.carried[0])
-        agent += self.carried_colour(observation.carried[1])
-        tokens = jnp.stack(
-            [
-                agent,
-                self.read_goal(encoders.feature_at(grid, observation.goal)),
-                self.read_all(grid.reshape(side * side, -1).max(axis=0)),
-                instruction,
-            ]
-        )
-        tokens = self.drop(tokens, deterministic=deterministic)
+        tokens = self.drop(self.context(context), deterministic=deterministic)
         return self.transformer.prefix(tokens, deterministic=deterministic)
 
     def logits(
@@ -191,24 +216,36 @@ class LeapModel(nn.Module):
         h = self.transformer(x, positions, memory, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
 
-    def _visits(self, context: Context, direction: jax.Array) -> jax.Array:
-        """When the agent last stood in, and last faced, each cell: `[S, S, 4]`.
 
-        The context drawn on the grid: each mark once as 1, once as its recency in (0, 1].
-        """
-        side, past = self.sizes.side, self.sizes.context
-        valid = context.actions <= self.sizes.num_actions  # PAD before the start
-        recency = jnp.arange(1, past + 1) / past
+class SequenceClassifier(nn.Module):
+    """An LSTM that reads a whole plan and says how corrupted it is (paper, appendix, ablation).
 
-        def marks(pose: jax.Array) -> jax.Array:
-            turned = symmetries.rotate_pose(pose, direction, side)
-            front = turned[:2] + symmetries.DIRECTION_VECTORS[turned[2]]
-            cells = [encoders.one_cell(turned[:2], side), encoders.one_cell(front, side)]
-            return jnp.stack(cells, axis=-1)  # [S, S, 2]
+    The context is the same as `LeapModel`'s; it is the LSTM's first memory.
+    """
 
-        drawn = jax.vmap(marks)(context.past.pose) * valid[:, None, None, None]
-        latest = (drawn * recency[:, None, None, None]).max(axis=0)
-        return jnp.concatenate([drawn.max(axis=0), latest], axis=-1)
+    config: ModelConfig
+    sizes: Sizes
+
+    def setup(self) -> None:  # noqa: D102
+        c = self.config
+        self.context = ContextTokens(c, self.sizes)
+        self.begin = dense(2 * c.width, scale=0.1)
+        self.action = _embed(self.sizes.num_actions, c.width)
+        self.recurrence = nn.RNN(nn.OptimizedLSTMCell(c.width))
+        self.head = nn.Dense(1)
+
+    def encode(self, context: Context) -> PyTree:
+        """The LSTM's first carry, `[D]` and `[D]`."""
+        return tuple(jnp.split(self.begin(self.context(context).reshape(-1)), 2))
+
+    def degree(self, memory: PyTree, actions: jax.Array) -> jax.Array:
+        """The degree of corruption `[]` of a complete plan `[T]`: 0 none of it, 1 all."""
+        states = self.recurrence(self.action(actions), initial_carry=memory)
+        return self.head(states[-1])[0]
+
+
+def _embed(count: int, width: int, name: str | None = None) -> nn.Embed:
+    return nn.Embed(count, width, embedding_init=_small, name=name)
 
 
 def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> jax.Array:

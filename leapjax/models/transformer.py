@@ -22,9 +22,11 @@ class KeysValues(NamedTuple):
     values: jax.Array  # [tokens, heads, D / heads]
 
 
-def dense(features: int, use_bias: bool = True, scale: float = WEIGHT_SCALE) -> nn.Dense:
+def dense(
+    features: int, use_bias: bool = True, scale: float = WEIGHT_SCALE, name: str | None = None
+) -> nn.Dense:
     """A linear layer with the initialisation of this transformer."""
-    return nn.Dense(features, use_bias, kernel_init=nn.initializers.normal(scale))
+    return nn.Dense(features, use_bias, kernel_init=nn.initializers.normal(scale), name=name)
 
 
 class Block(nn.Module):

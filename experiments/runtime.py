@@ -1,14 +1,35 @@
-"""XLA's compilation cache, kept between runs: a second start takes seconds."""
+"""How JAX is set up for a program of ours: its devices, its compilation cache."""
 
+import contextlib
 import os
 import platform
 from pathlib import Path
 
 import jax
 
+MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
+
+
+def start() -> None:
+    """Every program's first step, before JAX has touched a device."""
+    use_every_core()
+    use_compilation_cache()
+
+
+def use_every_core() -> None:
+    """Makes each core a JAX device of its own, as `leapjax.sharding` wants them.
+
+    `JAX_NUM_CPU_DEVICES`, if set, has the last word.
+    """
+    if "JAX_NUM_CPU_DEVICES" in os.environ:
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
+        jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CPU_DEVICES))
+
 
 def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder.
+    """Keeps compiled programs in the user's cache folder: a second start takes seconds.
 
     Programs are compiled for one processor, so each kind has its own folder.
     `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".

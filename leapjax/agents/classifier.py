@@ -1,0 +1,86 @@
+"""The paper's other energy: an LSTM that says how corrupted a plan is (appendix, ablation).
+
+Trained on plans some of whose actions were replaced; a plan without a replaced action has
+the least energy. Planning with it works worse than with the masked language model.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax import planners
+from leapjax.agents import leap
+from leapjax.agents.gradients import make_update
+from leapjax.agents.leap import TrainingConfig
+from leapjax.data.windows import Window
+from leapjax.energy import classifier
+from leapjax.models import trajectory
+from leapjax.models.trajectory import ModelConfig, SequenceClassifier, Sizes
+from leapjax.types import Agent, Context, Params, Plan, TrainState
+
+
+def make_agent(
+    model: ModelConfig,
+    training: TrainingConfig,
+    planner: planners.PlannerConfig,
+    sizes: Sizes,
+    words: int,
+    axis: str | None = None,
+) -> Agent:
+    """The classifier as an `Agent`; the arguments are those of `leapjax.agents.leap`."""
+    module = SequenceClassifier(model, sizes)
+    optimizer = leap.make_optimizer(training)
+
+    def encode(params: Params, context: Context) -> object:
+        return module.apply(params, context, method="encode")
+
+    def degree(params: Params, memory: object, actions: jax.Array) -> jax.Array:
+        result = module.apply(params, memory, actions, method="degree")
+        assert isinstance(result, jax.Array)
+        # As for every energy: the end action, the last one, is never the first of a plan.
+        return jnp.where(actions[0] == sizes.num_actions - 1, jnp.inf, result)
+
+    energy = classifier(encode, degree, sizes.num_actions)
+
+    def init(key: jax.Array) -> TrainState:
+        context = trajectory.blank_context(sizes, words)
+        actions = jnp.zeros(sizes.horizon, jnp.int32)
+        params = module.init(key, context, actions, method=_encode_and_judge)
+        return TrainState(params, optimizer.init(params), jnp.int32(0))
+
+    def window_loss(
+        params: Params, window: Window, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Squared error of the degree of corruption of one corrupted window."""
+        corrupted, target = corrupt(key, window.actions, sizes.num_actions)
+        memory = module.apply(params, window.context, method="encode")
+        found = module.apply(params, memory, corrupted, method="degree")
+        assert isinstance(found, jax.Array)
+        return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
+
+    def act(params: Params, key: jax.Array, context: Context) -> Plan:
+        return planners.planner_for(planner)(energy, params, key, context, planner)
+
+    return Agent(init, make_update(window_loss, optimizer, axis), energy, act)
+
+
+def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:
+    """Replaces n of the actions `[T]` by others, n uniform in 0 .. T; and n / T.
+
+    The paper says "depending on the degree of randomness": the share of actions that are
+    not the demonstrator's.
+    """
+    count_key, order_key, action_key = jax.random.split(key, 3)
+    horizon = actions.shape[0]
+    count = jax.random.randint(count_key, (), 0, horizon + 1)
+    replaced = jax.random.permutation(order_key, horizon) < count
+    # A shift by 1 .. A-1 is always another action.
+    shift = jax.random.randint(action_key, (horizon,), 1, max(num_actions, 2))
+    corrupted = jnp.where(replaced, (actions + shift) % num_actions, actions)
+    return corrupted, count / horizon
+
+
+def _encode_and_judge(
+    module: SequenceClassifier, context: Context, actions: jax.Array
+) -> jax.Array:
+    """Touches every parameter, to initialise them."""
+    return module.degree(module.encode(context), actions)

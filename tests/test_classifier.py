@@ -1,0 +1,88 @@
+"""The sequence classifier: what it is trained on, what it learns, how one plans with it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax import planners, training
+from leapjax.agents import classifier, leap
+from leapjax.agents.leap import TrainingConfig
+from leapjax.data import windows
+from leapjax.envs import vocabulary
+from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.planners import GibbsConfig
+
+SIZES = Sizes(7, vocabulary.SIZE, NUM_ACTIONS, 0, 4, 49)
+MODEL = ModelConfig(layers=1, heads=1, width=16, channels=8, fields=2, sweeps=4, rounds=1)
+TRAINING = TrainingConfig(steps=150, batch=16, warmup=10, learning_rate=1e-2)
+END = NUM_ACTIONS - 1
+
+
+def test_corruption_is_as_many_other_actions_as_it_says():
+    actions = jnp.array([0, 2, 2, END])
+    keys = jax.random.split(jax.random.key(0), 4000)
+    corrupted, degrees = jax.vmap(lambda k: classifier.corrupt(k, actions, NUM_ACTIONS))(keys)
+    assert ((corrupted >= 0) & (corrupted < NUM_ACTIONS)).all()
+    np.testing.assert_allclose((corrupted != actions).mean(axis=1), degrees)
+    # Every degree is as likely, every position too, and every other action.
+    counts = np.bincount(np.round(degrees * 4).astype(int), minlength=5)
+    np.testing.assert_allclose(counts / 4000, 0.2, atol=0.03)
+    np.testing.assert_allclose((corrupted != actions).mean(axis=0), 0.5, atol=0.04)
+    changed = corrupted[:, 1][corrupted[:, 1] != 2]
+    shares = np.bincount(changed, minlength=NUM_ACTIONS) / len(changed)
+    expected = np.where(np.arange(NUM_ACTIONS) == 2, 0, 1 / (NUM_ACTIONS - 1))
+    np.testing.assert_allclose(shares, expected, atol=0.04)
+
+
+@pytest.fixture(scope="module")
+def trained(local_demonstrations):
+    """An agent that was trained for a moment, its parameters and all steps of its data."""
+    agent = classifier.make_agent(MODEL, TRAINING, GibbsConfig(4, 9), SIZES, 5)
+    step = training.make_train_step(
+        agent, lambda key, data: leap.make_batch(key, data, TRAINING, SIZES)
+    )
+    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations))
+    losses = []
+    state = training.train(
+        step, jax.jit(agent.init)(jax.random.key(0)), data, jax.random.key(1), TRAINING.steps,
+        lambda done, state, means: losses.append(means["loss"]),
+    )  # fmt: skip
+    return agent, state.params, leap.make_batch(jax.random.key(2), data, TRAINING, SIZES), losses
+
+
+def test_it_learns_how_corrupted_a_plan_is(trained):
+    agent, params, batch, losses = trained
+    # Always saying 1/2 has a squared error of 1/8.
+    assert losses[-1] < 0.06 < losses[0]
+    energy = agent.energy
+    keys = jax.random.split(jax.random.key(3), 16)
+
+    @jax.jit
+    def energies(context, actions, key):
+        memory = energy.encode(params, context)
+        shuffled = jax.random.randint(key, actions.shape, 0, END)
+        return energy.total(params, memory, actions), energy.total(params, memory, shuffled)
+
+    clean, random = jax.vmap(energies)(batch.context, batch.actions, keys)
+    assert (clean < random).mean() > 0.8
+
+
+def test_one_plans_with_it_as_with_any_energy(trained):
+    agent, params, batch, _ = trained
+    assert not agent.energy.accepts_mask
+    keys = planners.plan_keys(0, np.arange(16), np.zeros(16, int))
+    config = GibbsConfig(4, 13, order="sequential", score_trace=True)
+    plan = planners.compile_planner(agent.energy, config, (16,))(params, keys, batch.context)
+    energies = np.asarray(plan.trace_energies)
+    # Its conditional is its total with each action tried, so greedy steps never raise it,
+    # once the random start's first action is not the end action.
+    finite = np.isfinite(energies)
+    assert finite[:, -1].all()
+    assert (np.diff(energies, axis=1)[finite[:, :-1]] <= 1e-5).all()
+    assert (plan.actions[:, 0] != END).all()
+    acted = jax.jit(agent.act)(
+        params, jax.random.wrap_key_data(keys[0]), jax.tree.map(lambda x: x[0], batch.context)
+    )
+    assert acted.actions.shape == (4,)
