@@ -8,6 +8,7 @@ in the same run on the same layer shapes.
 
 import dataclasses
 import json
+import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import matplotlib
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -30,7 +32,14 @@ from leapjax.envs import vocabulary
 from leapjax.envs.adapter import NUM_ACTIONS
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.planners import GibbsConfig, compile_planner, split_batch
+from leapjax.planners import (
+    CompiledPlanner,
+    GibbsConfig,
+    compile_planner,
+    plan_keys,
+    split_batch,
+)
+from leapjax.types import Params
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -52,6 +61,8 @@ class Options:
 
     quick: bool = False
     """Only (T, N) = (5, 10), at batch 1 and 256."""
+    large: int = 0
+    """Also plan so many contexts of (15, 50) in one call, and report the memory it took."""
     json: Path | None = None
     """Write the rows here."""
     plot: Path | None = None
@@ -73,6 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows += measure(name, horizon, iterations, side, batches, options.seconds)
             console.print(f"measured {name} (T, N) = ({horizon}, {iterations}), side {side}")
     console.print(table(rows))
+    if options.large:
+        for name in MODELS:
+            console.print(plan_many(name, options.large))
     if options.json:
         pretrained.write_text(options.json, json.dumps(rows, indent=1) + "\n")
     if options.plot:
@@ -85,12 +99,7 @@ def measure(
 ) -> list[Row]:
     """One preset and setting at every batch size."""
     model = MODELS[name]
-    sizes = Sizes(side, vocabulary.SIZE, NUM_ACTIONS, 0, horizon, 64)
-    config = GibbsConfig(horizon, iterations)
-    agent = leap.make_agent(model, leap.TrainingConfig(), config, sizes, WORDS)
-    assert agent.energy is not None
-    params = jax.jit(agent.init)(jax.random.key(0)).params
-    planner = compile_planner(agent.energy, config)
+    planner, params, sizes = make_planner(name, horizon, iterations, side)
     flops = needed_flops(model, horizon, iterations)
     rows = []
     for batch in batches:
@@ -123,6 +132,34 @@ def measure(
     return rows
 
 
+def make_planner(
+    name: str, horizon: int, iterations: int, side: int
+) -> tuple[CompiledPlanner, Params, Sizes]:
+    """A planner with random parameters."""
+    sizes = Sizes(side, vocabulary.SIZE, NUM_ACTIONS, 0, horizon, 64)
+    config = GibbsConfig(horizon, iterations)
+    agent = leap.make_agent(MODELS[name], leap.TrainingConfig(), config, sizes, WORDS)
+    assert agent.energy is not None
+    params = jax.jit(agent.init)(jax.random.key(0)).params
+    return compile_planner(agent.energy, config), params, sizes
+
+
+def plan_many(name: str, count: int) -> str:
+    """Plans for very many contexts at once, and says what it took."""
+    horizon, iterations, side = SETTINGS[-1]
+    planner, params, sizes = make_planner(name, horizon, iterations, side)
+    contexts = jax.tree.map(np.asarray, random_contexts(sizes, count))
+    keys = plan_keys(0, np.arange(count), np.zeros(count, int))
+    begun = time.perf_counter()
+    planner(params, keys, contexts)
+    taken = time.perf_counter() - begun
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return (
+        f"{name}: {count} plans of ({horizon}, {iterations}) in {taken:.0f} s, compilation "
+        f"included; at most {most:.2f} GiB of memory in the whole process"
+    )
+
+
 def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
     """Floating-point operations of the N passes of one plan, without the encoders.
 
@@ -148,9 +185,9 @@ def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
     return one_pass(horizon) + (iterations - 1) * one_pass(1)
 
 
-def random_contexts(sizes: Sizes, batch: int) -> Any:
+def random_contexts(sizes: Sizes, batch: int, words: int = WORDS) -> Any:
     """`[B]` contexts of the right shapes with random grids and poses."""
-    blank = trajectory.blank_context(sizes, WORDS)
+    blank = trajectory.blank_context(sizes, words)
     contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
     key = jax.random.key(2)
     shape = contexts.observation.grid.shape
@@ -189,7 +226,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             right.plot(batches, [100 * r["fraction_of_peak"] for r in chosen], "o-")
     left.set(xlabel="batch", ylabel="plans per second", xscale="log", yscale="log")
     right.set(xlabel="batch", ylabel="% of matrix-multiply peak", xscale="log", ylim=(0, 100))
-    left.legend(fontsize=8)
+    left.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, -0.12), ncols=2)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -108,7 +108,7 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
     adapter = BabyAIAdapter(level)
     firsts = seeds.validation_seeds(0, min(options.batch, options.episodes))
     histories = [
-        rollouts.History(adapter.reset(seed), context, adapter.num_actions)
+        rollouts.History(adapter.reset(int(seed)), context, adapter.num_actions)
         for seed in np.resize(np.array(firsts), options.batch)
     ]
     contexts = rollouts.stack_contexts(histories)
@@ -167,6 +167,10 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         xscale="log", xlabel="plans per second",
         ylabel=f"success on {rows[0]['episodes']} validation episodes, %", title=rows[0]["level"],
     )  # fmt: skip
+    speeds = [row["plans_per_second"] for row in rows]
+    ticks = [t for t in 125.0 * 2.0 ** np.arange(10) if min(speeds) / 1.5 < t < max(speeds) * 1.5]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)

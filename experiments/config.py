@@ -75,8 +75,9 @@ def preset(level: Level, name: str) -> Config:
         model = ModelConfig("paper", dropout=0.1)
         training = TrainingConfig(masking="one", windows="episode")
     elif name == "leapjax":
-        # Chosen on validation levels: a little noise leads out of plans that lead nowhere.
-        planner = dataclasses.replace(planner, temperature=0.5)
+        # Chosen on validation levels (docs/performance.md): a little noise leads out of plans
+        # that lead nowhere, and more iterations than positions give nothing.
+        planner = dataclasses.replace(planner, iterations=level.horizon, temperature=0.5)
         model = ModelConfig("leapjax", dropout=0.0, sweeps=_sweeps(level))
         training = TrainingConfig(
             steps=_steps(level),
@@ -94,10 +95,10 @@ def preset(level: Level, name: str) -> Config:
 
 
 def _steps(level: Level) -> int:
-    """As many as a few minutes on two cores allow: a step of the largest maze is slow."""
+    """As many as ten minutes on two cores allow with several rooms, twenty with the largest."""
     if level.rows * level.columns == 1:
         return 1600
-    return 1200 if level.room_size > 5 else 2400
+    return 6000 if level.room_size > 5 and level.rows > 1 else 4000
 
 
 def _sweeps(level: Level) -> int:

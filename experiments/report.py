@@ -1,7 +1,8 @@
-"""Tables of the README, made from the committed rows: `python -m experiments.report`."""
+"""Tables in the documents, made from the committed rows: `python -m experiments.report`."""
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments import results
@@ -11,56 +12,146 @@ from leapjax import scores
 from leapjax.envs.levels import LEVELS
 from leapjax.pretrained import write_text
 
-BEGIN, END = "<!-- results: begin -->", "<!-- results: end -->"
+
+def main() -> int:
+    """Rewrites every table, here."""
+    for path, text in documents(Path()).items():
+        write_text(path, text)
+    return 0
 
 
-def markdown(rows: Sequence[Row]) -> str:
+def documents(root: Path) -> dict[Path, str]:
+    """What each document with tables should say, given the rows."""
+    rows: dict[str, list[Row]] = {"babyai": results.read(root / "results" / "babyai.jsonl")}
+    for name in ("planning", "search", "training"):
+        rows[name] = json.loads((root / "results" / f"{name}.json").read_text(encoding="utf-8"))
+    sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
+        "results": (success, "babyai"),
+        "speed": (speed, "planning"),
+        "planning": (planning, "planning"),
+        "search": (search, "search"),
+        "training": (training, "training"),
+    }
+    written = {}
+    for path in (root / "README.md", root / "docs" / "performance.md"):
+        text = path.read_text(encoding="utf-8")
+        for name, (make, source) in sections.items():
+            if f"<!-- {name}: begin -->" in text:
+                text = replace_section(text, name, make(rows[source]))
+        written[path] = text
+    return written
+
+
+def replace_section(text: str, name: str, section: str) -> str:
+    """The text with what is between the two markers of that name replaced."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, rest = text.split(begin)
+    _, after = rest.split(end)
+    return f"{before}{begin}\n\n{section}\n\n{end}{after}"
+
+
+def success(rows: Sequence[Row]) -> str:
     """Success rates per level: the paper's, preset `paper`, preset `leapjax`.
 
     A cell is the mean over seeds, the 95% interval of all their episodes together, and the
     number of seeds.
     """
-    lines = [
-        "| level | paper | preset `paper` | preset `leapjax` |",
-        "| --- | --- | --- | --- |",
-    ]
+    lines = []
     for level in LEVELS.values():
-        cells = {name: _select(rows, level.name, name) for name in PRESETS}
+        chosen = [
+            [r for r in rows if (r["level"], r["preset"]) == (level.name, name)] for name in PRESETS
+        ]
+        ours, papers = map(_rate, chosen)
+        lines.append([level.name, f"{level.paper_success:.1f}%", papers, ours])
+    return _table("level | paper | preset `paper` | preset `leapjax`", lines)
+
+
+def speed(rows: Sequence[Row]) -> str:
+    """Plans per second at batch 256 and alone."""
+    lines = []
+    for row in rows:
+        if row["batch"] != 256:
+            continue
+        same = ("preset", "horizon", "iterations")
+        alone = next(r for r in rows if r["batch"] == 1 and all(r[key] == row[key] for key in same))
         lines.append(
-            f"| {level.name} | {level.paper_success:.1f}% | {_cell(cells['paper'])} "
-            f"| {_cell(cells['leapjax'])} |"
+            [
+                f"T = {row['horizon']}, N = {row['iterations']}",
+                f"`{row['preset']}`",
+                f"{row['plans_per_second']:,.0f}",
+                f"{row['fraction_of_peak']:.0%}",
+                f"{1e3 * alone['seconds']:.1f} ms",
+            ]
         )
-    return "\n".join(lines)
+    return _table("plan | preset | plans per second | of the machine's peak | one alone", lines)
 
 
-def _select(rows: Sequence[Row], level: str, preset: str) -> list[Row]:
-    return [row for row in rows if row["level"] == level and row["preset"] == preset]
+def planning(rows: Sequence[Row]) -> str:
+    """Every measurement of planning."""
+    lines = [
+        [
+            f"`{row['preset']}`",
+            f"{row['horizon']}, {row['iterations']}",
+            str(row["batch"]),
+            f"{row['plans_per_second']:,.0f}",
+            f"{row['gflops']:.0f}",
+            f"{row['peak_gflops']:.0f}",
+            f"{row['fraction_of_peak']:.0%}",
+        ]
+        for row in rows
+        if row["batch"] in (1, 16, 256, 1024)
+    ]
+    return _table("preset | T, N | batch | plans/s | GFLOP/s | peak | fraction", lines)
 
 
-def _cell(rows: Sequence[Row]) -> str:
+def search(rows: Sequence[Row]) -> str:
+    """Success and speed of every search setting, the levels side by side."""
+    found = list(dict.fromkeys(row["level"] for row in rows))
+    lines = []
+    for variant in dict.fromkeys(row["variant"] for row in rows):
+        cells = [variant]
+        for level in found:
+            row = next((r for r in rows if (r["level"], r["variant"]) == (level, variant)), None)
+            cells += [_rate([row]), f"{row['plans_per_second']:,.0f}"] if row else ["-", "-"]
+        lines.append(cells)
+    return _table(" | ".join(["search", *(f"{name} | plans/s" for name in found)]), lines)
+
+
+def training(rows: Sequence[Row]) -> str:
+    """Every measurement of training."""
+    lines = [
+        [
+            row["level"],
+            f"`{row['preset']}`",
+            f"{1e3 / row['steps_per_second']:.0f}",
+            f"{row['encoder_share']:.0%}",
+            f"{row['flops_per_step'] / 1e9:.1f}",
+            f"{row['gflops']:.0f}",
+            f"{row['fraction_of_peak']:.0%}",
+            f"{row['training_seconds']:.0f} s for {row['steps']:,} steps",
+        ]
+        for row in rows
+    ]
+    header = "level | preset | ms/step | encoder | GFLOP/step | GFLOP/s | of the peak | a run"
+    return _table(header, lines)
+
+
+def _rate(rows: Sequence[Row]) -> str:
+    """Success over all episodes of some rows, with its interval and the number of seeds."""
     if not rows:
         return "-"
     successes = sum(row["successes"] for row in rows)
     episodes = sum(row["episodes"] for row in rows)
     low, high = scores.wilson_interval(successes, episodes)
-    seeds = len({row["seed"] for row in rows})
-    counted = f"{seeds} seed{'s' if seeds > 1 else ''}"
-    return f"{100 * successes / episodes:.1f}% [{100 * low:.1f}, {100 * high:.1f}], {counted}"
+    rate = f"{100 * successes / episodes:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+    seeds = {row["seed"] for row in rows if "seed" in row}
+    return f"{rate}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}" if seeds else rate
 
 
-def replace_section(text: str, section: str) -> str:
-    """The text with what is between the markers replaced."""
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n\n{section}\n\n{END}{after}"
-
-
-def main() -> int:
-    """Rewrites the table in README.md."""
-    readme = Path("README.md")
-    rows = results.read(Path("results") / "babyai.jsonl")
-    write_text(readme, replace_section(readme.read_text(encoding="utf-8"), markdown(rows)))
-    return 0
+def _table(header: str, lines: Sequence[Sequence[str]]) -> str:
+    columns = header.count("|") + 1
+    rows = [f"| {header} |", "| " + " | ".join(["---"] * columns) + " |"]
+    return "\n".join([*rows, *(f"| {' | '.join(cells)} |" for cells in lines)])
 
 
 if __name__ == "__main__":

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks import quality
 from experiments import babyai, results
 from leapjax import UserError, load, plan_keys, rollouts
-from leapjax.data import storage
+from leapjax.data import seeds, storage
 from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import LEVELS
+from leapjax.planners import GibbsConfig
 
 LEVEL = "GoToLocalS7N5"
 TOY = (
@@ -233,3 +235,37 @@ def test_parameters_are_plain_arrays(workplace):
     assert all(
         isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(load(run_folder(workplace)).params)
     )
+
+
+def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        quality, "variants", lambda trained: {"trained": trained, "one": GibbsConfig(5, 1)}
+    )
+    played = []
+    evaluate = rollouts.evaluate
+
+    def record(make_adapter, episode_seeds, *rest, **options):
+        played.append(list(episode_seeds))
+        return evaluate(make_adapter, episode_seeds, *rest, **options)
+
+    monkeypatch.setattr(rollouts, "evaluate", record)
+    rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
+    arguments = "--episodes 3 --batch 4 --seconds 0.01 --json".split()
+    folder = str(run_folder(workplace))
+    assert quality.main([folder, *arguments, str(rows), "--plot", str(plot)]) == 0
+    written = json.loads(rows.read_text())
+    assert [row["variant"] for row in written] == ["trained", "one"]
+    assert [row["iterations"] for row in written] == [3, 1]
+    assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
+    assert played == [list(seeds.validation_seeds(0, 3))] * 2
+    assert plot.stat().st_size > 1000
+
+
+def test_every_search_setting_can_be_made():
+    variants = quality.variants(GibbsConfig(5, 10, temperature=0.5))
+    assert len(set(variants.values())) == len(variants) > 10
+
+
+def test_quality_without_a_run_is_one_line(tmp_path, capsys):
+    assert quality.main([str(tmp_path)]) == 2
+    assert "is not a checkpoint" in capsys.readouterr().err

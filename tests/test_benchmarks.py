@@ -1,12 +1,14 @@
 """The benchmark counts what the program does, and runs."""
 
+import dataclasses
 import json
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import planning
+from benchmarks import planning, training
+from experiments.config import preset
 from leapjax.envs import vocabulary
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
@@ -39,13 +41,15 @@ def test_needed_flops_are_what_xla_counts(name):
     assert needed < counted < 1.15 * needed
 
 
-def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch):
+def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     tiny = ModelConfig("leapjax", layers=1, width=16, heads=2, channels=4, rounds=1, sweeps=2)
     monkeypatch.setattr(planning, "MODELS", {"leapjax": tiny})
     monkeypatch.setattr(planning, "SETTINGS", ((2, 3, 5),))
     monkeypatch.setattr(planning, "BATCHES", (1, 9))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
-    assert planning.main(["--json", str(rows), "--plot", str(plot), "--seconds", "0.01"]) == 0
+    written = ["--json", str(rows), "--plot", str(plot)]
+    assert planning.main([*written, "--seconds", "0.01", "--large", "20"]) == 0
+    assert "20 plans of (2, 3)" in capsys.readouterr().out
     fields = (
         "horizon iterations batch preset compile_seconds plans_per_second gflops peak_gflops "
         "fraction_of_peak"
@@ -55,3 +59,30 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch):
     assert all(set(fields) <= row.keys() for row in written)
     assert all(row[field] > 0 for row in written for field in fields[4:])
     assert plot.stat().st_size > 1000
+
+
+def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
+    def tiny(level, name):
+        config = preset(level, name)
+        small = {"width": 16, "heads": 2, "layers": 1, "channels": 4, "rounds": 1, "sweeps": 2}
+        return dataclasses.replace(
+            config,
+            model=dataclasses.replace(config.model, **small),
+            training=dataclasses.replace(config.training, batch=4),
+        )
+
+    monkeypatch.setattr(training, "preset", tiny)
+    rows = tmp_path / "rows.json"
+    arguments = ["--levels", "GoToLocalS7N5", "--presets", "leapjax", "--seconds", "0.01"]
+    assert training.main([*arguments, "--json", str(rows)]) == 0
+    (row,) = json.loads(rows.read_text())
+    assert row["preset"] == "leapjax" and row["batch"] == row["devices"] == 4
+    for field in ("steps_per_second", "flops_per_step", "fraction_of_peak", "training_seconds"):
+        assert row[field] > 0
+    assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"])
+    assert row["encoder_share"] > 0
+
+
+def test_the_training_benchmark_refuses_an_unknown_level(capsys):
+    assert training.main(["--levels", "Nowhere"]) == 2
+    assert "Nowhere" in capsys.readouterr().err
