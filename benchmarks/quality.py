@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import fastest
-from experiments import runtime
-from leapjax import pretrained, rollouts
+from experiments import results, runtime
+from leapjax import files, pretrained, rollouts
 from leapjax.data import seeds
 from leapjax.envs import levels
 from leapjax.envs.adapter import BabyAIAdapter
@@ -60,22 +60,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = tyro.cli(Options, args=None if arguments is None else list(arguments))
     runtime.start()
     try:
-        trained = pretrained.read_specification(options.run).planner
-        rows = [measure(options, name, config) for name, config in variants(trained).items()]
+        specification = pretrained.read_specification(options.run)
+        paper = levels.find_level(specification.level).iterations
+        configs = variants(specification.planner, paper)
+        rows = [measure(options, name, config) for name, config in configs.items()]
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     Console().print(table(rows))
     if options.json:
-        pretrained.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
     if options.plot:
         draw(rows, options.plot)
     return 0
 
 
-def variants(trained: GibbsConfig) -> dict[str, GibbsConfig]:
-    """Search settings to compare, by what to call them; N is the trained one if not said."""
-    most = trained.iterations
+def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:
+    """Search settings to compare, by what to call them; the paper's N is `most`."""
     greedy = dataclasses.replace(trained, temperature=0.0, final_temperature=None)
     result = {}
     for n in sorted({1, 2, 3, 5, 10, most}):
@@ -124,7 +125,10 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
         "level": specification.level,
         "horizon": config.horizon,
         "iterations": config.iterations,
-        "trained_iterations": specification.planner.iterations,
+        "paper_iterations": level.iterations,
+        "run": options.run.resolve().name,
+        "training_steps": specification.training.steps,
+        "versions": results.versions(),
         "plans_per_second": options.batch / taken,
         "episodes": options.episodes,
         "successes": int(episodes.successes.sum()),
@@ -140,7 +144,7 @@ def table(rows: Sequence[Row]) -> Table:
     result = Table("search", "success", "95% interval", "plans/s", "authors' code x")
     for row in rows:
         low, high = wilson_interval(row["successes"], row["episodes"])
-        authors = AUTHORS.get((row["horizon"], row["trained_iterations"]))
+        authors = AUTHORS.get((row["horizon"], row["paper_iterations"]))
         result.add_row(
             row["variant"],
             f"{row['successes'] / row['episodes']:.1%}",

@@ -28,6 +28,8 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
     Of `[tokens, width]` by `[width, 4 width]` and back, as the transformers here have them:
     the better of all cores on one product at a time, and the tokens split over the devices.
     """
+    devices = len(jax.local_devices())
+    tokens = -(-tokens // devices) * devices  # so that they can be split
     key = jax.random.key(0)
     x = jax.random.normal(key, (tokens, width))
     weights = (

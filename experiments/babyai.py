@@ -4,8 +4,10 @@ Collects demonstrations, trains, plans by Gibbs sampling on held-out levels, and
 the success rate beside the paper's.
 """
 
+import contextlib
 import csv
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -18,48 +20,58 @@ from rich.console import Console
 
 from experiments import animation, plots, results, runtime
 from experiments.config import Config, configuration_hash, parse, resolved
+from experiments.interruption import Interrupted, Interruption, interruptible
 from experiments.progress import Meter
-from leapjax import pretrained, rollouts, sharding, training
+from leapjax import files, pretrained, rollouts, sharding, training
 from leapjax.agents import leap
-from leapjax.checkpoints import Checkpoints
+from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import demonstrations, seeds, storage, windows
 from leapjax.data.demonstrations import Demonstration
 from leapjax.envs import levels, vocabulary
 from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import Level
 from leapjax.errors import UserError
-from leapjax.planners import compile_planner
+from leapjax.planners import NotANumber, compile_planner
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
 from leapjax.types import TrainState
 
 EXPERIMENT = "babyai"
 RECORDED = Path("results") / f"{EXPERIMENT}.jsonl"
-CHECKPOINT_SECONDS = 30.0
 Metrics = list[dict[str, float]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     console = Console()
     try:
-        configs = parse(sys.argv[1:] if arguments is None else arguments)
+        configs = parse(arguments)
         runtime.start()
-        rows = []
-        for config in configs:
-            for seed in config.seeds:
-                rows.append(run(config, seed, console))
+        with interruptible() as interruption:
+            rows = [
+                run(config, seed, console, interruption)
+                for config in configs
+                for seed in config.seeds
+            ]
         console.print(results.success_table(rows), results.time_table(rows))
+    except Interrupted as stopped:
+        command = shlex.join(["python", "-m", "experiments.babyai", *arguments])
+        print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
+        return stopped.exit_code
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except NotANumber as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except training.NonFiniteLoss as error:
         print(f"error: {error}; the last checkpoint is from before it", file=sys.stderr)
         return 1
     return 0
 
 
-def run(config: Config, seed: int, console: Console) -> results.Row:
+def run(config: Config, seed: int, console: Console, interruption: Interruption) -> results.Row:
     """One level and one seed, from demonstrations to a row."""
     name = configuration_hash(config, seed)
     known = results.find(RECORDED, name) if config.record and not config.force else None
@@ -72,15 +84,24 @@ def run(config: Config, seed: int, console: Console) -> results.Row:
     folder = config.runs / f"{EXPERIMENT}-{config.level}-{config.preset}-seed{seed}-{name}"
     console.print(f"[bold]{config.level}[/bold], preset {config.preset}, seed {seed}: {folder}")
     seconds: dict[str, float] = {"demos": 0, "compile": 0, "train": 0, "eval": 0}
-    if config.checkpoint is None:
-        planner, metrics, steps = fit(config, level, seed, folder, episode_seeds, seconds, console)
-    else:
-        planner, metrics, steps = reuse(config, level), [], 0
-    episodes = measure(planner, config, level, seed, episode_seeds, seconds, console)
-    row = make_row(config, level, seed, name, planner, episodes, seconds, steps)
-    results.record(RECORDED if config.record else config.runs / RECORDED.name, row)
-    if config.pictures:
-        draw(planner, config, level, seed, episode_seeds, metrics, folder, console)
+    # What can be refused is refused before the run has a folder.
+    trained = None if config.checkpoint is None else reuse(config, level)
+    begun = time.perf_counter()
+    data = gather(config, level, seed, console) if trained is None else []
+    seeds.check_disjoint([d.seed for d in data], episode_seeds)
+    seconds["demos"] = time.perf_counter() - begun
+    with files.only_process_in(folder):
+        if trained is None:
+            planner, metrics, steps = fit(
+                config, level, seed, data, folder, seconds, console, interruption
+            )
+        else:
+            planner, metrics, steps = trained, [], 0
+        episodes = measure(planner, config, level, seed, episode_seeds, seconds, console)
+        row = make_row(config, level, seed, name, planner, episodes, seconds, steps)
+        results.record(RECORDED if config.record else config.runs / RECORDED.name, row)
+        if config.pictures:
+            draw(planner, config, level, seed, episode_seeds, metrics, folder, console)
     console.print(
         f"success {results.percent(row)}, mean length {row['mean_length']:.1f}"
         + (f", paper {level.paper_success}%" if level.paper_success is not None else "")
@@ -92,10 +113,11 @@ def fit(
     config: Config,
     level: Level,
     seed: int,
+    data: Sequence[Demonstration],
     folder: Path,
-    episode_seeds: range,
     seconds: dict[str, float],
     console: Console,
+    interruption: Interruption,
 ) -> tuple[Pretrained, Metrics, int]:
     """Trains, or continues, one run; what it learned and how it went."""
     specification = Specification(
@@ -103,26 +125,26 @@ def fit(
         pretrained.sizes_for(level, config.context, config.planner.horizon),
         config.training, config.planner, level.words, vocabulary.WORDS,
     )  # fmt: skip
-    begun = time.perf_counter()
-    data = gather(config, level, specification.sizes.side, seed, console)
-    seeds.check_disjoint([d.seed for d in data], episode_seeds)
+    examples = windows.concatenate(data)
+    check_data(folder, windows.fingerprint(examples))
     mesh = sharding.data_mesh(config.training.batch)
-    steps = sharding.replicate(windows.concatenate(data), mesh)
-    seconds["demos"] = time.perf_counter() - begun
+    steps = sharding.replicate(examples, mesh)
 
     agent = pretrained.make_agent(specification, sharding.DATA)
-    folder.mkdir(parents=True, exist_ok=True)
     pretrained.save_specification(folder, specification)
-    pretrained.write_text(folder / "config.json", json.dumps(resolved(config, seed), indent=1))
+    files.write_text(folder / "config.json", json.dumps(resolved(config, seed), indent=1))
     saved = Checkpoints(folder / pretrained.CHECKPOINTS)
     begun = time.perf_counter()
     key = sharding.replicate(jax.random.key(seed), mesh)
     state = sharding.replicate(jax.jit(agent.init)(jax.random.key(seed)), mesh)
     metrics = read_metrics(folder)
-    if saved.latest is not None:
-        state = saved.restore(state)
-        metrics = [m for m in metrics if m["step"] <= saved.latest]
-        console.print(f"continuing at step {saved.latest} of {config.training.steps}")
+    restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
+    if restored is not None:
+        state = restored
+        metrics = [m for m in metrics if m["step"] <= int(state.step)]
+        console.print(f"continuing at step {int(state.step)} of {config.training.steps}")
+    else:
+        metrics = []
     step = training.make_train_step(
         agent, lambda k, d: leap.make_batch(k, d, config.training, specification.sizes), mesh
     )
@@ -132,30 +154,49 @@ def fit(
     before = metrics[-1]["seconds"] if metrics else 0.0
     begun = last_saved = time.perf_counter()
     total = config.training.steps
-    with Meter(console, "training", total, int(state.step)) as meter:
+    with (
+        interruption.deferred(),
+        contextlib.closing(saved),
+        Meter(console, "training", total, int(state.step)) as meter,
+    ):
 
         def report(done: int, now: TrainState, means: dict[str, float]) -> None:
             nonlocal last_saved
             elapsed = before + time.perf_counter() - begun
             metrics.append({"step": done, "seconds": elapsed, **means})
             meter.update(done, f"loss {means['loss']:.3f} accuracy {means['accuracy']:.1%}")
-            if done == total or time.perf_counter() - last_saved > CHECKPOINT_SECONDS:
+            due = time.perf_counter() - last_saved > config.checkpoint_seconds
+            if done == total or interruption.requested or due:
                 write_metrics(folder, metrics)
                 saved.save(now)
                 last_saved = time.perf_counter()
 
-        state = training.train(compiled, state, steps, key, total, report)
-    saved.close()
+        state = training.train(
+            compiled, state, steps, key, total, report, stop=lambda: interruption.requested
+        )
     seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
     assert agent.energy is not None
     plan = compile_planner(agent.energy, config.planner)
     return Pretrained(specification, agent.energy, state.params, plan), metrics, total
 
 
-def gather(
-    config: Config, level: Level, side: int, seed: int, console: Console
-) -> list[Demonstration]:
+def check_data(folder: Path, fingerprint: str) -> None:
+    """Refuses to continue a run that was begun on other demonstrations."""
+    path = folder / "data.json"
+    if path.exists():
+        values = read_json(path)
+        before = values.get("fingerprint") if isinstance(values, dict) else None
+        if before != fingerprint:
+            raise UserError(
+                f"{folder} was begun on other demonstrations ({before}, now {fingerprint}): "
+                "remove it to begin again, or give this run another --runs folder"
+            )
+    files.write_text(path, json.dumps({"fingerprint": fingerprint}))
+
+
+def gather(config: Config, level: Level, seed: int, console: Console) -> list[Demonstration]:
     """The demonstrations to train on: the user's, the cached ones, or new ones."""
+    side = pretrained.sizes_for(level, config.context, config.planner.horizon).side
     if config.demonstrations is not None:
         data = storage.load(config.demonstrations, level, side)
         if len(data) < config.demos:
@@ -324,7 +365,7 @@ def write_metrics(folder: Path, metrics: Metrics) -> None:
     """The training curve as CSV."""
     lines = [",".join(metrics[0])]
     lines += [",".join(repr(value) for value in entry.values()) for entry in metrics]
-    pretrained.write_text(folder / "metrics.csv", "\n".join(lines) + "\n")
+    files.write_text(folder / "metrics.csv", "\n".join(lines) + "\n")
 
 
 def read_metrics(folder: Path) -> Metrics:

@@ -55,13 +55,15 @@ class Config:
     """Where checkpoints, metrics, plots and unrecorded rows go."""
     pictures: bool = True
     """Draw the plots and the animation."""
+    checkpoint_seconds: float = 30.0
+    """Save the training state this often: what a killed run can lose at most."""
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
     planner: Annotated[GibbsConfig, tyro.conf.arg(name="")] = GibbsConfig()
 
 
 # What a result does not depend on, or what its row holds on its own.
-_NOT_HASHED = ("seeds", "checkpoint", "record", "force", "runs", "pictures")
+_NOT_HASHED = ("seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds")
 
 
 def preset(level: Level, name: str) -> Config:

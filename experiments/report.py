@@ -10,7 +10,7 @@ from experiments.config import PRESETS
 from experiments.results import Row
 from leapjax import scores
 from leapjax.envs.levels import LEVELS
-from leapjax.pretrained import write_text
+from leapjax.files import write_text
 
 
 def main() -> int:
@@ -54,8 +54,10 @@ def success(rows: Sequence[Row]) -> str:
     """Success rates per level: the paper's, preset `paper`, preset `leapjax`.
 
     A cell is the mean over seeds, the 95% interval of all their episodes together, and the
-    number of seeds.
+    number of seeds. Only test episodes count, and of two rows of one seed the later one.
     """
+    latest = {(r["level"], r["preset"], r["seed"]): r for r in rows if not r["validation"]}
+    rows = list(latest.values())
     lines = []
     for level in LEVELS.values():
         chosen = [

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from leapjax import scores
 from leapjax.errors import UserError
-from leapjax.pretrained import write_text
+from leapjax.files import only_process_in, write_text
 
 Row = dict[str, Any]
 REQUIRED = ("experiment", "level", "method", "preset", "seed", "episodes", "successes", "hash")
@@ -43,9 +43,10 @@ def read(path: Path) -> list[Row]:
 
 def record(path: Path, row: Row) -> None:
     """Adds a row, in the place of one of the same configuration, atomically."""
-    rows = [other for other in read(path) if other["hash"] != row["hash"]]
-    lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
-    write_text(path, "".join(f"{line}\n" for line in lines))
+    with only_process_in(path.parent, wait=True):
+        rows = [other for other in read(path) if other["hash"] != row["hash"]]
+        lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
+        write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def find(path: Path, configuration: str) -> Row | None:

@@ -1,9 +1,14 @@
 """Checkpoints: Orbax for the arrays, JSON for what they mean. Nothing is ever unpickled."""
 
+import contextlib
 import dataclasses
 import json
+import logging
+import shutil
 import types
 import typing
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +19,7 @@ import orbax.checkpoint as ocp
 from leapjax.errors import UserError, first_line
 from leapjax.types import PyTree, TrainState
 
+ITEM = "default"  # Orbax's name for the only thing that a checkpoint of ours holds
 T = TypeVar("T")
 
 
@@ -25,10 +31,9 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, keep: int = 2) -> None:
-        self._manager = ocp.CheckpointManager(
-            folder.absolute(),
-            options=ocp.CheckpointManagerOptions(max_to_keep=keep, cleanup_tmp_directories=True),
-        )
+        self._folder = folder.absolute()
+        self._options = ocp.CheckpointManagerOptions(max_to_keep=keep, cleanup_tmp_directories=True)
+        self._manager = ocp.CheckpointManager(self._folder, options=self._options)
 
     @property
     def latest(self) -> int | None:
@@ -36,76 +41,142 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, state: TrainState) -> None:
-        """Writes a state, in the background."""
-        self._manager.save(int(state.step), args=ocp.args.StandardSave(state._asdict()))
-
-    def restore(self, like: TrainState) -> TrainState:
-        """The newest state; `like` gives structure, shapes and placement.
+        """Writes a state, in the background.
 
         Raises:
-            UserError: it cannot be read.
+            UserError: this one, or the one before it, cannot be written.
+        """
+        with self._writing():
+            self._manager.save(int(state.step), args=ocp.args.StandardSave(state._asdict()))
+
+    def restore(
+        self, like: TrainState, skipped: Callable[[str], Any] = warnings.warn
+    ) -> TrainState | None:
+        """The newest state that can be read, or None; `like` gives structure and placement.
+
+        A damaged checkpoint is set aside, as `<step>.damaged`, and the one before is tried.
+
+        Args:
+            like: the state of a run of this configuration.
+            skipped: called with one line for each checkpoint that was set aside.
+
+        Raises:
+            UserError: a checkpoint is whole, but of another configuration.
         """
         target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict())
-        try:
-            restored = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
-        except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
-            raise UserError(
-                f"the checkpoint {self._manager.directory / str(self.latest)} cannot be read "
-                f"({first_line(error)}): delete it to continue from the one before"
-            ) from None
-        return TrainState(**restored)
-
-    def wait(self) -> None:
-        """Returns when everything is on disk."""
-        self._manager.wait_until_finished()
+        while self.latest is not None:
+            path = self._folder / str(self.latest)
+            try:
+                _check_shapes(_saved_shapes(path), like._asdict(), path)
+                restored = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
+            except UserError:
+                raise
+            except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+                aside = path.with_name(f"{path.name}.damaged")
+                shutil.rmtree(aside, ignore_errors=True)
+                path.rename(aside)
+                self._manager.close()
+                self._manager = ocp.CheckpointManager(self._folder, options=self._options)
+                older = "the one before is used" if self.latest else "there is none before it"
+                skipped(f"{path} is damaged ({first_line(error)}); it is now {aside}; {older}")
+            else:
+                return TrainState(**restored)
+        return None
 
     def close(self) -> None:
-        """Waits, then lets go of the folder."""
-        self.wait()
+        """Waits until everything is on disk, then lets go of the folder.
+
+        Raises:
+            UserError: a state cannot be written.
+        """
+        with self._writing():
+            self._manager.wait_until_finished()
         self._manager.close()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+            raise UserError(
+                f"cannot write a checkpoint to {self._folder} ({first_line(error)}); those "
+                "written before are intact: make room, and start the same command again"
+            ) from None
 
 
 def restore_params(folder: Path, like: PyTree) -> PyTree:
-    """The parameters of the newest checkpoint in a folder, with the structure of `like`.
+    """The parameters of the newest readable checkpoint, with the structure of `like`.
+
+    Warns of each damaged one that it skips.
 
     Raises:
-        UserError: there is none, it is damaged, or its arrays have other shapes.
+        UserError: there is none, none can be read, or its arrays have other shapes.
     """
-    step = None
+    steps = []
     if folder.is_dir():
-        steps = [int(p.name) for p in folder.iterdir() if p.name.isdecimal()]
-        step = max(steps, default=None)
-    if step is None:
+        steps = sorted((int(p.name) for p in folder.iterdir() if p.name.isdecimal()), reverse=True)
+    if not steps:
         raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
-    path = (folder / str(step) / "default").absolute()
-    try:
-        with ocp.PyTreeCheckpointer() as checkpointer:
-            saved = checkpointer.metadata(path).item_metadata.tree["params"]
-            _check_shapes(saved, like, folder)
+    reasons = []
+    for step in steps:
+        path = folder.absolute() / str(step)
+        try:
+            _check_shapes(_saved_shapes(path, "params"), like, path)
             target = {"params": jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
             arguments = ocp.checkpoint_utils.construct_restore_args(target)
-            restored = checkpointer.restore(
-                path,
-                args=ocp.args.PyTreeRestore(target, restore_args=arguments, partial_restore=True),
-            )
-    except UserError:
-        raise
-    except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
-        raise UserError(f"the checkpoint {path} cannot be read ({first_line(error)})") from None
-    return jax.tree.map(jnp.asarray, restored["params"])
+            with ocp.PyTreeCheckpointer() as checkpointer:
+                restored = checkpointer.restore(
+                    path / ITEM,
+                    args=ocp.args.PyTreeRestore(
+                        target, restore_args=arguments, partial_restore=True
+                    ),
+                )
+        except UserError:
+            raise
+        except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+            reasons.append(f"the checkpoint {path} cannot be read ({first_line(error)})")
+        else:
+            for reason in reasons:
+                warnings.warn(f"{reason}: using step {step}", stacklevel=2)
+            return jax.tree.map(jnp.asarray, restored["params"])
+    raise UserError("; ".join(reasons))
 
 
-def _check_shapes(saved: PyTree, like: PyTree, folder: Path) -> None:
-    def shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
-        leaves = jax.tree_util.tree_leaves_with_path(tree)
-        return {jax.tree_util.keystr(path): tuple(leaf.shape) for path, leaf in leaves}
+def _saved_shapes(checkpoint: Path, part: str | None = None) -> dict[str, tuple[int, ...]]:
+    """The shapes of the arrays in a checkpoint, by their place in the tree."""
+    logger = logging.getLogger("absl")  # Orbax warns of files that ours do not have
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            metadata = checkpointer.metadata(checkpoint / ITEM).item_metadata
+    finally:
+        logger.setLevel(level)
+    if metadata is None:
+        raise ValueError("it has no readable metadata")
+    tree = metadata.tree
+    return _shapes(tree if part is None else tree[part])
 
-    found, expected = shapes(saved), shapes(like)
+
+def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    # Orbax keeps named tuples and lists as dictionaries: compare the names alone.
+    return {
+        "/".join(
+            str(getattr(k, "key", getattr(k, "idx", getattr(k, "name", k)))) for k in path
+        ): tuple(leaf.shape)
+        for path, leaf in leaves
+    }
+
+
+def _check_shapes(found: dict[str, tuple[int, ...]], like: PyTree, checkpoint: Path) -> None:
+    expected = _shapes(like)
     for name in sorted(expected.keys() | found.keys()):
         if found.get(name) != expected.get(name):
             raise UserError(
-                f"the checkpoint in {folder} does not fit its configuration: {name} is "
-                f"{found.get(name, 'missing')}, expected {expected.get(name, 'nothing')}"
+                f"the checkpoint {checkpoint} does not fit its configuration: {name} is "
+                f"{found.get(name, 'missing')}, expected {expected.get(name, 'nothing')}; it was "
+                "made by another version: remove it, or use another --runs folder"
             )
 
 

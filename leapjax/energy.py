@@ -52,7 +52,7 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
             return energies[jnp.minimum(actions[position], num_actions - 1)]
 
         terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
-        return _infinite_if_incomplete(jnp.sum(terms), actions, num_actions)
+        return _infinite_if_incomplete(_check_total(jnp.sum(terms)), actions, num_actions)
 
     return Energy(encode, conditional, total, _checked(num_actions))
 
@@ -70,7 +70,8 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """
 
     def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-        return _infinite_if_incomplete(total(params, memory, actions), actions, num_actions)
+        energy = _check_total(total(params, memory, actions))
+        return _infinite_if_incomplete(energy, actions, num_actions)
 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
@@ -186,11 +187,11 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
         # Where no action at a position makes the plan allowed, another position has to
         # change: the constraint then says nothing about this one.
         hopeless = jnp.all(jnp.isinf(extra), axis=-1, keepdims=True)
-        return base + jnp.where(hopeless, 0.0, extra)
+        return _check_energies(base + jnp.where(hopeless, 0.0, extra), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
-        return energy.total(params, inner, actions) + penalty(context, actions)
+        return _check_total(energy.total(params, inner, actions) + penalty(context, actions))
 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
@@ -239,10 +240,16 @@ def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:
     if not isinstance(energies, jax.core.Tracer) and bool(jnp.isnan(energies).any()):
         rows = np.flatnonzero(np.isnan(energies).any(axis=-1))
         raise ValueError(
-            f"the energies at positions {np.asarray(positions)[rows]} are NaN: the model's "
-            "scores there are NaN, hold +inf, or are all -inf"
+            f"the energies at positions {np.asarray(positions)[rows]} are NaN: the scores or "
+            "penalties there are NaN, or the scores hold +inf or are all -inf"
         )
     return energies
+
+
+def _check_total(energy: jax.Array) -> jax.Array:
+    if not isinstance(energy, jax.core.Tracer) and bool(jnp.isnan(energy)):
+        raise ValueError("the energy of the plan is NaN: look at the scores, totals or penalties")
+    return energy
 
 
 def _infinite_if_incomplete(energy: jax.Array, actions: jax.Array, num_actions: int) -> jax.Array:

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -23,7 +23,11 @@ ORDERS = ("random", "sequential", "uncertain")
 
 
 class NotANumber(ValueError):
-    """An energy that was minimised is NaN somewhere."""
+    """An energy that was minimised is NaN somewhere; `plan` is what came of it all the same."""
+
+    def __init__(self, message: str, plan: Plan) -> None:
+        super().__init__(message)
+        self.plan = plan  # of NumPy arrays; `plan.valid` says which rows can be trusted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +40,7 @@ class GibbsConfig:
     order: str = "random"  # which positions: "random", "sequential" or "uncertain"
     temperature: float = 0.0  # of the first iteration; 0 takes the most likely action
     final_temperature: float | None = None  # of the last, linear between; None: the same
-    early_stop: bool = False  # stop once every position was looked at and nothing changed
+    early_stop: bool = False  # stop once nothing can change; at temperature 0, P = 1 only
     restarts: int = 1  # R independent plans, of which the one of least energy is kept
     score: bool = False  # also return the energy of the plan (T more passes)
     score_trace: bool = False  # also return the energy after every iteration (N * T passes)
@@ -48,6 +52,11 @@ class GibbsConfig:
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
         schedules.check_temperatures(self.temperature, self.last_temperature)
+        if self.early_stop and (self.resampled > 1 or self.temperature or self.last_temperature):
+            raise ValueError(
+                "early_stop needs temperature 0 and resampled 1: otherwise something could "
+                "still change when every position was looked at"
+            )
         if self.order not in ORDERS:
             raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
 
@@ -101,9 +110,11 @@ def gibbs(
 
     Which positions, by `config.order`: "random"; "sequential", from left to right and around;
     "uncertain", those whose action was least likely when last looked at, among the ones not
-    looked at since something changed. With `early_stop` the chain ends when there are none
-    of these left: at temperature 0 and P = 1 nothing could change any more, so the plan is
-    the same and the rest of its trace repeats it. A batch stops with its slowest plan.
+    looked at since something changed (all, when none of these is left). That order depends on
+    the plan: it is a way to search, not an exact sampler. With `early_stop` the chain ends
+    when every position was looked at since the last change: at temperature 0 and P = 1
+    nothing could change any more, so the plan is the same and the rest of its trace repeats
+    it. A batch stops with its slowest plan.
     """
     memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
@@ -119,10 +130,10 @@ def gibbs(
     plan = Plan(actions, trace, energy.violation(params, memory, actions) <= 0, valid)
     if config.score:
         least = energy.total(params, memory, actions) if least is None else least
-        plan = plan._replace(energy=least)
+        plan = plan._replace(energy=least, valid=plan.valid & ~jnp.isnan(least))
     if config.score_trace:
         scores = jax.vmap(lambda a: energy.total(params, memory, a))(trace)
-        plan = plan._replace(trace_energies=scores)
+        plan = plan._replace(trace_energies=scores, valid=plan.valid & ~jnp.any(jnp.isnan(scores)))
     return plan
 
 
@@ -181,12 +192,13 @@ def _gibbs_chain(
         chain: _Chain, inputs: tuple[jax.Array, jax.Array, jax.Array]
     ) -> tuple[_Chain, jax.Array]:
         where, gumbel, temperature = inputs
+        settled = chain.settled & ~jnp.all(chain.settled)  # all looked at: begin again
         if config.order == "uncertain":
-            doubt = jnp.where(chain.settled, -1.0, chain.doubt)
+            doubt = jnp.where(settled, -1.0, chain.doubt)
             where = jax.lax.top_k(doubt, config.resampled)[1]
         drawn, doubt, valid = draw(chain.actions, where, gumbel, temperature)
         changed = jnp.any(drawn != chain.actions[where])
-        settled = jnp.where(changed, False, chain.settled).at[where].set(True)
+        settled = jnp.where(changed, False, settled).at[where].set(True)
         actions = chain.actions.at[where].set(drawn)
         doubts = chain.doubt.at[where].set(doubt)
         return _Chain(actions, doubts, settled, chain.valid & valid), actions
@@ -196,7 +208,7 @@ def _gibbs_chain(
         noise(noise_key, iterations - 1, config.resampled),
         temperatures[1:],
     )
-    if config.early_stop:
+    if config.early_stop and iterations > 1:
         chain, later = _scan_until_settled(iterate, start, inputs)
     else:
         chain, later = jax.lax.scan(iterate, start, inputs)
@@ -314,7 +326,10 @@ def planner_for(config: PlannerConfig) -> Callable[..., Plan]:
 
 
 class CompiledPlanner:
-    """A jitted planner for batches of any size; made by `compile_planner`."""
+    """A jitted planner for batches of any size; made by `compile_planner`.
+
+    It keeps a reference to the parameters of its last call.
+    """
 
     def __init__(
         self,
@@ -334,8 +349,8 @@ class CompiledPlanner:
                 keys, contexts
             )
 
-        self._last: list[Array] = []
-        self._placed: dict[int, Params] = {}
+        nothing = jax.tree.structure(())
+        self._last: tuple[list[Array], Any, dict[int, Params]] = ([], nothing, {})
         # Plans have nothing to say to each other: each device plans its rows by itself.
         self._meshes = {size: sharding.data_mesh(size, devices) for size in self.chunk_sizes}
         self._programs = {
@@ -389,7 +404,8 @@ class CompiledPlanner:
             raise NotANumber(
                 f"the energy is NaN for {np.sum(~plan.valid)} of {batch} contexts (the first is "
                 f"context {np.argmin(plan.valid)}): look at the parameters, and at logits that "
-                "are +inf or all -inf"
+                "are +inf or all -inf",
+                plan,
             )
         return plan
 
@@ -400,14 +416,16 @@ class CompiledPlanner:
         after call: placing them costs more than a single plan. Arrays of NumPy may be
         written to, so they are placed each time.
         """
-        leaves = jax.tree.leaves(params)
-        same = len(leaves) == len(self._last) and all(map(operator.is_, leaves, self._last))
+        leaves, structure = jax.tree.flatten(params)
+        last, last_structure, placed = self._last
+        same = structure == last_structure and all(map(operator.is_, leaves, last))
         if not same or not all(isinstance(leaf, jax.Array) for leaf in leaves):
-            self._last, self._placed = leaves, {}
-        for mesh in meshes:
-            if mesh.size not in self._placed:
-                self._placed[mesh.size] = sharding.replicate(params, mesh)
-        return self._placed
+            placed = {}
+        missing = {mesh for mesh in meshes if mesh.size not in placed}
+        if missing:
+            placed = placed | {mesh.size: sharding.replicate(params, mesh) for mesh in missing}
+            self._last = leaves, structure, placed  # at once: another thread sees all or nothing
+        return placed
 
     def sizes_up_to(self, batch: int) -> list[int]:
         """The chunk sizes that batches of at most so many plans can need."""

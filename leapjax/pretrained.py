@@ -14,6 +14,7 @@ from leapjax.envs import levels, vocabulary
 from leapjax.envs.adapter import NUM_ACTIONS
 from leapjax.envs.levels import Level
 from leapjax.errors import UserError
+from leapjax.files import write_text
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import CompiledPlanner, GibbsConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
@@ -111,11 +112,3 @@ def load(path: str | os.PathLike[str], planner: planners.PlannerConfig | None = 
     assert agent.energy is not None
     plan = planners.compile_planner(agent.energy, planner or specification.planner)
     return Pretrained(specification, agent.energy, params, plan)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a file so that a reader sees all of it or the one before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    scratch.write_text(text, encoding="utf-8")
-    scratch.replace(path)

@@ -6,7 +6,7 @@ the batch: the many small operations of these networks do not split well by them
 """
 
 import functools
-import math
+import os
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
@@ -25,7 +25,9 @@ SPLIT = PartitionSpec(DATA)
 def data_mesh(batch: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
     """A mesh of as many devices as split a batch evenly; of this process, if not given."""
     devices = jax.local_devices() if devices is None else devices
-    count = math.gcd(batch, len(devices))
+    if not devices:
+        raise ValueError("a mesh needs at least one device, got none")
+    count = max(n for n in range(1, len(devices) + 1) if batch % n == 0)
     return Mesh(np.array(devices[:count]), (DATA,))
 
 
@@ -45,6 +47,7 @@ def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any
         return rows(params, *batches)
 
     # Where every core is a device, matrix products that ask other cores for help only wait.
-    alone = mesh.size > 1 and mesh.devices.flat[0].platform == "cpu"
+    cores = os.cpu_count() or 1
+    alone = mesh.size > 1 and mesh.devices.flat[0].platform == "cpu" and mesh.size >= cores
     options = {"xla_cpu_multi_thread_eigen": False} if alone else None
     return jax.jit(program, static_argnums=0, compiler_options=options)

@@ -14,7 +14,7 @@ BATCH_STREAM, UPDATE_STREAM = 0, 1
 
 
 class NonFiniteLoss(RuntimeError):
-    """Training met a loss that is not a finite number."""
+    """Training met a loss or a gradient that is not a finite number."""
 
 
 def make_train_step(
@@ -31,7 +31,17 @@ def make_train_step(
         mesh: splits every batch over its devices; the state is on all of them (see
             `sharding.replicate`) and `agent` averages over the axis `sharding.DATA`. None
             for one device.
+
+    Raises:
+        ValueError: the agent averages over another axis than the mesh has.
     """
+    wanted = None if mesh is None else sharding.DATA
+    if agent.axis != wanted:
+        raise ValueError(
+            f"the agent averages gradients over axis {agent.axis!r}, but with "
+            f"{'no mesh' if mesh is None else 'a mesh'} that must be {wanted!r}: make it with "
+            f"axis={wanted!r}"
+        )
     update = agent.update
     if mesh is not None:
         everywhere, split = sharding.REPLICATED, sharding.SPLIT
@@ -58,8 +68,9 @@ def train(
     steps: int,
     report: Callable[[int, TrainState, dict[str, float]], Any],
     report_every: int = 20,
+    stop: Callable[[], bool] = lambda: False,
 ) -> TrainState:
-    """Runs until the state has seen `steps` steps.
+    """Runs until the state has seen `steps` steps, or `stop` says so.
 
     Args:
         train_step: from `make_train_step`, or anything of that signature.
@@ -70,22 +81,26 @@ def train(
         report: called with (step, state, mean metrics) every `report_every` steps and at
             the end; only there does the loop wait for the device.
         report_every: steps.
+        stop: asked after every step; if it says yes, this step is reported and the last.
 
     Raises:
         NonFiniteLoss: names the step; the state of the last report was still good.
     """
     done = int(state.step)
     pending: list[dict[str, jax.Array]] = []
-    while done < steps:
+    stopping = False
+    while done < steps and not stopping:
         state, metrics = train_step(state, data, key)
         done += 1
         pending.append(metrics)
-        if done % report_every == 0 or done == steps:
+        stopping = stop()
+        if done % report_every == 0 or done == steps or stopping:
             values = jax.device_get(pending)
             for offset, value in enumerate(values):
-                if not np.isfinite(value["loss"]):
-                    bad = done - len(values) + offset + 1
-                    raise NonFiniteLoss(f"the loss of step {bad} is {value['loss']}")
+                for name in ("loss", "gradient_norm"):
+                    if not np.isfinite(value.get(name, 0.0)):
+                        bad = done - len(values) + offset + 1
+                        raise NonFiniteLoss(f"the {name} of step {bad} is {value[name]}")
             means = {name: float(np.mean([v[name] for v in values])) for name in values[0]}
             report(done, state, means)
             pending = []

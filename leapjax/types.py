@@ -100,3 +100,5 @@ class Agent(NamedTuple):
     # the energy that `act` minimises, for composition; None for methods without one
     act: Callable[[Params, jax.Array, PyTree], Plan]
     # (params, key, context) -> plan; pure, one context
+    axis: str | None = None
+    # the mesh axis that `update` averages over, inside `jax.shard_map`; None outside of it

@@ -1,6 +1,7 @@
 """The real `main`, end to end at toy size, and what it says to wrong input."""
 
 import json
+import os
 import shutil
 
 import jax
@@ -10,7 +11,8 @@ from PIL import Image
 
 from benchmarks import quality
 from experiments import babyai, results
-from leapjax import UserError, load, plan_keys, rollouts
+from experiments.config import PRESETS, preset
+from leapjax import UserError, files, load, plan_keys, rollouts
 from leapjax.data import seeds, storage
 from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import LEVELS
@@ -181,14 +183,42 @@ def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
         load(copy)
 
 
-def test_a_damaged_training_state_is_one_line(workplace, tmp_path, capsys):
-    shutil.copytree(run_folder(workplace), tmp_path / "runs" / run_folder(workplace).name)
-    for file in (tmp_path / "runs").rglob("*"):
-        if file.is_file() and "/default/" in str(file):
-            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs"), "--no-pictures"]) == 2
+def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_path, capsys):
+    folder = tmp_path / "runs" / run_folder(workplace).name
+    shutil.copytree(run_folder(workplace), folder)
+    damage(folder / "checkpoints" / "4")
+    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs"), "--no-pictures"]) == 0
     error = capsys.readouterr().err
-    assert "cannot be read" in error and error.count("\n") == 1
+    assert "checkpoints/4 is damaged" in error and "there is none before it" in error
+    (before,) = results.read(workplace / "runs" / "babyai.jsonl")
+    (after,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    assert after["successes"] == before["successes"]
+    with pytest.raises(UserError, match="cannot be read"):
+        damage(folder / "checkpoints" / "4")
+        load(folder)
+
+
+def damage(checkpoint):
+    """Cuts every file of a checkpoint's arrays in half."""
+    for file in (checkpoint / "default").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_path, capsys):
+    folder = tmp_path / "runs" / run_folder(workplace).name
+    shutil.copytree(run_folder(workplace), folder)
+    (folder / "data.json").write_text('{"fingerprint": "0123456789abcdef"}')
+    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs")]) == 2
+    assert "was begun on other demonstrations (0123456789abcdef" in capsys.readouterr().err
+
+
+def test_a_folder_in_use_is_refused(workplace, capsys):
+    with files.only_process_in(run_folder(workplace)):
+        assert babyai.main(TOY) == 2
+    error = capsys.readouterr().err
+    assert f"in use by another process ({os.getpid()})" in error and error.count("\n") == 1
+    assert babyai.main([*TOY, "--no-pictures"]) == 0
 
 
 def test_a_data_set_of_the_users_own_is_trained_on(workplace):
@@ -239,7 +269,7 @@ def test_parameters_are_plain_arrays(workplace):
 
 def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        quality, "variants", lambda trained: {"trained": trained, "one": GibbsConfig(5, 1)}
+        quality, "variants", lambda trained, most: {"trained": trained, "one": GibbsConfig(5, 1)}
     )
     played = []
     evaluate = rollouts.evaluate
@@ -262,8 +292,11 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 
 
 def test_every_search_setting_can_be_made():
-    variants = quality.variants(GibbsConfig(5, 10, temperature=0.5))
-    assert len(set(variants.values())) == len(variants) > 10
+    for level in LEVELS.values():
+        for name in PRESETS:
+            variants = quality.variants(preset(level, name).planner, level.iterations)
+            assert len(variants) > 10
+            assert max(config.iterations for config in variants.values()) == level.iterations
 
 
 def test_quality_without_a_run_is_one_line(tmp_path, capsys):

@@ -472,3 +472,16 @@ def test_scores_without_a_distribution_are_refused(row):
     with pytest.raises(AssertionError):
         wrong = pseudo_likelihood(lambda p, c: None, lambda *_: jnp.zeros((1, 2)), ACTIONS)
         jax.jit(wrong.conditional)(None, None, actions, jnp.array([0]))
+
+
+def test_totals_and_penalties_that_are_nan_are_refused():
+    nothing = jnp.zeros(HORIZON, jnp.int32)
+    nan = from_total(lambda p, c: None, lambda p, m, a: jnp.float32(jnp.nan), ACTIONS)
+    with pytest.raises(ValueError, match="energy of the plan is NaN"):
+        nan.total(None, None, nothing)
+    fine = scoring(np.zeros((HORIZON, ACTIONS)))
+    penalised = constrain(fine, lambda context, actions: jnp.float32(jnp.nan))
+    with pytest.raises(ValueError, match="are NaN"):
+        penalised.conditional(None, (None, None), nothing, jnp.array([0]))
+    with pytest.raises(ValueError, match="energy of the plan is NaN"):
+        penalised.total(None, (None, None), nothing)

@@ -211,8 +211,7 @@ def test_a_chain_that_stops_early_has_the_plan_of_one_that_does_not(order):
     np.testing.assert_array_equal(stopped.actions, whole.actions)
 
 
-@pytest.mark.parametrize("temperature", [0.0, 1.0])
-def test_an_early_stop_saves_passes(temperature):
+def test_an_early_stop_saves_passes():
     calls = []
 
     def conditional(params, memory, actions, positions):
@@ -220,7 +219,7 @@ def test_an_early_stop_saves_passes(temperature):
         return ENUMERABLE.conditional(params, memory, actions, positions)
 
     counting = ENUMERABLE._replace(conditional=conditional)
-    config = GibbsConfig(HORIZON, 200, order="sequential", temperature=temperature, early_stop=True)
+    config = GibbsConfig(HORIZON, 200, order="sequential", early_stop=True)
     plan = gibbs(counting, TABLE, jax.random.key(0), NO_TILT, config)
     jax.effects_barrier()
     changes = np.flatnonzero((np.diff(plan.trace, axis=0) != 0).any(-1))
@@ -747,8 +746,14 @@ def test_plans_of_any_shape(data):
                 resampled=st.integers(1, horizon),
                 order=st.sampled_from(ORDERS),
                 temperature=st.sampled_from([0.0, 0.7]),
-                early_stop=st.booleans(),
                 restarts=st.integers(1, 2),
+            ),
+            st.builds(
+                GibbsConfig,
+                horizon=st.just(horizon),
+                iterations=st.integers(1, 5),
+                order=st.sampled_from(ORDERS),
+                early_stop=st.just(True),
             ),
             st.builds(ShootingConfig, horizon=st.just(horizon), candidates=st.integers(1, 5)),
             st.builds(
@@ -788,6 +793,59 @@ def test_plans_do_not_depend_on_how_many_devices_share_them(devices):
     np.testing.assert_allclose(plan.energy, expected.energy, rtol=1e-5)
 
 
+def test_no_position_is_forgotten_at_a_temperature():
+    """Once all are settled the most uncertain ones are not the only ones looked at."""
+    scores = np.array([[20.0, 0.0], [0.0, 0.0], [0.0, 0.0]], np.float32)
+    energy = Energy(
+        lambda p, c: None, lambda p, m, a, where: -jnp.asarray(scores)[where],
+        lambda p, m, a: jnp.zeros(()), 2,
+    )  # fmt: skip
+    config = GibbsConfig(3, 400, order="uncertain", temperature=1.0)
+    trace = np.asarray(gibbs(energy, None, jax.random.key(0), None, config).trace)
+    changes = (np.diff(trace, axis=0) != 0).sum(axis=0)
+    assert changes[0] == 0
+    assert (changes[1:] > 40).all()
+
+
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_an_early_stop_of_a_short_chain(iterations):
+    config = GibbsConfig(HORIZON, iterations, order="sequential")
+    plans = [
+        gibbs(ENUMERABLE, TABLE, jax.random.key(0), NO_TILT, c)
+        for c in (config, dataclasses.replace(config, early_stop=True))
+    ]
+    np.testing.assert_array_equal(plans[0].trace, plans[1].trace)
+
+
+@pytest.mark.parametrize(
+    "options", [{"temperature": 0.1}, {"final_temperature": 1.0}, {"resampled": 2}]
+)
+def test_an_early_stop_where_something_could_still_change_is_refused(options):
+    with pytest.raises(ValueError, match="early_stop needs temperature 0"):
+        GibbsConfig(3, 5, early_stop=True, **options)
+
+
+def test_parameters_in_another_place_of_the_tree_are_other_parameters():
+    keys, contexts = batch_of(8)
+    table = jnp.asarray(TABLE)
+    either = TILTED._replace(
+        encode=lambda p, c: TILTED.encode(-p["b"] if p["a"] is None else p["a"], c)
+    )
+    planner = compile_planner(either, CONFIGS["gibbs"], (8,))
+    first = planner({"a": table, "b": None}, keys, contexts)
+    second = planner({"a": None, "b": table}, keys, contexts)
+    expected = compile_planner(TILTED, CONFIGS["gibbs"], (8,))
+    np.testing.assert_array_equal(first.actions, expected(table, keys, contexts).actions)
+    np.testing.assert_array_equal(second.actions, expected(-table, keys, contexts).actions)
+
+
+def test_a_nan_total_is_not_valid():
+    energy = ENUMERABLE._replace(total=lambda p, m, a: jnp.float32(jnp.nan))
+    for options in ({"score": True}, {"score_trace": True}, {"restarts": 2}):
+        config = GibbsConfig(HORIZON, 3, **options)
+        assert not gibbs(energy, TABLE, jax.random.key(0), NO_TILT, config).valid
+
+
 def test_parameters_are_placed_again_only_when_they_change():
     keys, contexts = batch_of(8)
     planner = compile_planner(TILTED, CONFIGS["gibbs"], (8,))
@@ -807,8 +865,11 @@ def test_parameters_are_placed_again_only_when_they_change():
 def test_an_energy_that_is_nan_is_an_error_and_not_a_plan(config):
     keys, contexts = batch_of(20)
     contexts["tilt"][3, 1] = np.nan
-    with pytest.raises(NotANumber, match=r"1 of 20 contexts \(the first is context 3\)"):
+    with pytest.raises(NotANumber, match=r"1 of 20 contexts \(the first is context 3\)") as error:
         batched(config)(TABLE, keys, contexts)
+    plan = error.value.plan
+    assert plan.valid.sum() == 19
+    np.testing.assert_array_equal(plan.actions[4:], one_by_one(config).actions[4:])
 
 
 def test_no_contexts_are_refused():

@@ -380,5 +380,14 @@ def test_a_step_split_over_devices_is_the_step_of_one(devices, data):
 
 def test_a_mesh_has_as_many_devices_as_split_the_batch():
     assert len(jax.devices()) == 8
-    sizes = {batch: sharding.data_mesh(batch).size for batch in (1, 2, 7, 12, 64)}
-    assert sizes == {1: 1, 2: 2, 7: 1, 12: 4, 64: 8}
+    sizes = {batch: sharding.data_mesh(batch).size for batch in (1, 2, 7, 12, 22, 64)}
+    assert sizes == {1: 1, 2: 2, 7: 7, 12: 6, 22: 2, 64: 8}
+    with pytest.raises(ValueError, match="at least one device"):
+        sharding.data_mesh(4, [])
+
+
+def test_an_agent_that_does_not_average_is_refused_a_mesh():
+    for axis, mesh in ((None, sharding.data_mesh(8)), (sharding.DATA, None)):
+        agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS, axis)
+        with pytest.raises(ValueError, match="averages gradients over axis"):
+            training.make_train_step(agent, lambda key, data: data, mesh)

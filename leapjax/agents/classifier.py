@@ -26,7 +26,10 @@ def make_agent(
     words: int,
     axis: str | None = None,
 ) -> Agent:
-    """The classifier as an `Agent`; the arguments are those of `leapjax.agents.leap`."""
+    """The classifier as an `Agent`; the arguments are those of `leapjax.agents.leap`.
+
+    Of `model` it has no use for the transformer's settings, nor for `training.masking`.
+    """
     module = SequenceClassifier(model, sizes)
     optimizer = leap.make_optimizer(training)
 
@@ -60,7 +63,7 @@ def make_agent(
     def act(params: Params, key: jax.Array, context: Context) -> Plan:
         return planners.planner_for(planner)(energy, params, key, context, planner)
 
-    return Agent(init, make_update(window_loss, optimizer, axis), energy, act)
+    return Agent(init, make_update(window_loss, optimizer, axis), energy, act, axis)
 
 
 def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:

@@ -128,7 +128,7 @@ def make_agent(
     def act(params: Params, key: jax.Array, context: Context) -> Plan:
         return planners.planner_for(planner)(energy, params, key, context, planner)
 
-    return Agent(init, make_update(window_loss, optimizer, axis), energy, act)
+    return Agent(init, make_update(window_loss, optimizer, axis), energy, act, axis)
 
 
 def make_batch(key: jax.Array, steps: Steps, training: TrainingConfig, sizes: Sizes) -> Window:

@@ -1,0 +1,63 @@
+"""SIGINT and SIGTERM: stop where nothing is lost, and say how to go on."""
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(BaseException):
+    """The program was asked to stop. Not an `Exception`: nothing on the way may catch it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        # Ctrl-C is a failure to whoever waits for the command; a polite SIGTERM is not.
+        self.exit_code = 130 if number == signal.SIGINT else 0
+
+
+class Interruption:
+    """What the two signals do while a program runs: see `interruptible`."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._deferred = False
+
+    def handle(self, number: int, _: FrameType | None) -> None:
+        """The signal handler. A second signal does not wait any more."""
+        if self._deferred and self._number is None:
+            self._number = number
+            return
+        raise Interrupted(number)
+
+    @property
+    def requested(self) -> bool:
+        """A signal came while signals were deferred."""
+        return self._number is not None
+
+    @contextlib.contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Inside, a signal waits: look at `requested`. At the end it is raised."""
+        self._deferred = True
+        try:
+            yield
+        finally:
+            self._deferred = False
+        if self._number is not None:
+            raise Interrupted(self._number)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Interruption]:
+    """Inside, SIGINT and SIGTERM raise `Interrupted`, at once or where they were deferred."""
+    interruption = Interruption()
+    try:
+        before = {number: signal.signal(number, interruption.handle) for number in SIGNALS}
+    except ValueError:  # not the main thread: signals do not arrive here
+        before = {}
+    try:
+        yield interruption
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,64 @@
+"""Files that are whole or not there, and folders that one process has to itself."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from leapjax.errors import UserError, first_line
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there, nothing keeps two processes apart
+    fcntl = None  # type: ignore[assignment]
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file so that a reader sees all of it or the one before.
+
+    Raises:
+        UserError: it cannot be written, for example because the disk is full.
+    """
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_text(text, encoding="utf-8")
+        scratch.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise UserError(f"cannot write {path}: {first_line(error)}") from None
+
+
+@contextlib.contextmanager
+def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Keeps other processes out of a folder; the system lets go however the process ends.
+
+    Args:
+        folder: made if it is not there.
+        wait: for another process to leave, instead of refusing.
+
+    Raises:
+        UserError: another process is in there, or the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / ".lock").open("a+", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
+    with file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except OSError:
+                file.seek(0)
+                owner = file.read().strip() or "unknown"
+                raise UserError(
+                    f"{folder} is in use by another process ({owner}): wait for it, stop it, or "
+                    "give this run another --runs folder"
+                ) from None
+        file.seek(0)
+        file.truncate()
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield

@@ -1,0 +1,210 @@
+"""Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import results
+from leapjax import checkpoints
+from leapjax.checkpoints import Checkpoints
+from leapjax.errors import UserError
+from leapjax.files import only_process_in, write_text
+from leapjax.types import TrainState
+
+ROOT = Path(__file__).parent.parent
+STEPS = 1500
+COMMAND = (
+    "-m experiments.babyai --demos 6 --episodes 3 --batch 4 --width 16 --heads 2 --layers 1 "
+    "--channels 4 --rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures "
+    f"--checkpoint-seconds 0.1 --steps {STEPS}"
+).split()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder for runs, with its own data sets and compilation cache; and a finished run."""
+    folder = tmp_path_factory.mktemp("interruption")
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "MINARI_DATASETS_PATH": str(folder / "datasets"),
+        "LEAPJAX_COMPILATION_CACHE": str(folder / "cache"),
+        "JAX_NUM_CPU_DEVICES": "2",
+    }
+    run = start(folder, environment, "whole")
+    assert run.wait() == 0, run.stderr.read()
+    return folder, environment
+
+
+def start(folder, environment, runs):
+    return subprocess.Popen(
+        [sys.executable, *COMMAND, "--runs", runs],
+        cwd=folder, env=environment, text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def steps_saved(folder):
+    return sorted(int(p.name) for p in folder.glob("*/checkpoints/*") if p.name.isdecimal())
+
+
+def wait_for_checkpoint(run, folder, after=0):
+    """Until there is a checkpoint later than a step, and training goes on."""
+    deadline = time.monotonic() + 120
+    while not any(after < step < STEPS for step in steps_saved(folder)):
+        assert run.poll() is None, f"the run ended too soon: {run.stderr.read()}"
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def parameters(folder):
+    """The final parameters of the only run in a folder."""
+    (path,) = folder.glob(f"*/checkpoints/{STEPS}/default")
+    with checkpoints.ocp.PyTreeCheckpointer() as checkpointer:
+        return checkpointer.restore(path.absolute())["params"]
+
+
+def check_same_end(folder, runs):
+    """A run that was broken off ended as the one that was not, with one row."""
+    expected, actual = parameters(folder / "whole"), parameters(folder / runs)
+    jax.tree.map(np.testing.assert_array_equal, actual, expected)
+    (row,) = results.read(folder / runs / "babyai.jsonl")
+    (other,) = results.read(folder / "whole" / "babyai.jsonl")
+    for name in ("hash", "successes", "mean_length"):
+        assert row[name] == other[name]
+
+
+def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
+    folder, environment = place
+    rng = np.random.default_rng(0)
+    for _ in range(int(os.environ.get("LEAPJAX_TEST_KILLS", "2"))):
+        before = max(steps_saved(folder / "killed"), default=0)
+        run = start(folder, environment, "killed")
+        wait_for_checkpoint(run, folder / "killed", before if before < STEPS - 400 else 0)
+        time.sleep(rng.uniform(0, 0.2))
+        run.kill()
+        run.wait()
+    run = start(folder, environment, "killed")
+    assert run.wait() == 0, run.stderr.read()
+    check_same_end(folder, "killed")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(place, number, code):
+    folder, environment = place
+    runs = f"stopped{number}"
+    run = start(folder, environment, runs)
+    wait_for_checkpoint(run, folder / runs)
+    run.send_signal(number)
+    assert run.wait(60) == code
+    error = run.stderr.read()
+    assert f"stopped by {signal.Signals(number).name}; continue with: python -m" in error
+    assert f"--runs {runs}" in error and "Traceback" not in error
+    assert 0 < max(steps_saved(folder / runs)) < STEPS
+    assert not (folder / runs / "babyai.jsonl").exists()
+    run = start(folder, environment, runs)
+    assert run.wait() == 0, run.stderr.read()
+    check_same_end(folder, runs)
+
+
+def state(step):
+    return TrainState({"w": jnp.full((50, 50), float(step))}, (), jnp.int32(step))
+
+
+def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path):
+    saved = Checkpoints(tmp_path / "checkpoints")
+    for step in (1, 2, 3):
+        saved.save(state(step))
+    saved.close()
+    for file in (tmp_path / "checkpoints" / "3" / "default").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[:20])
+    saved, said = Checkpoints(tmp_path / "checkpoints"), []
+    restored = saved.restore(state(0), skipped=said.append)
+    assert int(restored.step) == 2
+    np.testing.assert_array_equal(restored.params["w"], 2.0)
+    assert len(said) == 1 and "checkpoints/3 is damaged" in said[0]
+    assert "the one before is used" in said[0]
+    # The step that was damaged can be saved again.
+    saved.save(state(3))
+    saved.close()
+    assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 3
+    assert (tmp_path / "checkpoints" / "3.damaged").is_dir()
+
+
+def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
+    saved = Checkpoints(tmp_path / "checkpoints")
+    saved.save(state(1))
+    saved.close()
+    other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
+    with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
+        Checkpoints(tmp_path / "checkpoints").restore(other)
+    assert (tmp_path / "checkpoints" / "1").is_dir()
+
+
+def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
+    program = f"""
+import resource, sys
+from pathlib import Path
+import jax
+import jax.numpy as jnp
+from leapjax import files
+from leapjax.checkpoints import Checkpoints
+from leapjax.errors import UserError
+from leapjax.types import TrainState
+def state(step, size):
+    noise = jax.random.normal(jax.random.key(0), (size, size))  # does not compress
+    return TrainState({{"w": noise}}, (), jnp.int32(step))
+folder = Path({str(tmp_path)!r})
+files.write_text(folder / "row.json", "old")
+saved = Checkpoints(folder / "checkpoints")
+saved.save(state(1, 50))
+saved._manager.wait_until_finished()
+# No file may grow beyond this: what a full disk does, to this process alone.
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    files.write_text(folder / "row.json", "new" * 100_000)
+except UserError as error:
+    print("row:", error)
+try:
+    saved.save(state(2, 1000))
+    saved.close()
+except UserError as error:
+    print("state:", error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith(f"row: cannot write {tmp_path}/row.json"), done.stderr[-2000:]
+    assert lines[1].startswith(f"state: cannot write a checkpoint to {tmp_path}/checkpoints")
+    assert (tmp_path / "row.json").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
+    assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1
+
+
+def test_a_lock_is_let_go_of(tmp_path):
+    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
+    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+        pass
+    with only_process_in(tmp_path / "run"):
+        pass
+
+
+def test_text_is_replaced_whole(tmp_path):
+    write_text(tmp_path / "new" / "file.json", json.dumps([1]))
+    write_text(tmp_path / "new" / "file.json", json.dumps([2]))
+    assert json.loads((tmp_path / "new" / "file.json").read_text()) == [2]
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["file.json"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        write_text(tmp_path / "file" / "below.json", "")
