@@ -85,7 +85,8 @@ def speed(rows: Sequence[Row]) -> str:
                 f"{1e3 * alone['seconds']:.1f} ms",
             ]
         )
-    return _table("plan | preset | plans per second | of the machine's peak | one alone", lines)
+    header = "plan | preset | plans per second | of the matrix-multiply peak | one alone"
+    return _table(header, lines)
 
 
 def planning(rows: Sequence[Row]) -> str:
