@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: babyai test lint clean
+.PHONY: babyai test test-long lint clean
 
 # The main job: train LEAP on a BabyAI level and report its success beside the paper's.
 # More options: make babyai ARGS="--level all".
@@ -13,6 +13,10 @@ babyai: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest $(ARGS)
+
+# The long form of the tests that have one: a run is killed ten times.
+test-long: $(READY)
+	LEAPJAX_TEST_KILLS=10 $(BIN)/python -m pytest tests/test_interruption.py $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

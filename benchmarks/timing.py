@@ -1,11 +1,13 @@
 """How long something takes, and how long it could take at best on this machine."""
 
+import functools
 import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import NamedSharding
 
 from leapjax import sharding
@@ -23,25 +25,26 @@ def fastest(run: Callable[[], Any], seconds: float) -> float:
 
 
 def matmul_peak(tokens: int, width: int, seconds: float) -> float:
-    """GFLOP/s of a perceptron's two matrix products, one after the other, and no more.
+    """GFLOP/s of the matrix products of one transformer layer, one after the other, no more.
 
-    Of `[tokens, width]` by `[width, 4 width]` and back, as the transformers here have them:
-    the better of all cores on one product at a time, and the tokens split over the devices.
+    Four of `[tokens, width]` by `[width, width]`, then to `4 width` and back: the better of
+    all cores on one product at a time, and the tokens split over the devices.
     """
     devices = len(jax.local_devices())
     tokens = -(-tokens // devices) * devices  # so that they can be split
     key = jax.random.key(0)
     x = jax.random.normal(key, (tokens, width))
-    weights = (
-        jax.random.normal(key, (width, 4 * width)) / width,
-        jax.random.normal(key, (4 * width, width)) / width,
-    )
-    flops = 2 * 2 * tokens * width * 4 * width
+    shapes = [(width, width)] * 4 + [(width, 4 * width), (4 * width, width)]
+    weights = [jax.random.normal(key, shape) / width for shape in shapes]
+    flops = 2 * tokens * sum(rows * columns for rows, columns in shapes)
     repeats = max(1, int(2e9 / flops))  # hides the dispatch
 
-    def multiply(_: None, weights: tuple[jax.Array, jax.Array], x: jax.Array) -> jax.Array:
+    def multiply(_: None, weights: list[jax.Array], x: jax.Array) -> jax.Array:
         # Each product needs the one before, so none can be left out.
-        return jax.lax.fori_loop(0, repeats, lambda _, y: (y @ weights[0]) @ weights[1], x)
+        def layer(_: int, y: jax.Array) -> jax.Array:
+            return functools.reduce(jnp.matmul, weights, y)
+
+        return jax.lax.fori_loop(0, repeats, layer, x)
 
     best = float("inf")
     for mesh in {sharding.data_mesh(1), sharding.data_mesh(tokens)}:

