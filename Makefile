@@ -14,9 +14,10 @@ babyai: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest $(ARGS)
 
-# The long form of the tests that have one: a run is killed ten times.
+# The long form of the tests that have one: docs/reliability.md.
 test-long: $(READY)
-	LEAPJAX_TEST_KILLS=10 $(BIN)/python -m pytest tests/test_interruption.py $(ARGS)
+	LEAPJAX_TEST_LONG=1 $(BIN)/python -m pytest -rA --durations=10 \
+		tests/test_interruption.py tests/test_processes.py tests/test_fuzz.py tests/test_soak.py $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

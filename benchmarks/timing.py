@@ -47,7 +47,7 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
         return jax.lax.fori_loop(0, repeats, layer, x)
 
     best = float("inf")
-    for mesh in {sharding.data_mesh(1), sharding.data_mesh(tokens)}:
+    for mesh in {sharding.make_mesh(1), sharding.make_mesh(tokens)}:
         run = partial(
             sharding.split_batches(multiply, mesh), None, sharding.replicate(weights, mesh),
             jax.device_put(x, NamedSharding(mesh, sharding.SPLIT)),

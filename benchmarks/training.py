@@ -77,18 +77,15 @@ def measure(config: Config, seconds: float) -> Row:
     level = levels.find_level(config.level)
     sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
     batch = config.training.batch
-    mesh = sharding.data_mesh(batch)
-    agent = leap.make_agent(
-        config.model, config.training, config.planner, sizes, level.words, sharding.DATA
-    )
-    key = sharding.replicate(jax.random.key(0), mesh)
-    state = sharding.replicate(jax.jit(agent.init)(key), mesh)
+    mesh = sharding.make_mesh(batch)
+    agent = leap.make_agent(config.model, config.training, config.planner, sizes, level.words, mesh)
+    state, key = training.begin(agent, 0, mesh)
     data = sharding.replicate(random_steps(sizes, level.words), mesh)
 
     def make_batch(key: jax.Array, data: PyTree) -> PyTree:
         return leap.make_batch(key, data, config.training, sizes)
 
-    step = training.make_train_step(agent, make_batch, mesh)
+    step = training.make_train_step(agent, make_batch)
     lowered = step.lower(state, data, key)  # type: ignore[attr-defined]
     compiled = lowered.compile()
 
@@ -131,7 +128,7 @@ def encoder_seconds(
 ) -> float:
     """Seconds for the encoder of a batch and its gradient, on as many devices."""
     energy = leap.make_energy(config.model, sizes)
-    mesh = sharding.data_mesh(batch)
+    mesh = sharding.make_mesh(batch)
 
     def gradient(_: None, params: Params, contexts: PyTree) -> PyTree:
         def total(params: Params) -> jax.Array:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from experiments.runtime import Cluster
 from leapjax import pretrained
 from leapjax.agents.leap import TrainingConfig
 from leapjax.envs import levels
@@ -60,10 +61,13 @@ class Config:
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
     planner: Annotated[GibbsConfig, tyro.conf.arg(name="")] = GibbsConfig()
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
 
 
 # What a result does not depend on, or what its row holds on its own.
-_NOT_HASHED = ("seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds")
+_NOT_HASHED = (
+    "seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds", "cluster",
+)  # fmt: skip
 
 
 def preset(level: Level, name: str) -> Config:

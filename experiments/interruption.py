@@ -24,28 +24,37 @@ class Interruption:
         self._number: int | None = None
         self._deferred = False
 
-    def handle(self, number: int, _: FrameType | None) -> None:
+    def handle(self, number: int, _: FrameType | None = None) -> None:
         """The signal handler. A second signal does not wait any more."""
-        if self._deferred and self._number is None:
-            self._number = number
-            return
-        raise Interrupted(number)
+        waits = self._deferred and self._number is None
+        self._number = number
+        if not waits:
+            raise Interrupted(number)
 
     @property
-    def requested(self) -> bool:
-        """A signal came while signals were deferred."""
-        return self._number is not None
+    def requested(self) -> int | None:
+        """The signal that came, if one came."""
+        return self._number
+
+    def adopt(self, number: int) -> None:
+        """A signal that came to another process of this run."""
+        self._number = self._number or number
+
+    def check(self) -> None:
+        """Raises what came. Python may have dropped it: it can do so inside a callback."""
+        if self._number is not None:
+            raise Interrupted(self._number)
 
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
         """Inside, a signal waits: look at `requested`. At the end it is raised."""
+        self.check()
         self._deferred = True
         try:
             yield
         finally:
             self._deferred = False
-        if self._number is not None:
-            raise Interrupted(self._number)
+        self.check()
 
 
 @contextlib.contextmanager

@@ -1,19 +1,100 @@
 """How JAX is set up for a program of ours: its devices, its compilation cache."""
 
 import contextlib
+import dataclasses
 import os
 import platform
+import sys
+import time
 from pathlib import Path
 
 import jax
 
+from leapjax.errors import UserError, first_line
+
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
+CONNECT_SECONDS = 120
+# How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
+# starts one process has too.)
+LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
-def start() -> None:
-    """Every program's first step, before JAX has touched a device."""
+@dataclasses.dataclass(frozen=True)
+class Cluster:
+    """The processes and devices that share a run."""
+
+    coordinator: str | None = None
+    """host:port of process 0, for several processes; SLURM and Open MPI say it themselves."""
+    num_processes: int | None = None
+    """With a coordinator: how many processes there are."""
+    process_id: int | None = None
+    """With a coordinator: which of them this is, from 0."""
+    fsdp: int = 1
+    """Split parameters and optimizer over groups of so many devices; 1: whole on each."""
+
+    def __post_init__(self) -> None:
+        given = [self.coordinator, self.num_processes, self.process_id]
+        if self.fsdp < 1:
+            raise ValueError(f"fsdp must be at least 1, got {self.fsdp}")
+        if given == [None, None, None]:
+            return
+        if self.coordinator is None or self.num_processes is None or self.process_id is None:
+            raise ValueError("coordinator, num-processes and process-id are given together")
+        if not 0 <= self.process_id < self.num_processes:
+            raise ValueError(
+                f"process-id is {self.process_id}, of {self.num_processes} processes: expected 0 "
+                f"to {self.num_processes - 1}"
+            )
+        host, _, port = self.coordinator.rpartition(":")
+        if not host or not port.isdecimal():
+            raise ValueError(f"coordinator is {self.coordinator!r}: expected host:port")
+
+
+def start(cluster: Cluster = Cluster()) -> None:
+    """Every program's first step, before JAX has touched a device.
+
+    Raises:
+        UserError: the other processes cannot be reached.
+    """
     use_every_core()
     use_compilation_cache()
+    connect(cluster)
+
+
+def connect(cluster: Cluster) -> None:
+    """Joins the other processes of a run, if there are others.
+
+    Raises:
+        UserError: they cannot be reached.
+    """
+    launched = any(int(os.environ.get(name, "1")) > 1 for name in LAUNCHED)
+    if cluster.coordinator is None and not launched:
+        return
+    try:
+        jax.distributed.initialize(
+            cluster.coordinator, cluster.num_processes, cluster.process_id,
+            initialization_timeout=CONNECT_SECONDS,
+        )  # fmt: skip
+    except Exception as error:  # noqa: BLE001  (gRPC and JAX raise many kinds)
+        raise UserError(
+            f"cannot join the other processes of this run ({first_line(error)}): check that all "
+            "were started, and that process 0 can be reached at --coordinator"
+        ) from None
+
+
+def leave(code: int) -> int:
+    """The exit code of a program that ends early.
+
+    With other processes it ends here: JAX would wait for them to end too, minutes long, while
+    they wait for this one. The first one gives the others time to say why they end, because
+    without it they are aborted.
+    """
+    if jax.distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        time.sleep(5 if jax.process_index() == 0 else 1)
+        os._exit(code)
+    return code
 
 
 def use_every_core() -> None:

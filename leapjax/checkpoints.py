@@ -14,8 +14,10 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
+from leapjax import processes, sharding
 from leapjax.errors import UserError, first_line
 from leapjax.types import PyTree, TrainState
 
@@ -27,18 +29,31 @@ class Checkpoints:
     """The training states of one run, newest last, in one folder.
 
     Saving is asynchronous and atomic: a killed program loses the steps since the last
-    checkpoint and never more.
+    checkpoint and never more. A checkpoint holds whole arrays, so that a run can go on with
+    another number of devices or processes. Of several processes the first one reads and
+    writes; all of them call every method but `close`.
     """
 
     def __init__(self, folder: Path, keep: int = 2) -> None:
         self._folder = folder.absolute()
-        self._options = ocp.CheckpointManagerOptions(max_to_keep=keep, cleanup_tmp_directories=True)
-        self._manager = ocp.CheckpointManager(self._folder, options=self._options)
+        self._keep = keep
+        if processes.is_first():
+            self._manager = self._open()
+
+    def _open(self) -> ocp.CheckpointManager:
+        alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
+        # Orbax makes no folders for some processes only.
+        self._folder.mkdir(parents=True, exist_ok=True)
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=self._keep, cleanup_tmp_directories=True, create=False,
+            multiprocessing_options=alone,
+        )  # fmt: skip
+        return ocp.CheckpointManager(self._folder, options=options)
 
     @property
     def latest(self) -> int | None:
         """The step of the newest checkpoint, or None."""
-        return self._manager.latest_step()
+        return processes.first_does(lambda: self._manager.latest_step())
 
     def save(self, state: TrainState) -> None:
         """Writes a state, in the background.
@@ -46,8 +61,15 @@ class Checkpoints:
         Raises:
             UserError: this one, or the one before it, cannot be written.
         """
-        with self._writing():
-            self._manager.save(int(state.step), args=ocp.args.StandardSave(state._asdict()))
+        # A copy: on a CPU these may be the device's own buffers, which training reuses.
+        values = jax.tree.map(np.array, sharding.to_host(state))
+
+        def write() -> None:
+            with self._writing():
+                arguments = ocp.args.StandardSave(values._asdict())
+                self._manager.save(int(values.step), args=arguments)
+
+        processes.first_does(write)
 
     def restore(
         self, like: TrainState, skipped: Callable[[str], Any] = warnings.warn
@@ -57,18 +79,32 @@ class Checkpoints:
         A damaged checkpoint is set aside, as `<step>.damaged`, and the one before is tried.
 
         Args:
-            like: the state of a run of this configuration.
+            like: the state of a run of this configuration, on its devices.
             skipped: called with one line for each checkpoint that was set aside.
 
         Raises:
             UserError: a checkpoint is whole, but of another configuration.
         """
-        target = jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict())
-        while self.latest is not None:
-            path = self._folder / str(self.latest)
+        blank = TrainState(*jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like))
+        found: list[TrainState] = []
+
+        def read() -> bool:
+            found.extend(self._read(blank, skipped))
+            return bool(found)
+
+        if not processes.first_does(read):
+            return None
+        values = processes.broadcast(found[0] if found else blank)
+        return sharding.place(values, jax.tree.map(lambda leaf: leaf.sharding, like))
+
+    def _read(self, like: TrainState, skipped: Callable[[str], Any]) -> list[TrainState]:
+        """The newest state, as arrays of NumPy, or nothing."""
+        while (latest := self._manager.latest_step()) is not None:
+            path = self._folder / str(latest)
             try:
                 _check_shapes(_saved_shapes(path), like._asdict(), path)
-                restored = self._manager.restore(self.latest, args=ocp.args.StandardRestore(target))
+                arguments = ocp.args.StandardRestore(like._asdict())
+                return [TrainState(**self._manager.restore(latest, args=arguments))]
             except UserError:
                 raise
             except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
@@ -76,22 +112,25 @@ class Checkpoints:
                 shutil.rmtree(aside, ignore_errors=True)
                 path.rename(aside)
                 self._manager.close()
-                self._manager = ocp.CheckpointManager(self._folder, options=self._options)
-                older = "the one before is used" if self.latest else "there is none before it"
-                skipped(f"{path} is damaged ({first_line(error)}); it is now {aside}; {older}")
-            else:
-                return TrainState(**restored)
-        return None
+                self._manager = self._open()
+                older = self._manager.latest_step() is not None
+                before = "the one before is used" if older else "there is none before it"
+                skipped(f"{path} is damaged ({first_line(error)}); it is now {aside}; {before}")
+        return []
 
     def close(self) -> None:
         """Waits until everything is on disk, then lets go of the folder.
 
+        The only method that asks nothing of the other processes: it also ends a run that
+        went wrong, where they may be anywhere.
+
         Raises:
             UserError: a state cannot be written.
         """
-        with self._writing():
-            self._manager.wait_until_finished()
-        self._manager.close()
+        if processes.is_first():
+            with self._writing():
+                self._manager.wait_until_finished()
+            self._manager.close()
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -122,7 +161,8 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
         path = folder.absolute() / str(step)
         try:
             _check_shapes(_saved_shapes(path, "params"), like, path)
-            target = {"params": jax.tree.map(ocp.utils.to_shape_dtype_struct, like)}
+            blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
+            target = {"params": blank}
             arguments = ocp.checkpoint_utils.construct_restore_args(target)
             with ocp.PyTreeCheckpointer() as checkpointer:
                 restored = checkpointer.restore(

@@ -313,8 +313,12 @@ def cross_entropy_method(
     return plan._replace(energy=energies[best]) if config.score else plan
 
 
-def planner_for(config: PlannerConfig) -> Callable[..., Plan]:
-    """The planner that a configuration belongs to."""
+def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
+    """`(params, key, context) -> Plan`: the planner that a configuration belongs to.
+
+    Raises:
+        TypeError: it belongs to none.
+    """
     planners: dict[type, Callable[..., Plan]] = {
         GibbsConfig: gibbs,
         ShootingConfig: random_shooting,
@@ -322,7 +326,7 @@ def planner_for(config: PlannerConfig) -> Callable[..., Plan]:
     }
     if type(config) not in planners:
         raise TypeError(f"no planner takes a {type(config).__name__}")
-    return planners[type(config)]
+    return functools.partial(planners[type(config)], energy, config=config)
 
 
 class CompiledPlanner:
@@ -341,18 +345,16 @@ class CompiledPlanner:
         self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
         if not self.chunk_sizes or self.chunk_sizes[0] < 1:
             raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
-        planner = planner_for(config)
+        planner = bind(energy, config)
 
         def plan_rows(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
             keys = jax.random.wrap_key_data(key_data, impl=kind)
-            return jax.vmap(lambda key, context: planner(energy, params, key, context, config))(
-                keys, contexts
-            )
+            return jax.vmap(planner, in_axes=(None, 0, 0))(params, keys, contexts)
 
         nothing = jax.tree.structure(())
         self._last: tuple[list[Array], Any, dict[int, Params]] = ([], nothing, {})
         # Plans have nothing to say to each other: each device plans its rows by itself.
-        self._meshes = {size: sharding.data_mesh(size, devices) for size in self.chunk_sizes}
+        self._meshes = {size: sharding.make_mesh(size, devices) for size in self.chunk_sizes}
         self._programs = {
             mesh.size: sharding.split_batches(plan_rows, mesh) for mesh in self._meshes.values()
         }

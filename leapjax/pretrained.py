@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import jax
+from jax.sharding import Mesh
 
 from leapjax import checkpoints, planners
 from leapjax.agents import leap
@@ -60,11 +61,11 @@ def sizes_for(level: Level, context: int, horizon: int) -> Sizes:
     return Sizes(side, vocabulary.SIZE, NUM_ACTIONS, context, horizon, longest)
 
 
-def make_agent(specification: Specification, axis: str | None = None) -> Agent:
-    """The agent of a specification; for `axis` see `leapjax.agents.leap.make_agent`."""
+def make_agent(specification: Specification, mesh: Mesh | None = None) -> Agent:
+    """The agent of a specification; for `mesh` see `leapjax.agents.leap.make_agent`."""
     return leap.make_agent(
         specification.model, specification.training, specification.planner,
-        specification.sizes, specification.words, axis,
+        specification.sizes, specification.words, mesh,
     )  # fmt: skip
 
 

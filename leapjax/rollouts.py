@@ -24,6 +24,18 @@ class Episodes(NamedTuple):
     seconds: float  # in all
 
 
+def join(parts: Sequence[Episodes]) -> Episodes:
+    """Episodes that were played side by side: counts add up, the slowest has the say."""
+    return Episodes(
+        np.concatenate([part.seeds for part in parts]),
+        np.concatenate([part.successes for part in parts]),
+        np.concatenate([part.lengths for part in parts]),
+        sum(part.plans for part in parts),
+        max(part.planning_seconds for part in parts),
+        max(part.seconds for part in parts),
+    )
+
+
 class History:
     """The last K states and actions of one episode, as a planner's context."""
 

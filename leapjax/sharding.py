@@ -1,4 +1,7 @@
-"""Where arrays live: one mesh of devices, over which batches are split.
+"""Where arrays live: one mesh of devices for batches and, if asked for, for parameters.
+
+The mesh has two axes. Batches are split over both; parameters and what the optimizer keeps
+of them are whole on every device, or split over the second axis (ZeRO, FSDP).
 
 The cores of a CPU are used best as several devices of their own, each with its share of
 the batch: the many small operations of these networks do not split well by themselves
@@ -6,6 +9,7 @@ the batch: the many small operations of these networks do not split well by them
 """
 
 import functools
+import math
 import os
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -16,24 +20,122 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from leapjax.types import PyTree
 
-DATA = "data"  # the mesh axis that splits a batch
+DATA, FSDP = "data", "fsdp"  # the axes of every mesh
 
 REPLICATED = PartitionSpec()
-SPLIT = PartitionSpec(DATA)
+SPLIT = PartitionSpec((DATA, FSDP))  # a batch, by its first dimension
+SMALLEST_SPLIT = 1024  # elements; smaller parameters are whole everywhere
 
 
-def data_mesh(batch: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """A mesh of as many devices as split a batch evenly; of this process, if not given."""
+def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int = 1) -> Mesh:
+    """A mesh `[data, fsdp]` of as many devices as split a batch evenly.
+
+    Args:
+        batch: rows to split.
+        devices: to choose from, as many of each process; all of this process, if not given.
+        fsdp: over how many devices parameters are split.
+
+    Raises:
+        ValueError: no number of these devices splits the batch, or makes whole groups of `fsdp`.
+    """
     devices = jax.local_devices() if devices is None else devices
     if not devices:
         raise ValueError("a mesh needs at least one device, got none")
-    count = max(n for n in range(1, len(devices) + 1) if batch % n == 0)
-    return Mesh(np.array(devices[:count]), (DATA,))
+    groups: dict[int, list[jax.Device]] = {}
+    for device in devices:
+        groups.setdefault(device.process_index, []).append(device)
+    most = min(len(group) for group in groups.values())
+    for each in range(most, 0, -1):
+        count = each * len(groups)
+        if batch % count == 0 and count % fsdp == 0:
+            chosen = [device for index in sorted(groups) for device in groups[index][:each]]
+            return Mesh(np.array(chosen).reshape(count // fsdp, fsdp), (DATA, FSDP))
+    raise ValueError(
+        f"a batch of {batch} and parameters split in {fsdp} do not fit {len(groups)} process(es) "
+        f"of {most} device(s): the devices used must divide the batch, and be a multiple of {fsdp}"
+    )
+
+
+def place(tree: PyTree, shardings: PyTree) -> PyTree:
+    """Arrays that every process has, put where their shardings say."""
+
+    def put(leaf: Any, sharding: NamedSharding) -> jax.Array:
+        if sharding.is_fully_addressable:
+            return jax.device_put(leaf, sharding)
+        whole = np.asarray(leaf)
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
+
+    return jax.tree.map(put, tree, shardings)
 
 
 def replicate(tree: PyTree, mesh: Mesh) -> PyTree:
     """The same arrays on every device of the mesh."""
-    return jax.device_put(tree, NamedSharding(mesh, REPLICATED))
+    return place(tree, jax.tree.map(lambda _: NamedSharding(mesh, REPLICATED), tree))
+
+
+def to_host(tree: PyTree) -> PyTree:
+    """Whole arrays of NumPy, on every process; all of them have to ask."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array)]
+    if all(leaf.is_fully_addressable for leaf in leaves):
+        return jax.device_get(tree)
+    mesh = leaves[0].sharding.mesh  # type: ignore[attr-defined]  # of a NamedSharding
+    whole = _gather_all(mesh)(tree)
+    return jax.tree.map(lambda leaf: np.asarray(leaf.addressable_data(0)), whole)
+
+
+@functools.cache
+def _gather_all(mesh: Mesh) -> Callable[[PyTree], PyTree]:
+    return jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, REPLICATED))
+
+
+# Parameters, split over the second axis.
+
+
+def parameter_specs(tree: PyTree, mesh: Mesh) -> PyTree:
+    """How each array of a tree of parameters, or of a `TrainState`, is split.
+
+    Along its longest dimension that the second axis divides; whole if there is none, or if
+    the array is small.
+    """
+    count = mesh.shape[FSDP]
+
+    def spec(leaf: Any) -> PartitionSpec:
+        fitting = [d for d, size in enumerate(leaf.shape) if size % count == 0]
+        if count == 1 or not fitting or math.prod(leaf.shape) < SMALLEST_SPLIT:
+            return REPLICATED
+        dimension = max(fitting, key=lambda d: leaf.shape[d])
+        return PartitionSpec(*(None,) * dimension, FSDP)
+
+    return jax.tree.map(spec, tree)
+
+
+def parameter_shardings(tree: PyTree, mesh: Mesh) -> PyTree:
+    """`parameter_specs` on their mesh."""
+    return jax.tree.map(lambda spec: NamedSharding(mesh, spec), parameter_specs(tree, mesh))
+
+
+def gather(tree: PyTree, specs: PyTree) -> PyTree:
+    """Inside `jax.shard_map`: whole parameters from each device's part."""
+
+    def whole(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+        if FSDP not in spec:
+            return leaf
+        return jax.lax.all_gather(leaf, FSDP, axis=spec.index(FSDP), tiled=True)
+
+    return jax.tree.map(whole, tree, specs)
+
+
+def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
+    """Inside `jax.shard_map`: each device's part of the mean of whole gradients."""
+
+    def part(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
+        if FSDP not in spec:
+            return jax.lax.pmean(leaf, (DATA, FSDP))
+        dimension = spec.index(FSDP)
+        total = jax.lax.psum_scatter(leaf, FSDP, scatter_dimension=dimension, tiled=True)
+        return jax.lax.pmean(total, DATA) / jax.lax.axis_size(FSDP)
+
+    return jax.tree.map(part, tree, specs)
 
 
 def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:

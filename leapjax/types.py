@@ -95,10 +95,8 @@ class Agent(NamedTuple):
     init: Callable[[jax.Array], TrainState]
     # (key) -> state
     update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
-    # (state, batch, key) -> (state, metrics); pure, not jitted
+    # (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself
     energy: Energy | None
     # the energy that `act` minimises, for composition; None for methods without one
     act: Callable[[Params, jax.Array, PyTree], Plan]
     # (params, key, context) -> plan; pure, one context
-    axis: str | None = None
-    # the mesh axis that `update` averages over, inside `jax.shard_map`; None outside of it

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import quality
-from experiments import babyai, results
+from experiments import babyai, pipeline, results
 from experiments.config import PRESETS, preset
 from leapjax import UserError, files, load, plan_keys, rollouts
 from leapjax.data import seeds, storage
@@ -68,7 +68,7 @@ def test_a_run_leaves_pictures_metrics_and_a_checkpoint(workplace):
     for name in ("loss.png", "iterations.png"):
         assert Image.open(folder / name).size[0] > 300
     assert getattr(Image.open(folder / "plan.gif"), "n_frames", 1) > 3
-    metrics = babyai.read_metrics(folder)
+    metrics = pipeline.read_metrics(folder)
     assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
 
 

@@ -6,115 +6,82 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import results
-from leapjax import checkpoints
+from experiments.interruption import Interrupted, interruptible
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, write_text
 from leapjax.types import TrainState
+from tests.programs import LONG, ROOT, Place
 
-ROOT = Path(__file__).parent.parent
 STEPS = 400
-COMMAND = (
-    "-m experiments.babyai --demos 6 --episodes 3 --batch 4 --width 16 --heads 2 --layers 1 "
-    "--channels 4 --rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures "
-    f"--checkpoint-seconds 0.1 --steps {STEPS}"
-).split()
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder for runs, with its own data sets and compilation cache; and a finished run."""
-    folder = tmp_path_factory.mktemp("interruption")
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "MINARI_DATASETS_PATH": str(folder / "datasets"),
-        "LEAPJAX_COMPILATION_CACHE": str(folder / "cache"),
-        "JAX_NUM_CPU_DEVICES": "2",
-    }
-    run = start(folder, environment, "whole")
-    assert run.wait() == 0, run.stderr.read()
-    return folder, environment
-
-
-def start(folder, environment, runs):
-    return subprocess.Popen(
-        [sys.executable, *COMMAND, "--runs", runs],
-        cwd=folder, env=environment, text=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-    )  # fmt: skip
-
-
-def steps_saved(folder):
-    return sorted(int(p.name) for p in folder.glob("*/checkpoints/*") if p.name.isdecimal())
-
-
-def wait_for_checkpoint(run, folder, after=0):
-    """Until there is a checkpoint later than a step, and training goes on."""
-    deadline = time.monotonic() + 120
-    while not any(after < step < STEPS for step in steps_saved(folder)):
-        assert run.poll() is None, f"the run ended too soon: {run.stderr.read()}"
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
-def parameters(folder):
-    """The final parameters of the only run in a folder."""
-    (path,) = folder.glob(f"*/checkpoints/{STEPS}/default")
-    with checkpoints.ocp.PyTreeCheckpointer() as checkpointer:
-        return checkpointer.restore(path.absolute())["params"]
-
-
-def check_same_end(folder, runs):
-    """A run that was broken off ended as the one that was not, with one row."""
-    expected, actual = parameters(folder / "whole"), parameters(folder / runs)
-    jax.tree.map(np.testing.assert_array_equal, actual, expected)
-    (row,) = results.read(folder / runs / "babyai.jsonl")
-    (other,) = results.read(folder / "whole" / "babyai.jsonl")
-    for name in ("hash", "successes", "mean_length"):
-        assert row[name] == other[name]
+    """Where the runs of this file go, with one that nothing happened to."""
+    place = Place(tmp_path_factory.mktemp("interruption"), STEPS)
+    place.finish(place.start("whole"))
+    return place
 
 
 def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
-    folder, environment = place
     rng = np.random.default_rng(0)
-    for _ in range(int(os.environ.get("LEAPJAX_TEST_KILLS", "1"))):
-        before = max(steps_saved(folder / "killed"), default=0)
-        run = start(folder, environment, "killed")
-        wait_for_checkpoint(run, folder / "killed", before if before < STEPS // 2 else 0)
+    for _ in range(10 if LONG else 1):
+        before = max(place.steps_saved("killed"), default=0)
+        run = place.start("killed")
+        place.wait_for_checkpoint(run, "killed", before if before < STEPS // 2 else 0)
         time.sleep(rng.uniform(0, 0.2))
         run.kill()
         run.wait()
-    run = start(folder, environment, "killed")
-    assert run.wait() == 0, run.stderr.read()
-    check_same_end(folder, "killed")
+    place.finish(place.start("killed"))
+    place.check_same_end("killed")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(place, number, code):
-    folder, environment = place
     runs = f"stopped{number}"
-    run = start(folder, environment, runs)
-    wait_for_checkpoint(run, folder / runs)
+    run = place.start(runs)
+    place.wait_for_checkpoint(run, runs)
     run.send_signal(number)
     assert run.wait(60) == code
     error = run.stderr.read()
     assert f"stopped by {signal.Signals(number).name}; continue with: python -m" in error
     assert f"--runs {runs}" in error and "Traceback" not in error
-    assert 0 < max(steps_saved(folder / runs)) < STEPS
-    assert not (folder / runs / "babyai.jsonl").exists()
+    assert 0 < max(place.steps_saved(runs)) < STEPS
+    assert not (place.folder / runs / "babyai.jsonl").exists()
     if number == signal.SIGTERM:
-        run = start(folder, environment, runs)
-        assert run.wait() == 0, run.stderr.read()
-        check_same_end(folder, runs)
+        place.finish(place.start(runs))
+        place.check_same_end(runs)
+
+
+def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
+    with interruptible() as interruption:
+        with pytest.raises(Interrupted, match="SIGTERM"):
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(Interrupted, match="SIGTERM"):  # as if nobody had seen it
+            interruption.check()
+        with pytest.raises(Interrupted, match="SIGTERM"), interruption.deferred():
+            pytest.fail("long work began")
+
+
+def test_a_deferred_signal_waits_and_a_second_one_does_not():
+    with interruptible() as interruption:
+        with pytest.raises(Interrupted, match="SIGINT"), interruption.deferred():
+            assert not interruption.requested
+            os.kill(os.getpid(), signal.SIGINT)
+            assert interruption.requested == signal.SIGINT
+        reached = False
+    with interruptible() as interruption:
+        with pytest.raises(Interrupted), interruption.deferred():
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+            reached = True
+        assert not reached
 
 
 def state(step):
@@ -162,6 +129,7 @@ from leapjax import files
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
+from tests.programs import LONG, ROOT, Place
 def state(step, size):
     noise = jax.random.normal(jax.random.key(0), (size, size))  # does not compress
     return TrainState({{"w": noise}}, (), jnp.int32(step))

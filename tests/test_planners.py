@@ -15,10 +15,10 @@ from leapjax.planners import (
     GibbsConfig,
     NotANumber,
     ShootingConfig,
+    bind,
     compile_planner,
     gibbs,
     plan_keys,
-    planner_for,
     split_batch,
 )
 from leapjax.types import Energy
@@ -49,10 +49,10 @@ REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: a sampler that is wrong, one that m
 @functools.cache
 def many_plans(energy, config):
     """The planner for a batch of keys in one context, compiled once."""
-    planner = planner_for(config)
+    planner = bind(energy, config)
 
     def plan(params, keys, context):
-        return jax.vmap(lambda key: planner(energy, params, key, context, config))(keys)
+        return jax.vmap(lambda key: planner(params, key, context))(keys)
 
     return quick_jit(plan)
 
@@ -346,7 +346,7 @@ def test_plan_is_the_end_of_its_trace_with_its_exact_energy(config):
 )
 def test_energies_are_returned_only_if_asked_for(config):
     plan = jax.eval_shape(
-        lambda key: planner_for(config)(ENUMERABLE, TABLE, key, NO_TILT, config),
+        lambda key: bind(ENUMERABLE, config)(TABLE, key, NO_TILT),
         jax.random.key(0),
     )
     assert plan.energy is None
@@ -422,8 +422,8 @@ def recording_planner(config, energy=ENUMERABLE):
         return energy.total(params, memory, actions)
 
     recording = energy._replace(total=total)
-    planner = planner_for(config)
-    return quick_jit(lambda key: planner(recording, TABLE, key, NO_TILT, config)), scored
+    planner = bind(recording, config)
+    return quick_jit(lambda key: planner(TABLE, key, NO_TILT)), scored
 
 
 def plan_and_scored(config, seed, energy=ENUMERABLE):
@@ -650,7 +650,8 @@ def batched(config):
 def one_by_one(config):
     """The plans of 20 contexts, each from its own unbatched call."""
     keys, contexts = batch_of(20)
-    single = quick_jit(lambda k, c: planner_for(config)(TILTED, TABLE, k, c, config))
+    planner = bind(TILTED, config)
+    single = quick_jit(lambda k, c: planner(TABLE, k, c))
     plans = [single(keys[i], {"tilt": contexts["tilt"][i]}) for i in range(20)]
     return jax.tree.map(lambda *rows: np.stack(rows), *plans)
 
@@ -924,4 +925,4 @@ def test_impossible_temperatures_are_refused(options):
 
 def test_only_planner_configurations_have_a_planner():
     with pytest.raises(TypeError, match="no planner takes a dict"):
-        planner_for({"horizon": 3})
+        bind(ENUMERABLE, {"horizon": 3})

@@ -346,29 +346,35 @@ def test_settings_that_cannot_work_are_refused(setting, says):
 # Batches that are split over devices.
 
 
-def gradient_step(devices, data, batch=16):
-    """The gradient, the metrics and the batch of one step on so many devices."""
+def gradient_step(devices, data, batch=16, fsdp=1):
+    """The gradient and the metrics of one step on so many devices, and its parameters."""
     config = dataclasses.replace(AUGMENTED, batch=batch)
-    axis = sharding.DATA if devices else None
-    agent = leap.make_agent(DROPOUT, config, GibbsConfig(4, 4), SIZES, WORDS, axis)
-    mesh = sharding.data_mesh(batch, jax.devices()[:devices]) if devices else None
+    mesh = sharding.make_mesh(batch, jax.devices()[:devices], fsdp) if devices else None
+    agent = leap.make_agent(DROPOUT, config, GibbsConfig(4, 4), SIZES, WORDS, mesh)
     step = training.make_train_step(
-        agent, lambda key, data: leap.make_batch(key, data, config, SIZES), mesh
+        agent, lambda key, data: leap.make_batch(key, data, config, SIZES)
     )
-    state, key = jax.jit(agent.init)(jax.random.key(0)), jax.random.key(4)
-    if mesh is not None:
+    if mesh is None:
+        state, key = jax.jit(agent.init)(jax.random.key(0)), jax.random.key(0)
+    else:
         assert mesh.size == devices
-        state, data, key = sharding.replicate((state, data, key), mesh)
+        state, key = training.begin(agent, 0, mesh)
+        data = sharding.replicate(data, mesh)
+    before = jax.tree.map(lambda leaf: leaf.sharding, state)
     state, metrics = step(state, data, key)
+    assert jax.tree.map(lambda leaf: leaf.sharding, state) == before or mesh is None
     # Adam's first moment after one step from zero is the gradient times 1 - beta.
     moments = optax.tree.get(state.optimizer, "mu")
-    return jax.device_get((moments, metrics))
+    return jax.device_get((moments, metrics)), state.params
 
 
-@pytest.mark.parametrize("devices", [1, 8])
-def test_a_step_split_over_devices_is_the_step_of_one(devices, data):
-    expected, expected_metrics = gradient_step(0, data)
-    actual, metrics = gradient_step(devices, data)
+@pytest.mark.parametrize(("devices", "fsdp"), [(1, 1), (8, 1), (8, 2), (8, 8)])
+def test_a_step_split_over_devices_is_the_step_of_one(devices, fsdp, data):
+    (expected, expected_metrics), _ = gradient_step(0, data)
+    (actual, metrics), params = gradient_step(devices, data, fsdp=fsdp)
+    largest = max(jax.tree.leaves(params), key=lambda leaf: leaf.size)
+    assert largest.sharding.shard_shape(largest.shape) != largest.shape or fsdp == 1
+    assert largest.addressable_data(0).size == largest.size // fsdp
     assert any(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(expected))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), actual, expected
@@ -380,14 +386,42 @@ def test_a_step_split_over_devices_is_the_step_of_one(devices, data):
 
 def test_a_mesh_has_as_many_devices_as_split_the_batch():
     assert len(jax.devices()) == 8
-    sizes = {batch: sharding.data_mesh(batch).size for batch in (1, 2, 7, 12, 22, 64)}
+    sizes = {batch: sharding.make_mesh(batch).size for batch in (1, 2, 7, 12, 22, 64)}
     assert sizes == {1: 1, 2: 2, 7: 7, 12: 6, 22: 2, 64: 8}
     with pytest.raises(ValueError, match="at least one device"):
-        sharding.data_mesh(4, [])
+        sharding.make_mesh(4, [])
 
 
-def test_an_agent_that_does_not_average_is_refused_a_mesh():
-    for axis, mesh in ((None, sharding.data_mesh(8)), (sharding.DATA, None)):
-        agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS, axis)
-        with pytest.raises(ValueError, match="averages gradients over axis"):
-            training.make_train_step(agent, lambda key, data: data, mesh)
+@pytest.mark.parametrize(("batch", "fsdp"), [(7, 8), (12, 5), (8, 3)])
+def test_a_mesh_that_cannot_be_is_refused(batch, fsdp):
+    with pytest.raises(ValueError, match=f"a batch of {batch} and parameters split in {fsdp}"):
+        sharding.make_mesh(batch, fsdp=fsdp)
+
+
+def test_large_parameters_are_split_and_small_ones_are_not():
+    mesh = sharding.make_mesh(8, fsdp=4)
+    tree = {
+        "tall": jnp.zeros((512, 12)), "wide": jnp.zeros((6, 1024)), "odd": jnp.zeros((333, 77)),
+        "small": jnp.zeros((4, 4)), "step": jnp.int32(0),
+    }  # fmt: skip
+    specs = sharding.parameter_specs(tree, mesh)
+    assert specs["tall"] == jax.P("fsdp") and specs["wide"] == jax.P(None, "fsdp")
+    assert specs["odd"] == specs["small"] == specs["step"] == jax.P()
+    placed = sharding.place(tree, sharding.parameter_shardings(tree, mesh))
+    assert placed["wide"].addressable_data(0).shape == (6, 256)
+    assert_identical(sharding.to_host(placed), jax.device_get(tree))
+
+
+def test_a_checkpoint_goes_on_with_another_split_of_the_parameters(data, tmp_path):
+    states = {}
+    for fsdp in (1, 4):
+        mesh = sharding.make_mesh(8, fsdp=fsdp)
+        agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS, mesh)
+        states[fsdp], _ = training.begin(agent, fsdp, mesh)
+    saved = Checkpoints(tmp_path / "checkpoints")
+    saved.save(states[4])
+    saved.close()
+    restored = Checkpoints(tmp_path / "checkpoints").restore(states[1])
+    assert_identical(restored, sharding.to_host(states[4]))
+    kept = jax.tree.map(lambda leaf: leaf.sharding, restored)
+    assert kept == jax.tree.map(lambda leaf: leaf.sharding, states[1])

@@ -6,6 +6,7 @@ the least energy. Planning with it works worse than with the masked language mod
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from leapjax import planners
 from leapjax.agents import leap
@@ -15,7 +16,7 @@ from leapjax.data.windows import Window
 from leapjax.energy import classifier
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, SequenceClassifier, Sizes
-from leapjax.types import Agent, Context, Params, Plan, TrainState
+from leapjax.types import Agent, Context, Params, TrainState
 
 
 def make_agent(
@@ -24,7 +25,7 @@ def make_agent(
     planner: planners.PlannerConfig,
     sizes: Sizes,
     words: int,
-    axis: str | None = None,
+    mesh: Mesh | None = None,
 ) -> Agent:
     """The classifier as an `Agent`; the arguments are those of `leapjax.agents.leap`.
 
@@ -60,10 +61,8 @@ def make_agent(
         assert isinstance(found, jax.Array)
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
-    def act(params: Params, key: jax.Array, context: Context) -> Plan:
-        return planners.planner_for(planner)(energy, params, key, context, planner)
-
-    return Agent(init, make_update(window_loss, optimizer, axis), energy, act, axis)
+    update = make_update(window_loss, optimizer, mesh)
+    return Agent(init, update, energy, planners.bind(energy, planner))
 
 
 def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
 from leapjax import planners, schedules
 from leapjax.agents.gradients import make_update
@@ -14,7 +15,7 @@ from leapjax.energy import pseudo_likelihood
 from leapjax.envs import vocabulary
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.types import Agent, Context, Energy, Params, Plan, TrainState, mask_token
+from leapjax.types import Agent, Context, Energy, Params, TrainState, mask_token
 
 UNDECAYED = ("bias", "scale", "embedding")
 
@@ -71,7 +72,7 @@ def make_agent(
     planner: planners.PlannerConfig,
     sizes: Sizes,
     words: int,
-    axis: str | None = None,
+    mesh: Mesh | None = None,
 ) -> Agent:
     """LEAP as an `Agent`.
 
@@ -81,8 +82,7 @@ def make_agent(
         planner: the search.
         sizes: of environment and plan.
         words: L, instruction length.
-        axis: the mesh axis that batches are split over, inside `jax.shard_map`; None
-            outside of it.
+        mesh: of devices to train on (see `leapjax.sharding`); None for one device.
     """
     module = trajectory.build(model, sizes)
     optimizer = make_optimizer(training)
@@ -125,10 +125,8 @@ def make_agent(
         accuracy = jnp.where(masks, hits, 0).sum() / count
         return -jnp.where(masks, chosen, 0).sum() / count, {"accuracy": accuracy}
 
-    def act(params: Params, key: jax.Array, context: Context) -> Plan:
-        return planners.planner_for(planner)(energy, params, key, context, planner)
-
-    return Agent(init, make_update(window_loss, optimizer, axis), energy, act, axis)
+    update = make_update(window_loss, optimizer, mesh)
+    return Agent(init, update, energy, planners.bind(energy, planner))
 
 
 def make_batch(key: jax.Array, steps: Steps, training: TrainingConfig, sizes: Sizes) -> Window:

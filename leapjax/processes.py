@@ -1,0 +1,67 @@
+"""Several processes that work as one: who writes, and what all of them agree on.
+
+With one process nothing here costs anything. With more (`jax.distributed`), all of them
+call these functions, and everything that runs on the shared devices, in the same order.
+"""
+
+import json
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from leapjax.errors import UserError
+from leapjax.types import PyTree
+
+T = TypeVar("T")
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes."""
+    return jax.process_index() == 0
+
+
+def gather(value: Any) -> list[Any]:
+    """A JSON value of every process, by process."""
+    if jax.process_count() == 1:
+        return [value]
+    data = np.frombuffer(json.dumps(value).encode(), np.uint8)
+    sizes = multihost_utils.process_allgather(np.int32(data.size))
+    # Padded to a power of two: every length would be a program of its own.
+    padded = np.zeros(1 << (int(sizes.max()) - 1).bit_length(), np.uint8)
+    padded[: data.size] = data
+    rows = multihost_utils.process_allgather(padded)
+    return [json.loads(row[:size].tobytes()) for row, size in zip(rows, sizes, strict=True)]
+
+
+def together(work: Callable[[], T]) -> T:
+    """Does something on every process; what goes wrong on one stops them all.
+
+    Raises:
+        UserError: that of the first process that had one.
+    """
+    result, failure = None, None
+    try:
+        result = work()
+    except UserError as error:
+        failure = str(error)
+    failures = [text for text in gather(failure) if text is not None]
+    if failures:
+        raise UserError(failures[0])
+    return result  # type: ignore[return-value]
+
+
+def first_does(work: Callable[[], Any]) -> Any:
+    """Does something on the first process; its result, a JSON value, on all of them.
+
+    Raises:
+        UserError: that of the first process.
+    """
+    return gather(together(lambda: work() if is_first() else None))[0]
+
+
+def broadcast(tree: PyTree) -> PyTree:
+    """The first process's arrays of NumPy, on all of them; the others pass arrays like them."""
+    return multihost_utils.broadcast_one_to_all(tree)

@@ -1,0 +1,100 @@
+"""Two processes are one: the same training, the same episodes, one writer, one end."""
+
+import signal
+import socket
+
+import numpy as np
+import pytest
+
+from experiments.runtime import Cluster
+from leapjax import processes
+from leapjax.errors import UserError
+from leapjax.rollouts import Episodes, join
+from tests.programs import Place, only_long
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Where the runs of this file go, with one of a single process on two devices."""
+    place = Place(tmp_path_factory.mktemp("processes"), STEPS)
+    place.finish(place.start("whole"))
+    return place
+
+
+def start_two(place, runs, *options):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        coordinator = f"localhost:{free.getsockname()[1]}"
+    together = ("--coordinator", coordinator, "--num-processes", "2", *options)
+    return [place.start(runs, *together, "--process-id", str(i), devices=1) for i in range(2)]
+
+
+# A sum of two is the same in any order, so not even the last bit differs. Split parameters
+# are another program.
+@pytest.mark.parametrize(("fsdp", "tolerance"), [(1, 0.0), pytest.param(2, 1e-6, marks=only_long)])
+def test_two_processes_train_and_evaluate_as_one(place, fsdp, tolerance):
+    for run in start_two(place, f"two{fsdp}", "--fsdp", str(fsdp)):
+        place.finish(run)
+    place.check_same_end(f"two{fsdp}", tolerance)
+
+
+@only_long
+def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
+    runs = start_two(place, "stopped")
+    place.wait_for_checkpoint(runs[0], "stopped")
+    runs[1].send_signal(signal.SIGTERM)
+    errors = [run.communicate(timeout=100)[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0], errors
+    assert all("stopped by SIGTERM; continue with" in error for error in errors)
+    # A checkpoint does not know how many processes wrote it.
+    place.finish(place.start("stopped"))
+    place.check_same_end("stopped")
+
+
+def test_what_one_process_refuses_is_refused_by_all_before_any_work(place):
+    runs = start_two(place, "refused", "--batch", "5")
+    errors = [run.communicate(timeout=100)[1] for run in runs]
+    assert [run.returncode for run in runs] == [2, 2]
+    assert all("a batch of 5" in error and "2 process(es)" in error for error in errors)
+    assert not (place.folder / "refused").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"coordinator": "a:1"}, "are given together"),
+        ({"process_id": 0, "num_processes": 2}, "are given together"),
+        ({"coordinator": "a:1", "process_id": 2, "num_processes": 2}, "expected 0 to 1"),
+        ({"coordinator": "a", "process_id": 0, "num_processes": 2}, "expected host:port"),
+        ({"fsdp": 0}, "fsdp must be at least 1"),
+    ],
+)
+def test_processes_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Cluster(**options)
+
+
+def test_alone_a_process_agrees_with_itself():
+    assert processes.is_first()
+    assert processes.gather({"a": 1}) == [{"a": 1}]
+    assert processes.first_does(lambda: 3) == processes.together(lambda: 3) == 3
+
+    def refuse():
+        raise UserError("no")
+
+    for ask in (processes.first_does, processes.together):
+        with pytest.raises(UserError, match="no"):
+            ask(refuse)
+
+
+def test_episodes_that_were_played_side_by_side_are_joined_in_order():
+    seeds = np.arange(5)
+    whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, 9, 2.0, 3.0)
+    parts = [
+        Episodes(seeds[:2], whole.successes[:2], whole.lengths[:2], 4, 1.0, 3.0),
+        Episodes(seeds[2:], whole.successes[2:], whole.lengths[2:], 5, 2.0, 2.5),
+    ]
+    for field, expected in zip(join(parts), whole, strict=True):
+        np.testing.assert_array_equal(field, expected)
