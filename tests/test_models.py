@@ -1,5 +1,7 @@
+import dataclasses
 import functools
 import heapq
+import re
 
 import jax
 import jax.numpy as jnp
@@ -407,6 +409,46 @@ def test_a_goal_that_is_not_available_is_nowhere():
     assert not np.asarray(encoders.one_cell(np.array([-1, -1]), SIDE)).any()
     image = np.ones((SIDE, SIDE, 2), np.float32)
     np.testing.assert_array_equal(encoders.feature_at(image, np.array([-1, -1])), [0, 0])
+
+
+# Lower precision.
+
+
+@EACH_ARCHITECTURE
+def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
+    sizes = Sizes(SIDE, VOCABULARY, ACTIONS, 2, HORIZON, MAX_STEPS)
+    config = ModelConfig(
+        architecture, layers=2, heads=2, width=16, channels=8, rounds=1, fields=2, sweeps=5
+    )
+    params, _ = model(architecture, 2)
+    context = random_context(0, 2)
+    actions = jnp.zeros(HORIZON, jnp.int32)
+
+    def everything(module, context, actions):
+        return module.logits(module.encode(context), actions, EVERYWHERE)
+
+    found = {}
+    for dtype in ("float32", "bfloat16"):
+        module = build(dataclasses.replace(config, dtype=dtype), sizes)
+        shapes = jax.eval_shape(
+            functools.partial(module.init, method=everything), jax.random.key(0), context, actions
+        )
+        assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
+        run = jax.jit(functools.partial(module.apply, method=everything))
+        found[dtype] = np.asarray(run(params, context, actions))[:, :-1]  # the end may be -inf
+        products = re.findall(
+            r"stablehlo.dot_general.*-> tensor<[^>]*x(\w+)>",
+            run.lower(params, context, actions).as_text(),
+        )
+        assert products and ("bf16" in products) == (dtype == "bfloat16")
+    assert found["bfloat16"].dtype == np.float32
+    difference = np.abs(found["bfloat16"] - found["float32"]).max()
+    assert 0 < difference < 0.05 * np.abs(found["float32"]).max()
+
+
+def test_unknown_precision_is_refused():
+    with pytest.raises(ValueError, match="unknown dtype 'float16': .* float32, bfloat16"):
+        ModelConfig(dtype="float16")
 
 
 # Mistakes.

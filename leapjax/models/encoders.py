@@ -10,6 +10,7 @@ import functools
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.typing import Dtype
 
 from leapjax.types import Observation
 
@@ -34,12 +35,13 @@ class Convolution(nn.Module):
     features: int
     side: int = 3
     padding: tuple[int, int] = (1, 1)
+    dtype: Dtype = jnp.float32  # of the matrix product; parameters are float32
 
     @nn.compact
     def __call__(self, image: jax.Array) -> jax.Array:
         """`[X, Y, C]` to `[X', Y', features]`."""
         kernel_init = nn.initializers.he_normal()
-        return nn.Dense(self.features, kernel_init=kernel_init)(
+        return nn.Dense(self.features, dtype=self.dtype, kernel_init=kernel_init)(
             patches(image, self.side, self.padding)
         )
 
@@ -88,19 +90,20 @@ class FiLMBlock(nn.Module):
     """Two convolutions modulated by a condition (paper: ExpertControllerFiLM)."""
 
     width: int
+    dtype: Dtype = jnp.float32
 
     @nn.compact
     def __call__(self, image: jax.Array, condition: jax.Array) -> jax.Array:
         """`[X, Y, C]` and `[D]` to `[X, Y, width]`."""
-        h = nn.relu(channel_norm()(Convolution(self.width)(image)))
-        h = Convolution(self.width)(h)
+        h = Convolution(self.width, dtype=self.dtype)(image)
+        h = Convolution(self.width, dtype=self.dtype)(nn.relu(channel_norm(self.dtype)(h)))
         scale, shift = nn.Dense(self.width)(condition), nn.Dense(self.width)(condition)
-        return nn.relu(channel_norm()(h * scale + shift))
+        return nn.relu(channel_norm(self.dtype)(h * scale + shift))
 
 
-def channel_norm() -> nn.GroupNorm:
+def channel_norm(dtype: Dtype) -> nn.GroupNorm:
     """Normalisation that needs no batch, where the authors' code has batch norm."""
-    return nn.GroupNorm(num_groups=8)
+    return nn.GroupNorm(num_groups=8, dtype=dtype)
 
 
 class PaperStateEncoder(nn.Module):
@@ -108,29 +111,35 @@ class PaperStateEncoder(nn.Module):
 
     side: int
     width: int
+    dtype: Dtype = jnp.float32
 
     @nn.compact
     def __call__(self, observation: Observation, instruction: jax.Array) -> jax.Array:
         """One state and the encoded instruction `[D]` to the state's token `[width]`."""
-        image = observation.grid.astype(jnp.float32)
-        h = nn.relu(channel_norm()(Convolution(self.width, 2)(image)))
+
+        def layer(h: jax.Array, side: int) -> jax.Array:
+            h = Convolution(self.width, side, dtype=self.dtype)(h)
+            return nn.relu(channel_norm(self.dtype)(h))
+
+        h = layer(observation.grid.astype(jnp.float32), 2)
         h = nn.max_pool(h, (2, 2), (2, 2))
-        h = nn.relu(channel_norm()(Convolution(self.width, 3)(h)))
+        h = layer(h, 3)
         if self.side >= 7:  # of a smaller grid no map would be left
             h = nn.max_pool(h, (2, 2), (2, 2))
         if self.side >= 16:  # "may vary a little depending on the environment size"
-            h = nn.max_pool(nn.relu(channel_norm()(Convolution(self.width, 3)(h))), (2, 2), (2, 2))
+            h = nn.max_pool(layer(h, 3), (2, 2), (2, 2))
         for _ in range(2):
-            h = FiLMBlock(self.width)(h, instruction)
+            h = FiLMBlock(self.width, self.dtype)(h, instruction)
         state = StateEncoder(self.side, self.width)(observation)
         for _ in range(2):
-            h = FiLMBlock(self.width)(h, state)
+            h = FiLMBlock(self.width, self.dtype)(h, state)
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
 
 
-def _convolution(features: int, name: str) -> nn.Conv:
+def _convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:
     """A 3x3 convolution with padding, by XLA."""
-    return nn.Conv(features, (3, 3), kernel_init=nn.initializers.he_normal(), name=name)
+    init = nn.initializers.he_normal()
+    return nn.Conv(features, (3, 3), dtype=dtype, kernel_init=init, name=name)
 
 
 class GridEncoder(nn.Module):
@@ -147,6 +156,7 @@ class GridEncoder(nn.Module):
     fields: int  # distance fields
     sweeps: int  # rounds of distances: how far a way can lead
     rounds: int  # rounds of convolutions, which share their weights
+    dtype: Dtype = jnp.float32  # of the convolutions; distances are float32
 
     @nn.compact
     def __call__(
@@ -159,7 +169,7 @@ class GridEncoder(nn.Module):
             agent: `[2]` its cell.
             goal: `[2]` its cell; (-1, -1) where it is not available.
         """
-        local = nn.relu(_convolution(self.channels, "local")(cells))
+        local = nn.relu(_convolution(self.channels, "local", self.dtype)(cells))
         bias = nn.initializers.constant(1.0)
         cost = nn.softplus(nn.Dense(self.fields, bias_init=bias, name="cost")(local))
         from_goal = (1 - one_cell(goal, cells.shape[0]))[..., None] * FAR
@@ -174,8 +184,9 @@ class GridEncoder(nn.Module):
         # Locally only differences matter: measured from the agent, and squashed.
         here = feature_at(distance, agent)
         relative = jnp.tanh((distance - here) / 4)
-        source = _convolution(self.channels, "source")(jnp.concatenate([cells, relative], axis=-1))
-        step = _convolution(self.channels, "step")
+        both = jnp.concatenate([cells, relative], axis=-1)
+        source = _convolution(self.channels, "source", self.dtype)(both)
+        step = _convolution(self.channels, "step", self.dtype)
         h = nn.relu(source)
         for _ in range(self.rounds):
             h = nn.relu(step(h) + source)

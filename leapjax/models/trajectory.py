@@ -17,6 +17,7 @@ from leapjax.models.transformer import Transformer, dense
 from leapjax.types import Context, Observation, PyTree
 
 ARCHITECTURES = ("paper", "leapjax")
+DTYPES = ("float32", "bfloat16")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,7 @@ class ModelConfig:
     fields: int = 8  # leapjax: learned distance fields
     sweeps: int = 16  # leapjax: rounds of value iteration that make them
     radius: int = 3  # leapjax: how far around the agent its cells are read one by one
+    dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
 
     def __post_init__(self) -> None:
         if self.architecture not in ARCHITECTURES:
@@ -40,6 +42,8 @@ class ModelConfig:
                 f"unknown architecture {self.architecture!r}: "
                 f"expected one of {', '.join(ARCHITECTURES)}"
             )
+        if self.dtype not in DTYPES:
+            raise ValueError(f"unknown dtype {self.dtype!r}: expected one of {', '.join(DTYPES)}")
         if self.width % self.heads:
             raise ValueError(f"width {self.width} is not a multiple of {self.heads} heads")
 
@@ -76,13 +80,13 @@ class PaperModel(nn.Module):
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
         self.instruction = encoders.InstructionEncoder(sizes.vocabulary, c.width)
-        self.state = encoders.PaperStateEncoder(sizes.side, c.width)
+        self.state = encoders.PaperStateEncoder(sizes.side, c.width, c.dtype)
         self.action = _embed(sizes.num_actions + 2, c.width)
         tokens = 2 * (sizes.context + sizes.horizon)
         self.position = nn.Embed(tokens, c.width, embedding_init=nn.initializers.zeros)
         steps = sizes.max_steps + sizes.horizon + 1
         self.time = nn.Embed(steps, c.width, embedding_init=nn.initializers.zeros)
-        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout)
+        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
@@ -141,7 +145,9 @@ class ContextTokens(nn.Module):
             visits = self._visits(context, direction)
             cells += nn.Dense(c.channels, use_bias=False, name="visited")(visits)
         scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction), 2)
-        encoder = encoders.GridEncoder(c.channels, c.fields, c.sweeps, c.rounds, name="grid")
+        encoder = encoders.GridEncoder(
+            c.channels, c.fields, c.sweeps, c.rounds, c.dtype, name="grid"
+        )
         grid, distances = encoder(
             cells * (1 + scale) + shift, observation.pose[:2], observation.goal
         )
@@ -194,7 +200,7 @@ class LeapModel(nn.Module):
         self.context = ContextTokens(c, sizes)
         self.action = _embed(sizes.num_actions + 2, c.width)
         self.position = _embed(sizes.horizon, c.width)
-        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout)
+        self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 

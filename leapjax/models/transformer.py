@@ -11,6 +11,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.typing import Dtype
 
 WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
 
@@ -23,30 +24,40 @@ class KeysValues(NamedTuple):
 
 
 def dense(
-    features: int, use_bias: bool = True, scale: float = WEIGHT_SCALE, name: str | None = None
+    features: int,
+    use_bias: bool = True,
+    scale: float = WEIGHT_SCALE,
+    name: str | None = None,
+    dtype: Dtype | None = None,
 ) -> nn.Dense:
     """A linear layer with the initialisation of this transformer."""
-    return nn.Dense(features, use_bias, kernel_init=nn.initializers.normal(scale), name=name)
+    init = nn.initializers.normal(scale)
+    return nn.Dense(features, use_bias, dtype=dtype, kernel_init=init, name=name)
 
 
 class Block(nn.Module):
-    """One layer: attention, then a two-layer perceptron, each on a normalised residual."""
+    """One layer: attention, then a two-layer perceptron, each on a normalised residual.
+
+    With a `dtype` of lower precision the matrix products have it, as have keys and values;
+    parameters, the residual, the statistics of norms and the softmax stay float32.
+    """
 
     width: int  # D
     heads: int
     dropout: float
     activation: Callable[[jax.Array], jax.Array]
+    dtype: Dtype
 
     def setup(self) -> None:  # noqa: D102
-        self.norm_attention = nn.LayerNorm()
-        self.query = dense(self.width)
+        self.norm_attention = nn.LayerNorm(dtype=self.dtype)
+        self.query = dense(self.width, dtype=self.dtype)
         # A key bias shifts all scores of a query alike, so softmax cannot see it.
-        self.key = dense(self.width, use_bias=False)
-        self.value = dense(self.width)
-        self.output = dense(self.width)
-        self.norm_perceptron = nn.LayerNorm()
-        self.expand = dense(4 * self.width)
-        self.contract = dense(self.width)
+        self.key = dense(self.width, use_bias=False, dtype=self.dtype)
+        self.value = dense(self.width, dtype=self.dtype)
+        self.output = dense(self.width, dtype=self.dtype)
+        self.norm_perceptron = nn.LayerNorm(dtype=self.dtype)
+        self.expand = dense(4 * self.width, dtype=self.dtype)
+        self.contract = dense(self.width, dtype=self.dtype)
         self.drop = nn.Dropout(self.dropout)
 
     def keys_values(self, x: jax.Array) -> KeysValues:
@@ -59,11 +70,12 @@ class Block(nn.Module):
     ) -> jax.Array:
         """Tokens `[Q, D]` after this layer, attending to `memory` where `mask [Q, M]` is."""
         queries = self._heads(self.query(self.norm_attention(x)))
-        scores = jnp.einsum("qhd,mhd->hqm", queries, memory.keys)
+        scores = jnp.einsum("qhd,mhd->hqm", queries, memory.keys).astype(jnp.float32)
         scores /= jnp.sqrt(self.width / self.heads)
         if mask is not None:
             scores = jnp.where(mask, scores, -1e30)
         weights = self.drop(jax.nn.softmax(scores, axis=-1), deterministic=deterministic)
+        weights = weights.astype(self.dtype)
         attended = jnp.einsum("hqm,mhd->qhd", weights, memory.values).reshape(x.shape)
         x = x + self.drop(self.output(attended), deterministic=deterministic)
         h = self.contract(self.activation(self.expand(self.norm_perceptron(x))))
@@ -81,10 +93,12 @@ class Transformer(nn.Module):
     heads: int
     dropout: float = 0.0
     activation: Callable[[jax.Array], jax.Array] = nn.gelu
+    dtype: Dtype = jnp.float32
 
     def setup(self) -> None:  # noqa: D102
         self.blocks = [
-            Block(self.width, self.heads, self.dropout, self.activation) for _ in range(self.layers)
+            Block(self.width, self.heads, self.dropout, self.activation, self.dtype)
+            for _ in range(self.layers)
         ]
         self.norm = nn.LayerNorm()
 
