@@ -13,6 +13,7 @@ import tyro
 from experiments.runtime import Cluster
 from leapjax import pretrained
 from leapjax.agents.leap import TrainingConfig
+from leapjax.data import seeds
 from leapjax.envs import levels
 from leapjax.envs.levels import Level
 from leapjax.errors import UserError
@@ -167,6 +168,14 @@ def check(config: Config) -> None:
             raise UserError(f"--{name} must be at least 1, got {getattr(config, name)}")
     if not config.seeds:
         raise UserError("--seeds needs at least one seed")
+    for seed in config.seeds:
+        seeds.training_seeds(seed)
+    first = seeds.validation_seeds if config.validation else seeds.test_seeds
+    first(config.test_seed, config.episodes)
+    if config.demos > seeds.TRAINING_STRIDE:
+        raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
+    if not config.checkpoint_seconds >= 0:
+        raise UserError(f"--checkpoint-seconds must be at least 0, got {config.checkpoint_seconds}")
     if config.context < 0:
         raise UserError(f"--context must be at least 0, got {config.context}")
     if config.executed is not None and not 1 <= config.executed <= config.planner.horizon:

@@ -31,7 +31,7 @@ from leapjax.data.demonstrations import Demonstration
 from leapjax.envs import vocabulary
 from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import Level
-from leapjax.errors import UserError
+from leapjax.errors import UserError, first_line
 from leapjax.models.trajectory import Sizes
 from leapjax.planners import compile_planner
 from leapjax.pretrained import Pretrained, Specification
@@ -292,9 +292,22 @@ def write_metrics(folder: Path, metrics: Metrics) -> None:
 
 
 def read_metrics(folder: Path) -> Metrics:
-    """The training curve so far."""
+    """The training curve so far.
+
+    Raises:
+        UserError: the file is damaged.
+    """
     path = folder / "metrics.csv"
     if not path.exists():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return [{k: float(v) for k, v in entry.items()} for entry in csv.DictReader(file)]
+    lines = files.read_text(path).splitlines()
+    try:
+        metrics = [{k: float(v) for k, v in entry.items()} for entry in csv.DictReader(lines)]
+        if any(not entry.keys() >= {"step", "seconds", "loss"} for entry in metrics):
+            raise ValueError("a column is missing")
+    except (TypeError, ValueError, csv.Error) as error:
+        raise UserError(
+            f"{path} is damaged ({first_line(error)}): remove it, and the run goes on with a "
+            "training curve that begins here"
+        ) from None
+    return metrics

@@ -12,10 +12,16 @@ from rich.table import Table
 
 from leapjax import scores
 from leapjax.errors import UserError
-from leapjax.files import only_process_in, write_text
+from leapjax.files import only_process_in, read_text, write_text
 
 Row = dict[str, Any]
-REQUIRED = ("experiment", "level", "method", "preset", "seed", "episodes", "successes", "hash")
+# What tables are made from; a float may be written as an integer.
+FIELDS = {
+    "experiment": str, "level": str, "method": str, "preset": str, "hash": str,
+    "seed": int, "episodes": int, "successes": int, "mean_length": float,
+    "demos_seconds": float, "compile_seconds": float, "train_seconds": float,
+    "eval_seconds": float, "plans_per_second": float,
+}  # fmt: skip
 
 
 def read(path: Path) -> list[Row]:
@@ -27,18 +33,36 @@ def read(path: Path) -> list[Row]:
     if not path.exists():
         return []
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    # Split where JSON lines are: other kinds of line end may be inside of a text.
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line.strip():
             continue
         try:
             row = json.loads(line)
         except (ValueError, RecursionError):
             raise UserError(f"{path}, line {number}: not JSON") from None
-        missing = [k for k in REQUIRED if not isinstance(row, dict) or k not in row]
-        if missing:
-            raise UserError(f"{path}, line {number}: a row without {', '.join(missing)}")
+        wrong = _what_is_wrong(row)
+        if wrong:
+            raise UserError(f"{path}, line {number}: {wrong}")
         rows.append(row)
     return rows
+
+
+def _what_is_wrong(row: Any) -> str | None:
+    if not isinstance(row, dict):
+        return f"expected a JSON object, got {type(row).__name__}"
+    missing = [name for name in FIELDS if name not in row]
+    if missing:
+        return f"a row without {', '.join(missing)}"
+    optional = {} if row.get("paper_success") is None else {"paper_success": float}
+    for name, kind in {**FIELDS, **optional}.items():
+        value = row[name]
+        expected = (int, float) if kind is float else kind
+        if not isinstance(value, expected) or isinstance(value, bool):
+            return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
+    if not 0 <= row["successes"] <= row["episodes"] or row["episodes"] < 1:
+        return f"{row['successes']} successes of {row['episodes']} episodes"
+    return None
 
 
 def record(path: Path, row: Row) -> None:

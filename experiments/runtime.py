@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import os
 import platform
 import sys
@@ -56,6 +57,9 @@ def start(cluster: Cluster = Cluster()) -> None:
     Raises:
         UserError: the other processes cannot be reached.
     """
+    # Of a damaged checkpoint many parts fail at once. We say so in one line; asyncio would log
+    # each of them that nobody asked for, with its traceback.
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
     use_every_core()
     use_compilation_cache()
     connect(cluster)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import logging
 import shutil
@@ -19,6 +20,7 @@ import orbax.checkpoint as ocp
 
 from leapjax import processes, sharding
 from leapjax.errors import UserError, first_line
+from leapjax.files import read_text
 from leapjax.types import PyTree, TrainState
 
 ITEM = "default"  # Orbax's name for the only thing that a checkpoint of ours holds
@@ -66,7 +68,7 @@ class Checkpoints:
 
         def write() -> None:
             with self._writing():
-                arguments = ocp.args.StandardSave(values._asdict())
+                arguments = ocp.args.StandardSave(_with_digests(values._asdict()))
                 self._manager.save(int(values.step), args=arguments)
 
         processes.first_does(write)
@@ -102,9 +104,10 @@ class Checkpoints:
         while (latest := self._manager.latest_step()) is not None:
             path = self._folder / str(latest)
             try:
-                _check_shapes(_saved_shapes(path), like._asdict(), path)
-                arguments = ocp.args.StandardRestore(like._asdict())
-                return [TrainState(**self._manager.restore(latest, args=arguments))]
+                target = _with_digests(like._asdict())
+                _check_shapes(_saved_shapes(path), target, path)
+                arguments = ocp.args.StandardRestore(target)
+                return [TrainState(**_checked(self._manager.restore(latest, args=arguments)))]
             except UserError:
                 raise
             except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
@@ -162,7 +165,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
         try:
             _check_shapes(_saved_shapes(path, "params"), like, path)
             blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
-            target = {"params": blank}
+            target = _with_digests({"params": blank})
             arguments = ocp.checkpoint_utils.construct_restore_args(target)
             with ocp.PyTreeCheckpointer() as checkpointer:
                 restored = checkpointer.restore(
@@ -171,6 +174,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
                         target, restore_args=arguments, partial_restore=True
                     ),
                 )
+            params = _checked(restored)["params"]
         except UserError:
             raise
         except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
@@ -178,20 +182,51 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
         else:
             for reason in reasons:
                 warnings.warn(f"{reason}: using step {step}", stacklevel=2)
-            return jax.tree.map(jnp.asarray, restored["params"])
+            return jax.tree.map(jnp.asarray, params)
     raise UserError("; ".join(reasons))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps from the log what Orbax has to say of files that ours do not have."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _with_digests(parts: dict[str, PyTree]) -> dict[str, PyTree]:
+    """The parts of a state, each with the SHA-256 of its arrays beside it.
+
+    The format underneath notices damage to its own structure, not to the numbers.
+    """
+    return {**parts, "digests": {name: _digest(part) for name, part in parts.items()}}
+
+
+def _checked(saved: dict[str, PyTree]) -> dict[str, PyTree]:
+    """The parts alone, if their arrays are those that were saved."""
+    parts = {name: part for name, part in saved.items() if name != "digests"}
+    for name, part in parts.items():
+        if not np.array_equal(_digest(part), saved["digests"][name]):
+            raise ValueError(f"the numbers of {name} are not those that were saved")
+    return parts
+
+
+def _digest(tree: PyTree) -> np.ndarray:
+    """`[32]` uint8."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
 
 
 def _saved_shapes(checkpoint: Path, part: str | None = None) -> dict[str, tuple[int, ...]]:
     """The shapes of the arrays in a checkpoint, by their place in the tree."""
-    logger = logging.getLogger("absl")  # Orbax warns of files that ours do not have
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with ocp.PyTreeCheckpointer() as checkpointer:
-            metadata = checkpointer.metadata(checkpoint / ITEM).item_metadata
-    finally:
-        logger.setLevel(level)
+    with _quiet(), ocp.PyTreeCheckpointer() as checkpointer:
+        metadata = checkpointer.metadata(checkpoint / ITEM).item_metadata
     if metadata is None:
         raise ValueError("it has no readable metadata")
     tree = metadata.tree
@@ -265,9 +300,8 @@ def read_json(path: Path) -> Any:
     Raises:
         UserError: it is missing or is not JSON.
     """
+    text = read_text(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not valid JSON ({error})") from None
+        raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None

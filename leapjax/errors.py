@@ -1,8 +1,16 @@
 """The one exception for a user's mistake: programs print it as one line and exit with 2."""
 
+LONGEST = 2000  # characters
+
 
 class UserError(ValueError):
-    """Input that cannot be used: says what was wrong, what was expected, what to do."""
+    """Input that cannot be used: says what was wrong, what was expected, what to do.
+
+    It is one line, whatever the input that it quotes.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split())[:LONGEST])
 
 
 def first_line(error: Exception) -> str:

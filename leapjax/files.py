@@ -13,6 +13,18 @@ except ImportError:  # not on Windows: there, nothing keeps two processes apart
     fcntl = None  # type: ignore[assignment]
 
 
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        UserError: it cannot be read, or is not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {first_line(error)}") from None
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes a file so that a reader sees all of it or the one before.
 

@@ -1,6 +1,7 @@
 """LEAP: train a masked language model on demonstrations, plan by Gibbs sampling."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,15 @@ class TrainingConfig:
         for name in ("steps", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        ranges = {
+            "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
+            "warmup": (0, math.inf), "clip": (0, math.inf),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:  # false for NaN too
+                raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ValueError(f"betas must be in [0, 1), got {self.betas}")
         if self.masking not in schedules.MASKINGS:
             raise ValueError(
                 f"unknown masking {self.masking!r}: expected one of {', '.join(schedules.MASKINGS)}"

@@ -3,12 +3,16 @@
 A data set of the user's own, of the same observations, is read in the same way.
 """
 
+import json
+import math
 import os
 import shutil
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
+import h5py
 import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
@@ -21,6 +25,7 @@ from leapjax.envs.levels import Level
 from leapjax.errors import UserError, first_line
 from leapjax.types import Observation
 
+LARGEST_SPACE = 10_000_000  # elements
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
 FORMAT = 1  # raised whenever what a demonstration holds changes: old caches are then unused
 
@@ -102,6 +107,7 @@ def load(name: str, level: Level, side: int) -> list[Demonstration]:
             "check the id with `minari list local`"
         )
     try:
+        _inspect(get_dataset_path(name) / "data")
         dataset = minari.load_dataset(name)
         episodes = list(dataset.iterate_episodes())
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
@@ -123,6 +129,63 @@ def load(name: str, level: Level, side: int) -> list[Demonstration]:
         seed = int(details.get("seed", UNKNOWN_SEED))
         demonstrations.append(Demonstration(states, actions.astype(np.int32), seed))
     return demonstrations
+
+
+def _inspect(folder: Path) -> None:
+    """Refuses what must not even be opened by Minari and HDF5.
+
+    Without its spaces Minari makes the environment that the data names, which runs code of
+    the data's choice. Sizes that are only claimed, and files elsewhere that are linked to,
+    would be read.
+
+    Raises:
+        ValueError: says what.
+    """
+    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+    if not isinstance(metadata, dict):
+        raise ValueError("metadata.json is not a JSON object")
+    if metadata.get("data_format") != "hdf5":
+        raise ValueError(f"its format is {metadata.get('data_format')!r}, expected 'hdf5'")
+    for name in ("observation_space", "action_space"):
+        if not isinstance(metadata.get(name), str):
+            raise ValueError(f"metadata.json has no {name}")
+        _check_sizes(json.loads(metadata[name]))
+    with h5py.File(folder / "main_data.hdf5") as file:
+        total = metadata.get("total_episodes")
+        if not isinstance(total, int) or not 0 <= total <= len(file):
+            raise ValueError(f"{total} episodes are announced, {len(file)} are there")
+        _check_group(file)
+
+
+def _check_sizes(space: Any) -> None:
+    """No space may ask for more than a picture's worth of bounds."""
+    if isinstance(space, dict):
+        for key in ("shape", "n"):
+            numbers = space.get(key)
+            sizes = numbers if isinstance(numbers, list) else [numbers]
+            sizes = [size for size in sizes if isinstance(size, int)]
+            if space.get("type") != "Discrete" and math.prod(sizes) > LARGEST_SPACE:
+                raise ValueError(f"a space of shape {numbers}")
+        space = list(space.values())
+    if isinstance(space, list):
+        for part in space:
+            _check_sizes(part)
+
+
+def _check_group(group: h5py.Group) -> None:
+    for name in group:
+        link = group.get(name, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{name} is a link to somewhere else")
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            _check_group(item)
+            continue
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
+            raise ValueError(f"{name} is not an array of this file")
+        # gzip makes at most 1 byte of 1032.
+        if item.nbytes > 1032 * item.id.get_storage_size() + 1024:
+            raise ValueError(f"{name} claims {item.nbytes} bytes, which are not there")
 
 
 def _observation(fields: object, where: str) -> Observation:
@@ -187,13 +250,7 @@ def _check_episode(
 def _rename_id(path: Path, old: str, new: str) -> None:
     """Minari keeps the id inside the data set too."""
     metadata = path / "data" / "metadata.json"
-    if metadata.exists():
-        metadata.write_text(metadata.read_text().replace(old, new))
-    else:
-        import h5py  # noqa: PLC0415  (only where Minari stored HDF5)
-
-        with h5py.File(path / "data" / "main_data.hdf5", "r+") as file:
-            file.attrs["dataset_id"] = new
+    metadata.write_text(metadata.read_text().replace(old, new))
 
 
 def exists(name: str) -> bool:

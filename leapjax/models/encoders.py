@@ -17,6 +17,7 @@ from leapjax.types import Observation
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
 OBJECTS, COLOURS, STATES = 11, 6, 4
 DIRECTIONS = 4
+NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
 _OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
 
@@ -103,7 +104,7 @@ class FiLMBlock(nn.Module):
 
 def channel_norm(dtype: Dtype) -> nn.GroupNorm:
     """Normalisation that needs no batch, where the authors' code has batch norm."""
-    return nn.GroupNorm(num_groups=8, dtype=dtype)
+    return nn.GroupNorm(num_groups=NORM_GROUPS, dtype=dtype)
 
 
 class PaperStateEncoder(nn.Module):

@@ -42,10 +42,21 @@ class ModelConfig:
                 f"unknown architecture {self.architecture!r}: "
                 f"expected one of {', '.join(ARCHITECTURES)}"
             )
+        sizes = ("layers", "heads", "width", "channels", "fields", "sweeps")
+        for name, least in {**dict.fromkeys(sizes, 1), "rounds": 0, "radius": 0}.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
         if self.dtype not in DTYPES:
             raise ValueError(f"unknown dtype {self.dtype!r}: expected one of {', '.join(DTYPES)}")
         if self.width % self.heads:
             raise ValueError(f"width {self.width} is not a multiple of {self.heads} heads")
+        if self.architecture == "paper" and self.width % encoders.NORM_GROUPS:
+            raise ValueError(
+                f"width {self.width} is not a multiple of {encoders.NORM_GROUPS}, the groups of "
+                "channels that the paper's encoder normalises"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

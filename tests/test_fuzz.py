@@ -1,0 +1,407 @@
+"""Damaged and adversarial input: a correct load or one line that says what is wrong.
+
+Never a traceback, a hang, much memory, or code that the data chose. `make test-long` tries
+thousands of cases; the suite tries some.
+"""
+
+import contextlib
+import copy
+import io
+import json
+import resource
+import shutil
+import signal
+import tempfile
+import warnings
+from pathlib import Path
+
+import h5py
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from experiments import config, pipeline, results
+from leapjax import checkpoints, pretrained
+from leapjax.checkpoints import Checkpoints
+from leapjax.data import storage
+from leapjax.data.demonstrations import Collection
+from leapjax.envs import levels
+from leapjax.errors import UserError
+from leapjax.types import TrainState
+from tests.programs import LONG
+from tests.test_storage import LEVEL, NAME, SIDE, assert_same
+
+SECONDS = 20  # nothing that is read here takes a tenth of a second
+MEBIBYTES = 512
+CASES = 600 if LONG else 25  # for each of seven kinds of input
+
+
+# The same cases every time.
+cases = settings(
+    max_examples=CASES, derandomize=True, database=None, deadline=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+
+
+class Hang(BaseException):
+    """What a reader does that does not come back. Nothing catches it by mistake."""
+
+
+@contextlib.contextmanager
+def bounded():
+    """Fails what takes long or much memory."""
+
+    def hang(*_):
+        raise Hang
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    previous = signal.signal(signal.SIGALRM, hang)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    assert grown < MEBIBYTES, f"{grown:.0f} MiB more"
+
+
+def outcome(read):
+    """What a reader returns, or None where it refused in one line."""
+    with bounded():
+        try:
+            return read()
+        except UserError as error:
+            assert str(error) and "\n" not in str(error)
+            return None
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """Truncated, with bits flipped, bytes overwritten, or a part repeated, moved or zeroed."""
+    data = bytearray(data)
+    if not data:
+        return b"\x00"
+    at = int(rng.integers(len(data)))
+    length = int(rng.integers(1, min(len(data), 2000) + 1))
+    kind = rng.integers(7)
+    if kind == 0:
+        return bytes(data[:at])
+    if kind == 1:
+        for place in rng.integers(len(data), size=rng.integers(1, 9)):
+            data[place] ^= 1 << int(rng.integers(8))
+    elif kind == 2:
+        data[at : at + length] = rng.bytes(length)
+    elif kind == 3:
+        data[at : at + length] = bytes(length)
+    elif kind == 4:
+        data[at:at] = data[at : at + length] * int(rng.integers(1, 50))
+    elif kind == 5:
+        del data[at : at + length]
+    else:  # a length or an address that claims very much
+        width = int(rng.choice([2, 4, 8]))
+        data[at : at + width] = b"\xff" * (width - 1) + b"\x7f"
+    return bytes(data)
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20)
+    | st.sampled_from([10**30, -1, 1e308, "x" * 10_000, "\ud800", "../../etc", "__class__"]),
+    lambda inner: st.lists(inner, max_size=4)
+    | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+)  # fmt: skip
+
+
+def places(value, path=()):
+    """The paths of everything in a JSON value."""
+    found = [path]
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            found += places(inner, (*path, key))
+    return found
+
+
+@st.composite
+def changed_json(draw, original):
+    """A JSON value some of whose parts were replaced, removed or added; or its damaged text."""
+    if draw(st.integers(0, 2)) == 0:
+        text = damaged(json.dumps(original).encode(), np.random.default_rng(draw(SEEDS)))
+        return draw(st.sampled_from([text, b"[" * 100_000, b"\xff\xfe", b"", text * 2]))
+    value = copy.deepcopy(original)
+    for _ in range(draw(st.integers(1, 3))):
+        path = draw(st.sampled_from(places(value)))
+        if not path:
+            return json.dumps(draw(JSON)).encode()
+        parent = value
+        for key in path[:-1]:
+            parent = parent[key]
+        if draw(st.booleans()):
+            parent[path[-1]] = draw(JSON)
+        elif isinstance(parent, dict):
+            del parent[path[-1]]
+            parent[draw(st.text(max_size=8))] = draw(JSON)
+    return json.dumps(value).encode()
+
+
+# Demonstrations.
+
+
+@pytest.fixture(scope="module")
+def data_set(local_demonstrations, tmp_path_factory):
+    """A Minari data set, whole, in a Minari folder of its own."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MINARI_DATASETS_PATH", str(folder))
+        storage.save(NAME, Collection(local_demonstrations), "for a test")
+    return folder
+
+
+def read_data_set(whole, change):
+    """What comes of a changed copy of the data set."""
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        copied = Path(folder) / "datasets"
+        shutil.copytree(whole, copied)
+        change(copied / NAME / "data")
+        patch.setenv("MINARI_DATASETS_PATH", str(copied))
+        return outcome(lambda: storage.load(NAME, LEVEL, SIDE))
+
+
+@cases
+@given(seed=SEEDS)
+def test_damaged_arrays(data_set, seed):
+    def change(folder):
+        path = folder / "main_data.hdf5"
+        path.write_bytes(damaged(path.read_bytes(), np.random.default_rng(seed)))
+
+    loaded = read_data_set(data_set, change)
+    for demonstration in loaded or []:
+        # HDF5 keeps no checksums: what is loaded need not be what was saved, but it is sound.
+        grid, actions = demonstration.observations.grid, demonstration.actions
+        assert grid.shape == (len(actions) + 1, SIDE, SIDE, 3) and len(actions) > 0
+        assert actions.min() >= 0 and actions.max() < 7 and grid[..., 0].max() <= 10
+
+
+@cases
+@given(data=st.data())
+def test_damaged_metadata(data_set, data):
+    def change(folder):
+        path = folder / "metadata.json"
+        original = json.loads(path.read_text())
+        for name in ("observation_space", "action_space"):
+            if data.draw(st.booleans()):
+                text = data.draw(changed_json(json.loads(original[name])))
+                original[name] = text.decode(errors="replace")
+        path.write_bytes(data.draw(changed_json(original)))
+
+    read_data_set(data_set, change)
+
+
+def test_data_cannot_have_code_run(data_set, tmp_path):
+    """Without spaces Minari makes the environment that the data names."""
+    trap = tmp_path / "trap"
+
+    def change(folder):
+        path = folder / "metadata.json"
+        values = json.loads(path.read_text())
+        del values["action_space"]
+        values["env_spec"] = json.dumps({
+            "id": "Trap-v0", "entry_point": "pathlib:Path.touch", "reward_threshold": None,
+            "nondeterministic": False, "max_episode_steps": None, "disable_env_checker": True,
+            "kwargs": {"self": str(trap)}, "additional_wrappers": [], "vector_entry_point": None,
+        })  # fmt: skip
+        path.write_text(json.dumps(values))
+
+    with pytest.raises(UserError, match="metadata.json has no action_space"):
+        change_and_load(data_set, change)
+    assert not trap.exists()
+
+
+def change_and_load(whole, change):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        shutil.copytree(whole, Path(folder) / "datasets")
+        change(Path(folder) / "datasets" / NAME / "data")
+        patch.setenv("MINARI_DATASETS_PATH", str(Path(folder) / "datasets"))
+        return storage.load(NAME, LEVEL, SIDE)
+
+
+def replace_actions(replace):
+    def change(folder):
+        with h5py.File(folder / "main_data.hdf5", "r+") as file:
+            group = file["episode_0"]
+            del group["actions"]
+            replace(group)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("replace", "says"),
+    [
+        # Chunks that were never written take no room in the file: 8 TB of zeros.
+        (lambda g: g.create_dataset("actions", (10**12,), "i8", chunks=(1000,)), "claims 8000000"),
+        (lambda g: g.__setitem__("actions", h5py.ExternalLink("/etc/passwd", "/")), "is a link"),
+        (lambda g: g.__setitem__("actions", h5py.SoftLink("/episode_1/actions")), "is a link"),
+        (
+            lambda g: g.create_dataset("actions", (9,), "i8", external=[("/etc/passwd", 0, 72)]),
+            "not an array of this file",
+        ),
+        (lambda g: g.__setitem__("actions", g), "recursion"),
+    ],
+)  # fmt: skip
+def test_arrays_that_are_not_there(data_set, replace, says):
+    with bounded(), pytest.raises(UserError, match=says):
+        change_and_load(data_set, replace_actions(replace))
+
+
+def test_episodes_that_are_not_there(data_set):
+    def change(folder):
+        path = folder / "metadata.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "total_episodes": 10**12}))
+
+    with bounded(), pytest.raises(UserError, match="1000000000000 episodes are announced"):
+        change_and_load(data_set, change)
+
+
+def test_the_data_set_as_it_was(data_set, local_demonstrations):
+    assert_same(change_and_load(data_set, lambda folder: None), local_demonstrations)
+
+
+# Rows, the training curve, what a checkpoint says of itself.
+
+ROW = {
+    **{name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()},
+    "paper_success": 95.0,
+    "configuration": {"level": "GoToLocalS7N5", "betas": [0.9, 0.95], "demonstrations": None},
+}
+
+
+@cases
+@given(data=st.data())
+def test_damaged_rows(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("rows") / "rows.jsonl"
+    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(ROW)) + b"\n")
+    rows = outcome(lambda: results.read(path))
+    if rows is not None:
+        for table in (results.success_table, results.time_table):
+            assert table(rows).row_count == len(rows) >= 1
+
+
+CURVE = "step,seconds,loss,accuracy\n20,0.5,1.25,0.5\n40,1.0,0.75,0.75\n"
+
+
+@cases
+@given(seed=SEEDS)
+def test_a_damaged_training_curve(tmp_path_factory, seed):
+    folder = tmp_path_factory.mktemp("curve")
+    (folder / "metrics.csv").write_bytes(damaged(CURVE.encode(), np.random.default_rng(seed)))
+    for entry in outcome(lambda: pipeline.read_metrics(folder)) or []:
+        assert entry["step"] is not None and all(isinstance(v, float) for v in entry.values())
+
+
+SPECIFICATION = pretrained.Specification(
+    "GoToLocalS7N5",
+    config.Config().model,
+    pretrained.Sizes(7, pretrained.vocabulary.SIZE, 8, 0, 5, 49),
+    config.Config().training,
+    config.Config().planner,
+    5,
+    pretrained.vocabulary.WORDS,
+)
+
+
+@cases
+@given(data=st.data())
+def test_a_damaged_specification(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("run")
+    pretrained.save_specification(folder, SPECIFICATION)
+    assert pretrained.read_specification(folder) == SPECIFICATION
+    path = folder / pretrained.SPECIFICATION
+    path.write_bytes(data.draw(changed_json(json.loads(path.read_text()))))
+    found = outcome(lambda: pretrained.read_specification(folder))
+    assert found is None or isinstance(found, pretrained.Specification)
+
+
+# The command line.
+
+WORDS = [f"--{name.replace('_', '-')}" for name in (
+    "level preset seeds demos demonstrations episodes test_seed validation context executed "
+    "checkpoint record runs pictures checkpoint_seconds architecture layers heads width dropout "
+    "channels rounds fields sweeps radius dtype steps batch learning_rate warmup betas clip "
+    "masking windows augment horizon iterations resampled order temperature restarts coordinator "
+    "num_processes process_id fsdp"
+).split()]  # fmt: skip
+VALUES = st.sampled_from(
+    ["0", "1", "-1", "7", "1e9", "nan", "inf", "-inf", "99999999999999999999", "None", "all",
+     "paper", "leapjax", "GoToSeqS5R2", "GoToLocal", "BabyAI-GoToObj-v0", "random", "each", "True",
+     "--", "-", "=", "", "\x00", "\n", "/dev/null", "{}", "$(touch x)", "bfloat16", "localhost:1",
+     "x" * 5000]
+) | st.text(max_size=10) | st.integers().map(str) | st.floats().map(str)  # fmt: skip
+ARGUMENT = st.sampled_from(WORDS) | VALUES | st.text(max_size=10)
+OPTIONS = st.lists(st.tuples(st.sampled_from(WORDS), VALUES).map(list), max_size=4).map(
+    lambda pairs: [word for pair in pairs for word in pair]
+)
+
+
+@cases
+@given(arguments=OPTIONS | st.lists(ARGUMENT, max_size=6))
+def test_any_command_line(arguments):
+    def parse():
+        try:
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                contextlib.redirect_stderr(io.StringIO()),
+            ):
+                return config.parse(arguments)
+        except SystemExit as stopped:  # help, or what argparse and tyro have to say
+            assert stopped.code in (0, 2)
+            return None
+
+    for parsed in outcome(parse) or []:
+        # What is accepted has a name, a level and episodes.
+        assert len(config.configuration_hash(parsed, parsed.seeds[0])) == 12
+        assert levels.find_level(parsed.level) and parsed.demos > 0 < parsed.episodes
+
+
+# Checkpoints.
+
+STATE = TrainState(
+    {"w": jnp.arange(600.0).reshape(20, 30), "b": jnp.ones(30)}, (jnp.zeros(3),), jnp.int32(2)
+)
+
+
+@pytest.fixture(scope="module")
+def two_checkpoints(tmp_path_factory):
+    """Checkpoints of steps 1 and 2."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    saved = Checkpoints(folder)
+    for step in (1, 2):
+        saved.save(STATE._replace(step=jnp.int32(step)))
+    saved.close()
+    return folder
+
+
+@cases
+@given(seed=SEEDS, whole_state=st.booleans())
+def test_a_damaged_checkpoint(two_checkpoints, seed, whole_state):
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        folder = Path(scratch) / "checkpoints"
+        shutil.copytree(two_checkpoints, folder)
+        files = sorted(path for path in (folder / "2").rglob("*") if path.is_file())
+        path = files[rng.integers(len(files))]
+        path.write_bytes(damaged(path.read_bytes(), rng))
+        if whole_state:
+            saved = Checkpoints(folder)
+            restored = outcome(lambda: saved.restore(STATE))
+            saved.close()
+            params = restored and restored.params
+            assert restored is None or int(restored.step) in (1, 2)
+        else:
+            params = outcome(lambda: checkpoints.restore_params(folder, STATE.params))
+        if params:  # not one bit of them is wrong
+            for name, value in STATE.params.items():
+                np.testing.assert_array_equal(params[name], value)
