@@ -79,7 +79,7 @@ def measure(config: Config, seconds: float) -> Row:
     batch = config.training.batch
     mesh = sharding.make_mesh(batch)
     agent = leap.make_agent(config.model, config.training, config.planner, sizes, level.words, mesh)
-    state, key = training.begin(agent, 0, mesh)
+    state, key = training.make_begin(agent, mesh)(0)
     data = sharding.replicate(random_steps(sizes, level.words), mesh)
 
     def make_batch(key: jax.Array, data: PyTree) -> PyTree:

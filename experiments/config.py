@@ -16,6 +16,7 @@ from leapjax.agents.leap import TrainingConfig
 from leapjax.data import seeds
 from leapjax.envs import levels
 from leapjax.envs.levels import Level
+from leapjax.envs.vocabulary import LONGEST_CLAUSE
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -84,8 +85,14 @@ def preset(level: Level, name: str) -> Config:
     elif name == "leapjax":
         # Chosen on validation levels (docs/performance.md): a little noise leads out of plans
         # that lead nowhere, and more iterations than positions give nothing.
-        planner = dataclasses.replace(planner, iterations=level.horizon, temperature=0.5)
-        model = ModelConfig("leapjax", dropout=0.0, sweeps=_sweeps(level))
+        # Where much must be done in one episode, more noise leads out of more of them.
+        sequence = level.words > LONGEST_CLAUSE
+        planner = dataclasses.replace(
+            planner, iterations=level.horizon, temperature=1.0 if sequence else 0.5
+        )
+        model = ModelConfig(
+            "leapjax", dropout=0.0, sweeps=_sweeps(level), word_heads=4 if sequence else 0
+        )
         training = TrainingConfig(
             steps=_steps(level),
             masking="random",
@@ -102,10 +109,11 @@ def preset(level: Level, name: str) -> Config:
 
 
 def _steps(level: Level) -> int:
-    """1 to 4 minutes on two cores; 12 to 16 for the largest maze, whose ways are the longest."""
+    """1 to 5 minutes on two cores; 12 to 16 for the largest maze, whose ways are the longest."""
     if level.rows * level.columns == 1:
         return 1600
-    return 6000 if level.room_size > 5 and level.rows > 1 else 4000
+    large = level.room_size > 5 and level.rows > 1
+    return 6000 if large or level.words > LONGEST_CLAUSE else 4000
 
 
 def _sweeps(level: Level) -> int:

@@ -102,7 +102,7 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
     processes.first_does(describe)
     begun = time.perf_counter()
     agent = pretrained.make_agent(specification, mesh)
-    state, key = training.begin(agent, run.seed, mesh)
+    state, key = training.make_begin(agent, mesh)(run.seed)
     steps = sharding.replicate(examples, mesh)
     saved = Checkpoints(folder / pretrained.CHECKPOINTS)
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))

@@ -16,16 +16,19 @@ class NonFiniteLoss(RuntimeError):
     """Training met a loss or a gradient that is not a finite number."""
 
 
-def begin(agent: Agent, seed: int, mesh: Mesh) -> tuple[TrainState, jax.Array]:
-    """The first state of a run and the key of the rest, on a mesh."""
+def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, jax.Array]]:
+    """The jitted `(seed) -> (state, key)`: the first state of a run, and the key of its steps.
 
-    def first() -> tuple[TrainState, jax.Array]:
+    Both are on the mesh, the state split as `sharding.parameter_specs` says.
+    """
+
+    def begin(seed: jax.Array) -> tuple[TrainState, jax.Array]:
         key = jax.random.key(seed)
         return agent.init(key), key
 
-    state, _ = jax.eval_shape(first)
+    state, _ = jax.eval_shape(begin, 0)
     places = sharding.parameter_shardings(state, mesh), NamedSharding(mesh, sharding.REPLICATED)
-    return jax.jit(first, out_shardings=places)()
+    return jax.jit(begin, out_shardings=places)
 
 
 def make_train_step(
@@ -38,7 +41,7 @@ def make_train_step(
 
     Args:
         agent: what is trained. If it was made with a mesh, the state and the key come from
-            `begin` with that mesh, and the data from `sharding.replicate`.
+            `make_begin` with that mesh, and the data from `sharding.replicate`.
         make_batch: (key, data) -> batch; pure.
     """
 

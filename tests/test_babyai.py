@@ -252,12 +252,12 @@ def test_evaluation_does_not_depend_on_the_batch(workplace):
 
 def test_rows_refuse_damage_by_line_number(tmp_path):
     path = tmp_path / "rows.jsonl"
-    row = dict.fromkeys(results.REQUIRED, 1)
+    row = {n: "x" if k is str else k(1) for n, k in results.FIELDS.items()}
     path.write_text(json.dumps(row) + "\n{oops\n")
     with pytest.raises(UserError, match="line 2: not JSON"):
         results.read(path)
     path.write_text("[]\n")
-    with pytest.raises(UserError, match="line 1: a row without"):
+    with pytest.raises(UserError, match="line 1: expected a JSON object, got list"):
         results.read(path)
 
 

@@ -104,5 +104,25 @@ def test_the_state_after_the_last_word_ignores_padding():
     words = jnp.array([3, 1, 4, 0, 0])
     params = encoder.init(jax.random.key(0), words)
     short = encoder.apply(params, words[:3])
-    np.testing.assert_allclose(encoder.apply(params, words), short, atol=1e-6)
-    assert not np.allclose(encoder.apply(params, words[jnp.array([1, 0, 2])]), short)
+    long = encoder.apply(params, words)
+    np.testing.assert_allclose(long.whole, short.whole, atol=1e-6)
+    np.testing.assert_allclose(long.words[:3], short.words, atol=1e-6)
+    assert long.given.tolist() == [True] * 3 + [False] * 2
+    assert not np.allclose(encoder.apply(params, words[jnp.array([1, 0, 2])]).whole, short.whole)
+
+
+def test_cells_attend_to_the_words_that_are_given():
+    encoder, attention = encoders.InstructionEncoder(10, 8), encoders.WordAttention(2, 4)
+    cells = jax.random.normal(jax.random.key(0), (3, 4, 5))
+    words = jnp.array([3, 1, 4])
+    encoded = encoder.init_with_output(jax.random.key(1), words)[0]
+    params = attention.init(jax.random.key(2), cells, encoded)
+    said = attention.apply(params, cells, encoded)
+    assert said.shape == cells.shape
+    padded = jax.tree.map(lambda x: jnp.concatenate([x, 100 * x]), encoded)
+    padded = padded._replace(given=jnp.arange(6) < 3, whole=encoded.whole)
+    np.testing.assert_allclose(attention.apply(params, cells, padded), said, atol=1e-6)
+    # Each cell by itself, and none is told the same as another.
+    alone = attention.apply(params, cells[1:2, 2:3], encoded)
+    np.testing.assert_allclose(alone[0, 0], said[1, 2], atol=1e-6)
+    assert np.unique(np.asarray(said).reshape(12, -1).round(4), axis=0).shape[0] == 12

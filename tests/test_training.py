@@ -358,7 +358,7 @@ def gradient_step(devices, data, batch=16, fsdp=1):
         state, key = jax.jit(agent.init)(jax.random.key(0)), jax.random.key(0)
     else:
         assert mesh.size == devices
-        state, key = training.begin(agent, 0, mesh)
+        state, key = training.make_begin(agent, mesh)(0)
         data = sharding.replicate(data, mesh)
     before = jax.tree.map(lambda leaf: leaf.sharding, state)
     state, metrics = step(state, data, key)
@@ -417,7 +417,7 @@ def test_a_checkpoint_goes_on_with_another_split_of_the_parameters(data, tmp_pat
     for fsdp in (1, 4):
         mesh = sharding.make_mesh(8, fsdp=fsdp)
         agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS, mesh)
-        states[fsdp], _ = training.begin(agent, fsdp, mesh)
+        states[fsdp], _ = training.make_begin(agent, mesh)(fsdp)
     saved = Checkpoints(tmp_path / "checkpoints")
     saved.save(states[4])
     saved.close()

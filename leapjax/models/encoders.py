@@ -6,6 +6,7 @@ matrix product over shifted copies.
 """
 
 import functools
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -47,6 +48,14 @@ class Convolution(nn.Module):
         )
 
 
+class Instruction(NamedTuple):
+    """An encoded instruction."""
+
+    words: jax.Array  # [L, width] each word, with what was said before it
+    given: jax.Array  # [L] bool: not padding
+    whole: jax.Array  # [width] the state after the last word
+
+
 class InstructionEncoder(nn.Module):
     """Word embeddings and a GRU (paper, appendix, network details)."""
 
@@ -54,12 +63,38 @@ class InstructionEncoder(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(self, instruction: jax.Array) -> jax.Array:
-        """Token ids `[L]`, 0 for padding, to the state after the last word `[width]`."""
+    def __call__(self, instruction: jax.Array) -> Instruction:
+        """Of token ids `[L]`, 0 for padding."""
         words = nn.Embed(self.vocabulary, self.width)(instruction)
-        length = jnp.sum(instruction > 0)
-        state, _ = nn.RNN(nn.GRUCell(self.width), return_carry=True)(words, seq_lengths=length)
-        return state
+        given = instruction > 0
+        recurrence = nn.RNN(nn.GRUCell(self.width), return_carry=True)
+        whole, states = recurrence(words, seq_lengths=jnp.sum(given))
+        return Instruction(words + states, given, whole)
+
+
+class WordAttention(nn.Module):
+    """What an instruction says of each cell: attention from cells to words.
+
+    'Go to the red ball and the key, then ...': one vector has to say of every object whether,
+    and when, it is meant; here the cell that holds it finds the words that name it.
+    """
+
+    heads: int
+    features: int = 16  # of a head
+
+    @nn.compact
+    def __call__(self, cells: jax.Array, instruction: Instruction) -> jax.Array:
+        """Cells `[S, S, C]` to `[S, S, C]`."""
+
+        def heads(x: jax.Array, name: str) -> jax.Array:
+            return nn.DenseGeneral((self.heads, self.features), name=name)(x)
+
+        words = instruction.words
+        queries, keys, values = heads(cells, "query"), heads(words, "key"), heads(words, "value")
+        scores = jnp.einsum("xyhd,lhd->xyhl", queries, keys) / self.features**0.5
+        weights = jax.nn.softmax(jnp.where(instruction.given, scores, -1e30), axis=-1)
+        said = jnp.einsum("xyhl,lhd->xyhd", weights, values)
+        return nn.DenseGeneral(cells.shape[-1], axis=(-2, -1), name="output")(said)
 
 
 class StateEncoder(nn.Module):

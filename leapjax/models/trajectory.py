@@ -33,6 +33,7 @@ class ModelConfig:
     rounds: int = 2  # leapjax: rounds of convolution over the grid
     fields: int = 8  # leapjax: learned distance fields
     sweeps: int = 16  # leapjax: rounds of value iteration that make them
+    word_heads: int = 0  # leapjax: attention heads from cells to words; 0: none
     radius: int = 3  # leapjax: how far around the agent its cells are read one by one
     dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
 
@@ -43,7 +44,12 @@ class ModelConfig:
                 f"expected one of {', '.join(ARCHITECTURES)}"
             )
         sizes = ("layers", "heads", "width", "channels", "fields", "sweeps")
-        for name, least in {**dict.fromkeys(sizes, 1), "rounds": 0, "radius": 0}.items():
+        for name, least in {
+            **dict.fromkeys(sizes, 1),
+            "rounds": 0,
+            "radius": 0,
+            "word_heads": 0,
+        }.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 <= self.dropout < 1:
@@ -105,7 +111,7 @@ class PaperModel(nn.Module):
         """The embeddings that every pass shares: `[2 (K + T), D]`."""
         del deterministic
         horizon, past = self.sizes.horizon, self.sizes.context
-        instruction = self.instruction(context.observation.instruction)
+        instruction = self.instruction(context.observation.instruction).whole
         states = jax.tree.map(
             lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
         )
@@ -155,13 +161,14 @@ class ContextTokens(nn.Module):
         if self.sizes.context:
             visits = self._visits(context, direction)
             cells += nn.Dense(c.channels, use_bias=False, name="visited")(visits)
-        scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction), 2)
+        scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction.whole), 2)
+        modulated = cells * (1 + scale) + shift
+        if c.word_heads:
+            modulated += encoders.WordAttention(c.word_heads, name="words")(cells, instruction)
         encoder = encoders.GridEncoder(
             c.channels, c.fields, c.sweeps, c.rounds, c.dtype, name="grid"
         )
-        grid, distances = encoder(
-            cells * (1 + scale) + shift, observation.pose[:2], observation.goal
-        )
+        grid, distances = encoder(modulated, observation.pose[:2], observation.goal)
 
         def read(features: jax.Array, name: str) -> jax.Array:
             return dense(c.width, scale=0.1, name=name)(features)
@@ -174,7 +181,7 @@ class ContextTokens(nn.Module):
         agent += _embed(encoders.COLOURS, c.width, "carried_colour")(colour)
         goal = read(encoders.feature_at(grid, observation.goal), "read_goal")
         whole = read(grid.reshape(side * side, -1).max(axis=0), "read_all")
-        return jnp.stack([agent, goal, whole, instruction])
+        return jnp.stack([agent, goal, whole, instruction.whole])
 
     def _visits(self, context: Context, direction: jax.Array) -> jax.Array:
         """When the agent last stood in, and last faced, each cell: `[S, S, 4]`.
