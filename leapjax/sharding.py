@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from leapjax.types import PyTree
@@ -130,12 +131,21 @@ def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
 
     def part(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
         if FSDP not in spec:
-            return jax.lax.pmean(leaf, (DATA, FSDP))
+            return leaf
         dimension = spec.index(FSDP)
         total = jax.lax.psum_scatter(leaf, FSDP, scatter_dimension=dimension, tiled=True)
-        return jax.lax.pmean(total, DATA) / jax.lax.axis_size(FSDP)
+        return total / jax.lax.axis_size(FSDP)
 
-    return jax.tree.map(part, tree, specs)
+    parts, structure = jax.tree.flatten(jax.tree.map(part, tree, specs))
+    split = [FSDP in spec for spec in jax.tree.leaves(specs)]
+    # One message instead of one for each array: between processes each costs its latency.
+    for axes, chosen in (((DATA, FSDP), False), ((DATA,), True)):
+        places = [place for place, is_split in enumerate(split) if is_split == chosen]
+        flat, unflatten = ravel_pytree([parts[place] for place in places])
+        means = unflatten(jax.lax.pmean(flat, axes))
+        for place, mean in zip(places, means, strict=True):
+            parts[place] = mean
+    return jax.tree.unflatten(structure, parts)
 
 
 def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:

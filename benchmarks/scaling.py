@@ -1,0 +1,189 @@
+"""Weak scaling of training over devices and processes: `python -m benchmarks.scaling`.
+
+Each device has as many windows per step however many devices there are. A setting is measured
+in processes of its own, because JAX fixes its devices when it starts. Virtual devices beyond
+the cores of the machine cannot be faster; what they show is what splitting costs.
+"""
+
+import dataclasses
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import tyro
+from jax.sharding import NamedSharding
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.timing import fastest
+from benchmarks.training import random_steps
+from experiments import runtime
+from experiments.config import preset
+from experiments.runtime import Cluster
+from leapjax import files, pretrained, processes, sharding, training
+from leapjax.agents import leap
+from leapjax.envs import levels
+from leapjax.errors import UserError
+
+Row = dict[str, Any]
+# (processes, devices of each, devices that share parameters)
+SETTINGS = ((1, 1, 1), (1, 2, 1), (2, 1, 1), (1, 2, 2), (1, 4, 1), (1, 8, 1), (1, 8, 8))
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure weak scaling."""
+
+    level: str = "GoToLocalS7N5"
+    """Whose settings of preset `leapjax` to measure."""
+    per_device: int = 32
+    """Windows per device and step."""
+    seconds: float = 5.0
+    """Time to spend on each measurement, at least."""
+    json: Path | None = None
+    """Write the rows here."""
+    worker: bool = False
+    """Measure in this process, on the devices that there are, and print the row."""
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures every setting, prints a table, and writes what was asked for."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options = tyro.cli(Options, args=arguments)
+    try:
+        levels.find_level(options.level)
+        if options.worker:
+            runtime.connect(options.cluster)
+            row = measure(options)
+            if processes.is_first():
+                print(json.dumps(row), flush=True)
+            return 0
+        rows = [launch(arguments, *setting) for setting in SETTINGS]
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    Console().print(table(rows))
+    if options.json:
+        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
+    """The row of one setting, from processes of its own.
+
+    Raises:
+        UserError: one of them failed.
+    """
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "benchmarks.scaling", *arguments, "--worker"]
+    command += ["--fsdp", str(fsdp)]
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": str(devices)}
+    workers = []
+    for index in range(count):
+        joined = ["--coordinator", f"localhost:{port}", "--num-processes", str(count)]
+        joined += ["--process-id", str(index)]
+        workers.append(
+            subprocess.Popen(
+                command + (joined if count > 1 else []),
+                env=environment,
+                text=True,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+            )
+        )
+    outputs = [worker.communicate() for worker in workers]
+    for worker, (_, error) in zip(workers, outputs, strict=True):
+        if worker.returncode:
+            last = (error.strip() or "no message").splitlines()[-1]
+            raise UserError(f"{count} processes of {devices} devices: {last}")
+    return json.loads(outputs[0][0].strip().splitlines()[-1])
+
+
+def measure(options: Options) -> Row:
+    """One setting, on all devices of all processes."""
+    level = levels.find_level(options.level)
+    config = preset(level, "leapjax")
+    batch = options.per_device * jax.device_count()
+    chosen = dataclasses.replace(config.training, batch=batch)
+    sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
+    mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)
+    agent = leap.make_agent(config.model, chosen, config.planner, sizes, level.words, mesh)
+    state, key = training.make_begin(agent, mesh)(0)
+    data = sharding.replicate(random_steps(sizes, level.words), mesh)
+    step = training.make_train_step(agent, lambda k, d: leap.make_batch(k, d, chosen, sizes))
+    compiled = step.lower(state, data, key).compile()  # type: ignore[attr-defined]
+
+    def advance() -> jax.Array:
+        nonlocal state
+        state, metrics = compiled(state, data, key)
+        return metrics["loss"]
+
+    # Every process must do as many steps, so none may decide by its own clock.
+    for _ in range(3):
+        jax.block_until_ready(advance())
+    repeats = max(processes.gather(int(options.seconds / fastest(advance, 0) / 5) + 1))
+    taken = min(fastest(lambda: [advance() for _ in range(5)], 0) / 5 for _ in range(repeats))
+
+    communicate = partial(exchange(state.params, mesh), state.params)
+    jax.block_until_ready(communicate())
+    alone = min(fastest(communicate, 0) for _ in range(50))
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    return {
+        "level": options.level,
+        "processes": jax.process_count(),
+        "devices": jax.device_count(),
+        "fsdp": options.cluster.fsdp,
+        "per_device": options.per_device,
+        "seconds_per_step": taken,
+        "examples_per_second": batch / taken,
+        "exchange_seconds": alone,
+        "parameters": int(parameters),
+    }
+
+
+def exchange(params: Any, mesh: jax.sharding.Mesh) -> Any:
+    """The communication of one step, alone: parameters gathered, gradients averaged."""
+    specs = sharding.parameter_specs(params, mesh)
+
+    def on_each_device(parts: Any) -> Any:
+        return sharding.scatter_mean(sharding.gather(parts, specs), specs)
+
+    places = jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
+    split = jax.shard_map(
+        on_each_device, mesh=mesh, in_specs=(specs,), out_specs=specs, check_vma=False
+    )
+    return jax.jit(split, out_shardings=places)
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows for a terminal."""
+    result = Table(
+        "processes", "devices", "fsdp", "ms/step", "examples/s", "of two devices", "exchange (ms)"
+    )
+    best = [r["examples_per_second"] for r in rows if (r["processes"], r["devices"]) == (1, 2)]
+    for row in rows:
+        result.add_row(
+            str(row["processes"]),
+            str(row["devices"]),
+            str(row["fsdp"]),
+            f"{1e3 * row['seconds_per_step']:.1f}",
+            f"{row['examples_per_second']:.0f}",
+            f"{row['examples_per_second'] / np.max(best):.0%}" if best else "",
+            f"{1e3 * row['exchange_seconds']:.1f}",
+        )
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
