@@ -5,25 +5,30 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import results
+from experiments import plots, results
 from experiments.config import PRESETS
 from experiments.results import Row
 from leapjax import scores
 from leapjax.envs.levels import LEVELS
 from leapjax.files import write_text
 
+PAPER_DEMOS = 500
+DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experiments.md")
+
 
 def main() -> int:
-    """Rewrites every table, here."""
+    """Rewrites every table, and draws what the rows say, here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
+    rows = results.read(Path("results") / "babyai.jsonl")
+    plots.data_efficiency(efficiency_by_level(rows), Path("docs") / "data-efficiency.png")
     return 0
 
 
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows: dict[str, list[Row]] = {"babyai": results.read(root / "results" / "babyai.jsonl")}
-    for name in ("planning", "search", "training"):
+    for name in ("planning", "search", "training", "scaling"):
         rows[name] = json.loads((root / "results" / f"{name}.json").read_text(encoding="utf-8"))
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
         "results": (success, "babyai"),
@@ -31,9 +36,11 @@ def documents(root: Path) -> dict[Path, str]:
         "planning": (planning, "planning"),
         "search": (search, "search"),
         "training": (training, "training"),
+        "scaling": (scaling, "scaling"),
+        "efficiency": (efficiency, "babyai"),
     }
     written = {}
-    for path in (root / "README.md", root / "docs" / "performance.md"):
+    for path in (root / name for name in DOCUMENTS):
         text = path.read_text(encoding="utf-8")
         for name, (make, source) in sections.items():
             if f"<!-- {name}: begin -->" in text:
@@ -54,18 +61,71 @@ def success(rows: Sequence[Row]) -> str:
     """Success rates per level: the paper's, preset `paper`, preset `leapjax`.
 
     A cell is the mean over seeds, the 95% interval of all their episodes together, and the
-    number of seeds. Only test episodes count, and of two rows of one seed the later one.
+    number of seeds.
     """
-    latest = {(r["level"], r["preset"], r["seed"]): r for r in rows if not r["validation"]}
-    rows = list(latest.values())
+    latest = _latest(rows)
     lines = []
     for level in LEVELS.values():
-        chosen = [
-            [r for r in rows if (r["level"], r["preset"]) == (level.name, name)] for name in PRESETS
-        ]
-        ours, papers = map(_rate, chosen)
+        ours, papers = (_rate(latest.get((level.name, name, PAPER_DEMOS), [])) for name in PRESETS)
         lines.append([level.name, f"{level.paper_success:.1f}%", papers, ours])
     return _table("level | paper | preset `paper` | preset `leapjax`", lines)
+
+
+def _latest(rows: Sequence[Row]) -> dict[tuple[str, str, int], list[Row]]:
+    """Rows by level, preset and number of demonstrations.
+
+    Only test episodes count, and of two rows of one seed the later one.
+    """
+    found: dict[tuple[str, str, int], dict[int, Row]] = {}
+    for row in rows:
+        if not row["validation"]:
+            setting = row["level"], row["preset"], row["demos"]
+            found.setdefault(setting, {})[row["seed"]] = row
+    return {setting: list(by_seed.values()) for setting, by_seed in found.items()}
+
+
+def efficiency_by_level(rows: Sequence[Row]) -> dict[str, dict[int, list[Row]]]:
+    """Rows of preset `leapjax` by number of demonstrations, of levels that have several."""
+    found: dict[str, dict[int, list[Row]]] = {}
+    for (level, name, demos), chosen in sorted(_latest(rows).items()):
+        if name == "leapjax":
+            found.setdefault(level, {})[demos] = chosen
+    return {level: by_demos for level, by_demos in found.items() if len(by_demos) > 1}
+
+
+def efficiency(rows: Sequence[Row]) -> str:
+    """Success against demonstrations, beside the paper's from 500."""
+    found = efficiency_by_level(rows)
+    demos = sorted({count for by_demos in found.values() for count in by_demos})
+    lines = [
+        [
+            level,
+            *(_rate(by_demos.get(count, [])) for count in demos),
+            f"{LEVELS[level].paper_success:.1f}%",
+        ]
+        for level, by_demos in found.items()
+    ]
+    counts = " | ".join(f"{count} demonstrations" for count in demos)
+    return _table(f"level | {counts} | paper, {PAPER_DEMOS}", lines)
+
+
+def scaling(rows: Sequence[Row]) -> str:
+    """Every measurement of weak scaling."""
+    (two,) = (r for r in rows if (r["processes"], r["devices"], r["fsdp"]) == (1, 2, 1))
+    lines = [
+        [
+            str(row["processes"]),
+            str(row["devices"]),
+            str(row["fsdp"]),
+            f"{1e3 * row['seconds_per_step']:.1f}",
+            f"{row['examples_per_second']:,.0f}",
+            f"{row['examples_per_second'] / two['examples_per_second']:.0%}",
+            f"{1e3 * row['exchange_seconds']:.1f}",
+        ]
+        for row in rows
+    ]
+    header = "processes | devices | fsdp | ms/step | windows/s | of two devices | exchange (ms)"
+    return _table(header, lines)
 
 
 def speed(rows: Sequence[Row]) -> str:

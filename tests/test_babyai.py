@@ -110,6 +110,19 @@ def test_a_loaded_planner_plans(workplace):
     assert (actions[:, 0] != 6).all()  # end is never first
 
 
+def test_a_planner_of_a_smaller_grid_is_refused_a_larger_level(workplace):
+    planner = load(run_folder(workplace))
+    large = LEVELS["GoToLocalS8N7"]
+    with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
+        rollouts.evaluate(
+            lambda: BabyAIAdapter(large), [0], planner.plan, planner.params, context=0
+        )
+    with pytest.raises(UserError, match=r"past actions has shape \(2,\), but .* \(0,\)"):
+        rollouts.evaluate(
+            lambda: BabyAIAdapter(LEVELS[LEVEL]), [0], planner.plan, planner.params, context=2
+        )
+
+
 def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
     arguments = [*TOY, "--record", "--no-pictures"]
     assert babyai.main(arguments) == 0

@@ -10,6 +10,7 @@ from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc
 from leapjax.data import demonstrations
 from leapjax.envs import levels, observations, vocabulary
 from leapjax.envs.adapter import BabyAIAdapter
+from leapjax.errors import UserError
 from tests.oracles import slow_path_lengths
 
 TURN_LEFT, FORWARD, PICKUP = 0, 2, 3
@@ -240,3 +241,10 @@ def test_the_goal_stays_for_the_whole_episode():
                 break
             moved_on += observations.nearest_goal(adapter.env) != goal
     assert moved_on > 0  # another match became nearer, and the goal still stayed
+
+
+def test_a_level_larger_than_the_grid_is_refused():
+    env = levels.make_environment(levels.find_level("GoToLocalS8N7"))
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="8 by 8 cells, larger than the grid of 7"):
+        observations.observe(env, 7, observations.NO_GOAL, np.zeros(5, np.int32))

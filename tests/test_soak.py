@@ -19,7 +19,7 @@ from leapjax.envs.adapter import BabyAIAdapter
 from tests.programs import LONG
 from tests.test_training import MODEL, TRAINING
 
-CYCLES, RUNS = (1000, 30) if LONG else (8, 3)
+CYCLES, RUNS = (300, 20) if LONG else (8, 3)
 LEVEL = levels.find_level("GoToLocalS7N5")
 
 

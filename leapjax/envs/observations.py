@@ -11,6 +11,7 @@ from minigrid.core.grid import Grid
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.envs.babyai.core.verifier import GoToInstr, OpenInstr, PickupInstr
 
+from leapjax.errors import UserError
 from leapjax.types import Observation
 
 NO_GOAL = (-1, -1)
@@ -25,9 +26,14 @@ def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) 
         side: S; smaller or non-square grids are padded at the far ends with zeros.
         goal: what `nearest_goal` said at reset.
         instruction: `[L]` token ids.
+
+    Raises:
+        UserError: the level is larger than S.
     """
     grid = np.zeros((side, side, 3), np.uint8)
     width, height = env.grid.width, env.grid.height
+    if max(width, height) > side:
+        raise UserError(f"the level is {width} by {height} cells, larger than the grid of {side}")
     grid[:width, :height] = env.grid.encode()
     x, y = map(int, env.agent_pos)
     grid[x, y] = OBJECT_TO_IDX["agent"], 0, env.agent_dir

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.data import symmetries
+from leapjax.errors import UserError
 from leapjax.models import encoders
 from leapjax.models.transformer import Transformer, dense
 from leapjax.types import Context, Observation, PyTree
@@ -110,6 +111,7 @@ class PaperModel(nn.Module):
     def encode(self, context: Context, deterministic: bool = True) -> PyTree:
         """The embeddings that every pass shares: `[2 (K + T), D]`."""
         del deterministic
+        _check_context(context, self.sizes)
         horizon, past = self.sizes.horizon, self.sizes.context
         instruction = self.instruction(context.observation.instruction).whole
         states = jax.tree.map(
@@ -152,6 +154,7 @@ class ContextTokens(nn.Module):
     @nn.compact
     def __call__(self, context: Context) -> jax.Array:
         """Tokens `[4, D]`: the agent, the goal, the whole grid, the instruction."""
+        _check_context(context, self.sizes)
         c, side = self.config, self.sizes.side
         direction = context.observation.pose[2]
         observation = symmetries.rotate(context.observation, direction)
@@ -266,6 +269,20 @@ class SequenceClassifier(nn.Module):
         """The degree of corruption `[]` of a complete plan `[T]`: 0 none of it, 1 all."""
         states = self.recurrence(self.action(actions), initial_carry=memory)
         return self.head(states[-1])[0]
+
+
+def _check_context(context: Context, sizes: Sizes) -> None:
+    """Refuses what another network would be needed for, while the program is being traced."""
+    found = {
+        "grid": (context.observation.grid.shape, (sizes.side, sizes.side, 3)),
+        "past actions": (context.actions.shape, (sizes.context,)),
+    }
+    for name, (shape, expected) in found.items():
+        if shape != expected:
+            raise UserError(
+                f"the context's {name} has shape {shape}, but this network was made for "
+                f"{expected}: use the level and the context length that it was trained with"
+            )
 
 
 def _embed(count: int, width: int, name: str | None = None) -> nn.Embed:
