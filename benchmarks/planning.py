@@ -28,17 +28,12 @@ from benchmarks.timing import fastest, matmul_peak
 from experiments import runtime
 from leapjax import files
 from leapjax.agents import leap
+from leapjax.batching import CompiledPlanner, compile_planner, plan_keys, split_batch
 from leapjax.envs import vocabulary
 from leapjax.envs.adapter import NUM_ACTIONS
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.planners import (
-    CompiledPlanner,
-    GibbsConfig,
-    compile_planner,
-    plan_keys,
-    split_batch,
-)
+from leapjax.planners import GibbsConfig
 from leapjax.types import Params
 
 matplotlib.use("Agg")

@@ -22,11 +22,12 @@ from rich.table import Table
 from benchmarks.timing import fastest
 from experiments import results, runtime
 from leapjax import files, pretrained, rollouts
+from leapjax.batching import plan_keys
 from leapjax.data import seeds
 from leapjax.envs import levels
 from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.errors import UserError
-from leapjax.planners import GibbsConfig, plan_keys
+from leapjax.planners import GibbsConfig
 from leapjax.scores import wilson_interval
 
 matplotlib.use("Agg")

@@ -8,7 +8,8 @@ import numpy as np
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from PIL import Image, ImageDraw
 
-from leapjax import planners, rollouts
+from leapjax import rollouts
+from leapjax.batching import plan_keys
 from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.envs.levels import Level
 from leapjax.pretrained import Pretrained
@@ -43,7 +44,7 @@ def episode_frames(
     mission = adapter.env.mission
     frames = []
     for replan in range(MAX_PLANS):
-        keys = planners.plan_keys(seed, np.array([level_seed]), np.array([replan]))
+        keys = plan_keys(seed, np.array([level_seed]), np.array([replan]))
         plan = planner(keys, rollouts.stack_contexts([history]))
         trace = np.asarray(plan.trace[0])
         for iteration in _distinct(trace):

@@ -18,10 +18,10 @@ from experiments.config import Config, configuration_hash, parse, resolved
 from experiments.interruption import Interrupted, Interruption, interruptible
 from experiments.pipeline import Run
 from leapjax import files, pretrained, processes, training
+from leapjax.batching import NotANumber
 from leapjax.data import seeds
 from leapjax.envs import levels
 from leapjax.errors import UserError, first_line
-from leapjax.planners import NotANumber
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
 

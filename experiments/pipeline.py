@@ -25,6 +25,7 @@ from experiments.interruption import Interruption
 from experiments.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
 from leapjax.agents import leap
+from leapjax.batching import compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import demonstrations, storage, windows
 from leapjax.data.demonstrations import Demonstration
@@ -33,7 +34,6 @@ from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.envs.levels import Level
 from leapjax.errors import UserError, first_line
 from leapjax.models.trajectory import Sizes
-from leapjax.planners import compile_planner
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
 from leapjax.types import TrainState

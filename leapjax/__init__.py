@@ -4,17 +4,15 @@ An `Energy` is a few pure functions of one trajectory; a planner finds a plan of
 energy; `compile_planner` makes it plan for any number of contexts at once.
 """
 
+from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.energy import classifier, compose, constrain, from_total, pseudo_likelihood, view
 from leapjax.errors import UserError
 from leapjax.planners import (
-    CompiledPlanner,
     CrossEntropyConfig,
     GibbsConfig,
     ShootingConfig,
-    compile_planner,
     cross_entropy_method,
     gibbs,
-    plan_keys,
     random_shooting,
 )
 from leapjax.pretrained import Pretrained, load

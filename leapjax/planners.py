@@ -1,33 +1,21 @@
 """Planners: `(energy, params, key, context, config) -> Plan`, pure, for one context.
 
-They know only `Energy`. `compile_planner` turns one into the jitted, batched function
-that plans for any number of contexts at once.
+They know only `Energy`. `leapjax.batching` makes one of them plan for any number of contexts.
 """
 
 import dataclasses
 import functools
-import operator
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh
 
-from leapjax import schedules, sharding
-from leapjax.types import Array, Energy, Params, Plan, PyTree, mask_token
+from leapjax import schedules
+from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 ORDERS = ("random", "sequential", "uncertain")
-
-
-class NotANumber(ValueError):
-    """An energy that was minimised is NaN somewhere; `plan` is what came of it all the same."""
-
-    def __init__(self, message: str, plan: Plan) -> None:
-        super().__init__(message)
-        self.plan = plan  # of NumPy arrays; `plan.valid` says which rows can be trusted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -327,182 +315,6 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
     if type(config) not in planners:
         raise TypeError(f"no planner takes a {type(config).__name__}")
     return functools.partial(planners[type(config)], energy, config=config)
-
-
-class CompiledPlanner:
-    """A jitted planner for batches of any size; made by `compile_planner`.
-
-    It keeps a reference to the parameters of its last call.
-    """
-
-    def __init__(
-        self,
-        energy: Energy,
-        config: PlannerConfig,
-        chunk_sizes: Sequence[int],
-        devices: Sequence[jax.Device] | None,
-    ) -> None:
-        self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
-        if not self.chunk_sizes or self.chunk_sizes[0] < 1:
-            raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
-        planner = bind(energy, config)
-
-        def plan_rows(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
-            keys = jax.random.wrap_key_data(key_data, impl=kind)
-            return jax.vmap(planner, in_axes=(None, 0, 0))(params, keys, contexts)
-
-        nothing = jax.tree.structure(())
-        self._last: tuple[list[Array], Any, dict[int, Params]] = ([], nothing, {})
-        # Plans have nothing to say to each other: each device plans its rows by itself.
-        self._meshes = {size: sharding.make_mesh(size, devices) for size in self.chunk_sizes}
-        self._programs = {
-            mesh.size: sharding.split_batches(plan_rows, mesh) for mesh in self._meshes.values()
-        }
-
-    def __call__(self, params: Params, keys: Array, contexts: PyTree) -> Plan:
-        """Plans for B contexts.
-
-        Args:
-            params: of the energy.
-            keys: `[B]`, or raw `[B, 2]` from `plan_keys`.
-            contexts: leaves with a leading `[B]`.
-
-        Returns:
-            A `Plan` of NumPy arrays with a leading `[B]`.
-
-        Raises:
-            ValueError: no contexts, or not as many as keys.
-            NotANumber: the energy of some action was NaN.
-        """
-        batch = keys.shape[0]
-        if batch == 0:
-            raise ValueError("no contexts to plan for")
-        for path, leaf in jax.tree.leaves_with_path(contexts):
-            if np.ndim(leaf) == 0 or leaf.shape[0] != batch:
-                raise ValueError(
-                    f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
-                    f"dimension must be the number of keys, {batch}"
-                )
-        # Cut with NumPy: each slice of a device array would be a program of its own.
-        kind = str(jax.config.jax_default_prng_impl)  # type: ignore[attr-defined]
-        if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
-            kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
-        inputs = jax.tree.map(np.asarray, (keys, contexts))
-        chunks = split_batch(batch, self.chunk_sizes)
-        placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
-        plans = []
-        for start, size, _ in chunks:
-            # A last chunk that is not full repeats its last row, which is then cut off.
-            rows = np.minimum(np.arange(start, start + size), batch - 1)
-            count = self._meshes[size].size
-            chunk = jax.tree.map(lambda leaf, r=rows: leaf[r], inputs)
-            plans.append(self._programs[count](kind, placed[count], *chunk))
-        parts = [
-            jax.tree.map(lambda leaf, n=used: np.asarray(leaf)[:n], plan)
-            for plan, (_, _, used) in zip(plans, chunks, strict=True)
-        ]
-        plan = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-        if not plan.valid.all():
-            raise NotANumber(
-                f"the energy is NaN for {np.sum(~plan.valid)} of {batch} contexts (the first is "
-                f"context {np.argmin(plan.valid)}): look at the parameters, and at logits that "
-                "are +inf or all -inf",
-                plan,
-            )
-        return plan
-
-    def _place(self, params: Params, meshes: set[Mesh]) -> dict[int, Params]:
-        """The parameters on the devices of each mesh, by its size.
-
-        Remembered while they are the very same arrays, which is what a caller passes call
-        after call: placing them costs more than a single plan. Arrays of NumPy may be
-        written to, so they are placed each time.
-        """
-        leaves, structure = jax.tree.flatten(params)
-        last, last_structure, placed = self._last
-        same = structure == last_structure and all(map(operator.is_, leaves, last))
-        if not same or not all(isinstance(leaf, jax.Array) for leaf in leaves):
-            placed = {}
-        missing = {mesh for mesh in meshes if mesh.size not in placed}
-        if missing:
-            placed = placed | {mesh.size: sharding.replicate(params, mesh) for mesh in missing}
-            self._last = leaves, structure, placed  # at once: another thread sees all or nothing
-        return placed
-
-    def sizes_up_to(self, batch: int) -> list[int]:
-        """The chunk sizes that batches of at most so many plans can need."""
-        batches = range(1, min(batch, 2 * self.chunk_sizes[-1]) + 1)
-        return sorted({size for b in batches for _, size, _ in split_batch(b, self.chunk_sizes)})
-
-
-def compile_planner(
-    energy: Energy,
-    config: PlannerConfig,
-    chunk_sizes: Sequence[int] = (1, 16, 128),
-    devices: Sequence[jax.Device] | None = None,
-) -> CompiledPlanner:
-    """Builds, once, the planner that serves batches of any size.
-
-    A batch is split into chunks of a few fixed sizes, so that 7, 300 or 10,000 contexts
-    just work: each chunk size compiles at its first use, a chunk fits the cache, only the
-    last chunk is ever padded, and all are dispatched before any is waited for.
-
-    Args:
-        energy: what to minimise.
-        config: of `gibbs`, `random_shooting` or `cross_entropy_method`, and which of them.
-        chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
-            split over as many of the devices as divide it.
-        devices: to plan on; all of this process, if not given.
-    """
-    return CompiledPlanner(energy, config, chunk_sizes, devices)
-
-
-def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Covers a batch with chunks: `(start, size, rows used)`, sizes in ascending order.
-
-    Greedy from the largest. What is left at the end is padded to the next size if it nearly
-    fills it, or if it would take many chunks of the smallest size: one plan alone takes
-    about a quarter of the time of sixteen.
-    """
-    chunks: list[tuple[int, int, int]] = []
-    start = 0
-    while start < batch:
-        left = batch - start
-        fitting = [size for size in sizes if size <= left]
-        larger = [size for size in sizes if size > left]
-        size = fitting[-1] if fitting else larger[0]
-        nearly_full = bool(larger) and left > 0.8 * larger[0]
-        one_by_one = bool(larger) and size == sizes[0] and left > larger[0] / 4
-        if nearly_full or one_by_one:
-            size = larger[0]
-        chunks.append((start, size, min(size, left)))
-        start += size
-    return chunks
-
-
-def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarray:
-    """Raw keys `[B, 2]` uint32: functions of (seed, episode, replan index), not of the row.
-
-    Args:
-        seed: of all plans.
-        episodes: `[B]` whose plan it is, such as a level seed.
-        replans: `[B]` how many plans the episode has had.
-    """
-    batch = len(episodes)
-    # Padded to a power of two, so that a shrinking batch does not compile at every size.
-    rows = np.minimum(np.arange(1 << max(batch - 1, 0).bit_length()), batch - 1)
-    folded = np.stack([episodes, replans]).astype(np.uint32)[:, rows]
-    return np.asarray(_fold_in(jax.random.key(seed), folded))[:batch]
-
-
-@jax.jit
-def _fold_in(key: jax.Array, indices: jax.Array) -> jax.Array:
-    """Key data `[B, 2]` of one key and indices `[2, B]`."""
-
-    def fold(episode: jax.Array, replan: jax.Array) -> jax.Array:
-        return jax.random.key_data(jax.random.fold_in(jax.random.fold_in(key, episode), replan))
-
-    return jax.vmap(fold)(*indices)
 
 
 def _check_positive(config: PlannerConfig, *names: str) -> None:

@@ -11,13 +11,14 @@ from jax.sharding import Mesh
 from leapjax import checkpoints, planners
 from leapjax.agents import leap
 from leapjax.agents.leap import TrainingConfig
+from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.envs import levels, vocabulary
 from leapjax.envs.adapter import NUM_ACTIONS
 from leapjax.envs.levels import Level
 from leapjax.errors import UserError
 from leapjax.files import write_text
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.planners import CompiledPlanner, GibbsConfig
+from leapjax.planners import GibbsConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
@@ -111,5 +112,5 @@ def load(path: str | os.PathLike[str], planner: planners.PlannerConfig | None = 
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = checkpoints.restore_params(folder / CHECKPOINTS, like)
     assert agent.energy is not None
-    plan = planners.compile_planner(agent.energy, planner or specification.planner)
+    plan = compile_planner(agent.energy, planner or specification.planner)
     return Pretrained(specification, agent.energy, params, plan)

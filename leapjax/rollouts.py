@@ -7,9 +7,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from leapjax import planners
+from leapjax.batching import CompiledPlanner, plan_keys
 from leapjax.envs.adapter import Adapter
-from leapjax.planners import CompiledPlanner
 from leapjax.types import Context, Params, PyTree, pad_token
 
 
@@ -129,7 +128,7 @@ def evaluate(
     while active:
         before = time.perf_counter()
         episodes = np.array([seeds[i] for i in active], np.uint32)
-        keys = planners.plan_keys(seed, episodes, np.full(len(active), replan, np.uint32))
+        keys = plan_keys(seed, episodes, np.full(len(active), replan, np.uint32))
         plans = plan(params, keys, stack_contexts([histories[i] for i in active]))
         if iteration is not None and not 1 <= iteration <= plans.trace.shape[1]:
             raise ValueError(f"iteration {iteration} is not in 1 .. {plans.trace.shape[1]}")

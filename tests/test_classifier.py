@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax import planners, training
+from leapjax import batching, training
 from leapjax.agents import classifier, leap
 from leapjax.agents.leap import TrainingConfig
 from leapjax.data import windows
@@ -72,9 +72,9 @@ def test_it_learns_how_corrupted_a_plan_is(trained):
 def test_one_plans_with_it_as_with_any_energy(trained):
     agent, params, batch, _ = trained
     assert not agent.energy.accepts_mask
-    keys = planners.plan_keys(0, np.arange(16), np.zeros(16, int))
+    keys = batching.plan_keys(0, np.arange(16), np.zeros(16, int))
     config = GibbsConfig(4, 13, order="sequential", score_trace=True)
-    plan = planners.compile_planner(agent.energy, config, (16,))(params, keys, batch.context)
+    plan = batching.compile_planner(agent.energy, config, (16,))(params, keys, batch.context)
     energies = np.asarray(plan.trace_energies)
     # Its conditional is its total with each action tried, so greedy steps never raise it,
     # once the random start's first action is not the end action.

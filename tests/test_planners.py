@@ -8,18 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from leapjax.batching import NotANumber, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
 from leapjax.planners import (
     ORDERS,
     CrossEntropyConfig,
     GibbsConfig,
-    NotANumber,
     ShootingConfig,
     bind,
-    compile_planner,
     gibbs,
-    plan_keys,
-    split_batch,
 )
 from leapjax.types import Energy
 from tests.enumerable import (

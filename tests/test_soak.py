@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments import babyai, results
 from experiments.config import Config
-from leapjax import planners, pretrained, rollouts, sharding, training
+from leapjax import batching, planners, pretrained, rollouts, sharding, training
 from leapjax.agents import leap
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
@@ -66,7 +66,7 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
     agent = leap.make_agent(MODEL, TRAINING, config.planner, sizes, LEVEL.words, mesh)
     begin = training.make_begin(agent, mesh)
     step = training.make_train_step(agent, lambda k, d: leap.make_batch(k, d, TRAINING, sizes))
-    plan = planners.compile_planner(agent.energy, config.planner)
+    plan = batching.compile_planner(agent.energy, config.planner)
     data = sharding.replicate(windows.concatenate(local_demonstrations), mesh)
     watch = Watch()
     for cycle in range(CYCLES):
