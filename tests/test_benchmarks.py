@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import planning, training
+from benchmarks import planning, scaling, training
 from experiments.config import preset
 from leapjax.envs import vocabulary
 from leapjax.models import trajectory
@@ -86,3 +86,15 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):
     assert training.main(["--levels", "Nowhere"]) == 2
     assert "Nowhere" in capsys.readouterr().err
+
+
+def test_the_scaling_benchmark_measures_its_settings(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(scaling, "SETTINGS", ((2, 1, 2),))
+    rows = tmp_path / "rows.json"
+    options = ["--per-device", "1", "--seconds", "0.01", "--json", str(rows)]
+    assert scaling.main(options) == 0
+    written = json.loads(rows.read_text())
+    assert [(row["processes"], row["devices"], row["fsdp"]) for row in written] == [(2, 2, 2)]
+    assert all(row["examples_per_second"] > 0 < row["exchange_seconds"] for row in written)
+    assert scaling.main(["--level", "GoToLocal"]) == 2
+    assert "unknown level" in capsys.readouterr().err

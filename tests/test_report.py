@@ -1,0 +1,48 @@
+"""Tables and plots say what the rows say."""
+
+from PIL import Image
+
+from experiments import plots, report
+
+
+def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
+    return {
+        "level": level, "preset": "leapjax", "demos": demos, "seed": seed, "episodes": 10,
+        "successes": successes, "validation": False, "paper_success": 95.0, **others,
+    }  # fmt: skip
+
+
+ROWS = [
+    row(), row(seed=1, successes=10), row(demos=50, successes=5), row(demos=50, successes=7),
+    row(demos=100, validation=True), row(demos=100, preset="paper"), row("PickUpLoc", successes=3),
+]  # fmt: skip
+
+
+def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_papers():
+    (line,) = (line for line in report.success(ROWS).splitlines() if "S8N7" in line)
+    assert line.startswith("| GoToLocalS8N7 | 95.0% | - | 95.0% [") and "2 seeds" in line
+
+
+def test_fewer_demonstrations_are_side_by_side():
+    lines = report.efficiency(ROWS).splitlines()
+    assert lines[0] == "| level | 50 demonstrations | 500 demonstrations | paper, 500 |"
+    assert len(lines) == 3  # PickUpLoc has only one number of demonstrations
+    cells = [cell.strip() for cell in lines[2].strip("|").split("|")]
+    assert cells[0] == "GoToLocalS8N7" and cells[1].startswith("70.0% [")
+    assert cells[2].startswith("95.0% [") and cells[3] == "95.0%"
+
+
+def test_data_efficiency_is_drawn(tmp_path):
+    path = tmp_path / "plot.png"
+    plots.data_efficiency(report.efficiency_by_level(ROWS), path)
+    assert Image.open(path).size[0] > 500
+
+
+def test_scaling_is_relative_to_two_devices_of_one_process():
+    measured = [
+        {"processes": p, "devices": d, "fsdp": 1, "seconds_per_step": 0.01,
+         "examples_per_second": e, "exchange_seconds": 0.001}
+        for p, d, e in ((1, 1, 600.0), (1, 2, 1000.0), (2, 2, 800.0))
+    ]  # fmt: skip
+    lines = report.scaling(measured).splitlines()[2:]
+    assert [line.split("|")[6].strip() for line in lines] == ["60%", "100%", "80%"]
