@@ -32,7 +32,15 @@ def model(architecture, past):
     """
     sizes = Sizes(SIDE, VOCABULARY, ACTIONS, past, HORIZON, MAX_STEPS)
     config = ModelConfig(
-        architecture, layers=2, heads=2, width=16, channels=8, rounds=1, fields=2, sweeps=5
+        architecture,
+        layers=2,
+        heads=2,
+        width=16,
+        channels=8,
+        rounds=1,
+        fields=2,
+        sweeps=5,
+        word_heads=2,
     )
     module = build(config, sizes)
 
@@ -418,7 +426,15 @@ def test_a_goal_that_is_not_available_is_nowhere():
 def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
     sizes = Sizes(SIDE, VOCABULARY, ACTIONS, 2, HORIZON, MAX_STEPS)
     config = ModelConfig(
-        architecture, layers=2, heads=2, width=16, channels=8, rounds=1, fields=2, sweeps=5
+        architecture,
+        layers=2,
+        heads=2,
+        width=16,
+        channels=8,
+        rounds=1,
+        fields=2,
+        sweeps=5,
+        word_heads=2,
     )
     params, _ = model(architecture, 2)
     context = random_context(0, 2)
