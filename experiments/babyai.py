@@ -84,9 +84,16 @@ def run_one(config: Config, seed: int, console: Console, interruption: Interrupt
     sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
     run = Run(config, level, seed, sizes, folder, console, interruption)
     # What can be refused is refused before the run has a folder.
-    trained = None if config.checkpoint is None else pipeline.reuse(run)
-    mesh = pipeline.training_mesh(config)
-    data = [] if trained else pipeline.gather(run)
+    if config.episodes < jax.process_count():
+        raise UserError(
+            f"--episodes {config.episodes}: fewer than the {jax.process_count()} processes"
+        )
+    trained, data = None, []
+    if config.checkpoint is not None:
+        trained = pipeline.reuse(run)
+    else:
+        mesh = pipeline.training_mesh(config)
+        data = pipeline.gather(run)
     seeds.check_disjoint([d.seed for d in data], episode_seeds)
     with contextlib.ExitStack() as stack:
         processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
