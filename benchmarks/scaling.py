@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 import tyro
-from jax.sharding import NamedSharding
 from rich.console import Console
 from rich.table import Table
 
@@ -159,11 +158,11 @@ def exchange(params: Any, mesh: jax.sharding.Mesh) -> Any:
     def on_each_device(parts: Any) -> Any:
         return sharding.scatter_mean(sharding.gather(parts, specs), specs)
 
-    places = jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
-    split = jax.shard_map(
-        on_each_device, mesh=mesh, in_specs=(specs,), out_specs=specs, check_vma=False
+    return jax.jit(
+        jax.shard_map(
+            on_each_device, mesh=mesh, in_specs=(specs,), out_specs=specs, check_vma=False
+        )
     )
-    return jax.jit(split, out_shardings=places)
 
 
 def table(rows: Sequence[Row]) -> Table:

@@ -14,7 +14,7 @@ import jax
 from rich.console import Console
 
 from experiments import pipeline, results, runtime
-from experiments.config import Config, configuration_hash, parse, resolved
+from experiments.config import Config, configuration_hash, episode_seeds, parse, resolved
 from experiments.interruption import Interrupted, Interruption, interruptible
 from experiments.pipeline import Run
 from leapjax import files, pretrained, processes, training
@@ -77,8 +77,7 @@ def run_one(config: Config, seed: int, console: Console, interruption: Interrupt
             console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
             return known
     level = levels.find_level(config.level)
-    first = seeds.validation_seeds if config.validation else seeds.test_seeds
-    episode_seeds = first(config.test_seed, config.episodes)
+    played = episode_seeds(config)
     folder = config.runs / f"{EXPERIMENT}-{config.level}-{config.preset}-seed{seed}-{name}"
     console.print(f"[bold]{config.level}[/bold], preset {config.preset}, seed {seed}: {folder}")
     sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
@@ -94,17 +93,17 @@ def run_one(config: Config, seed: int, console: Console, interruption: Interrupt
     else:
         mesh = pipeline.training_mesh(config)
         data = pipeline.gather(run)
-    seeds.check_disjoint([d.seed for d in data], episode_seeds)
+    seeds.check_disjoint([d.seed for d in data], played)
     with contextlib.ExitStack() as stack:
         processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
         planner, metrics = (trained, []) if trained else pipeline.fit(run, data, mesh)
-        episodes = pipeline.measure(planner, run, episode_seeds)
+        episodes = pipeline.measure(planner, run, played)
         row = make_row(run, name, planner, episodes)
 
         def write() -> None:
             results.record(RECORDED if config.record else config.runs / RECORDED.name, row)
             if config.pictures:
-                pipeline.draw(planner, run, episode_seeds, metrics)
+                pipeline.draw(planner, run, played, metrics)
 
         processes.first_does(write)
     console.print(

@@ -178,8 +178,7 @@ def check(config: Config) -> None:
         raise UserError("--seeds needs at least one seed")
     for seed in config.seeds:
         seeds.training_seeds(seed)
-    first = seeds.validation_seeds if config.validation else seeds.test_seeds
-    first(config.test_seed, config.episodes)
+    episode_seeds(config)
     if config.demos > seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
     if not config.checkpoint_seconds >= 0:
@@ -196,6 +195,16 @@ def check(config: Config) -> None:
             f"--horizon {config.planner.horizon} is longer than an episode of {level.name} "
             f"may last: its step limit is {limit}"
         )
+
+
+def episode_seeds(config: Config) -> range:
+    """The level seeds of the episodes that success is measured on.
+
+    Raises:
+        UserError: they leave their range.
+    """
+    first = seeds.validation_seeds if config.validation else seeds.test_seeds
+    return first(config.test_seed, config.episodes)
 
 
 def shortest_limit(level: Level) -> int:

@@ -87,7 +87,7 @@ class Checkpoints:
         Raises:
             UserError: a checkpoint is whole, but of another configuration.
         """
-        blank = TrainState(*jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like))
+        blank = _blank(like)
         found: list[TrainState] = []
 
         def read() -> bool:
@@ -165,8 +165,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
     for step in steps:
         path = folder.absolute() / str(step)
         try:
-            blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
-            target = _with_digests({"params": blank})
+            target = _with_digests({"params": _blank(like)})
             found = {k: v for k, v in _saved_shapes(path).items() if "params" in k.split("/")[:2]}
             _check_shapes(found, target, path)
             arguments = ocp.checkpoint_utils.construct_restore_args(target)
@@ -187,6 +186,11 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
                 warnings.warn(f"{reason}: using step {step}", stacklevel=2)
             return jax.tree.map(jnp.asarray, params)
     raise UserError("; ".join(reasons))
+
+
+def _blank(like: PyTree) -> PyTree:
+    """Arrays of NumPy to say what is to be read."""
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
 
 
 def _with_digests(parts: dict[str, PyTree]) -> dict[str, PyTree]:

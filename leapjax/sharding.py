@@ -21,10 +21,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from leapjax.types import PyTree
 
-DATA, FSDP = "data", "fsdp"  # the axes of every mesh
+DATA, FSDP = AXES = "data", "fsdp"  # of every mesh
 
 REPLICATED = PartitionSpec()
-SPLIT = PartitionSpec((DATA, FSDP))  # a batch, by its first dimension
+SPLIT = PartitionSpec(AXES)  # a batch, by its first dimension
 SMALLEST_SPLIT = 1024  # elements; smaller parameters are whole everywhere
 
 
@@ -50,7 +50,7 @@ def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int
         count = each * len(groups)
         if batch % count == 0 and count % fsdp == 0:
             chosen = [device for index in sorted(groups) for device in groups[index][:each]]
-            return Mesh(np.array(chosen).reshape(count // fsdp, fsdp), (DATA, FSDP))
+            return Mesh(np.array(chosen).reshape(count // fsdp, fsdp), AXES)
     raise ValueError(
         f"a batch of {batch} and parameters split in {fsdp} do not fit {len(groups)} process(es) "
         f"of {most} device(s): the devices used must divide the batch, and be a multiple of {fsdp}"
@@ -139,7 +139,7 @@ def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
     parts, structure = jax.tree.flatten(jax.tree.map(part, tree, specs))
     split = [FSDP in spec for spec in jax.tree.leaves(specs)]
     # One message instead of one for each array: between processes each costs its latency.
-    for axes, chosen in (((DATA, FSDP), False), ((DATA,), True)):
+    for axes, chosen in ((AXES, False), ((DATA,), True)):
         places = [place for place, is_split in enumerate(split) if is_split == chosen]
         flat, unflatten = ravel_pytree([parts[place] for place in places])
         means = unflatten(jax.lax.pmean(flat, axes))

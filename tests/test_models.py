@@ -22,6 +22,13 @@ END, MASK, PAD = ACTIONS - 1, mask_token(ACTIONS), pad_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
 
 
+def tiny(architecture):
+    return ModelConfig(
+        architecture, layers=2, heads=2, width=16, channels=8, rounds=1, fields=2, sweeps=5,
+        word_heads=2,
+    )  # fmt: skip
+
+
 @functools.cache
 def model(architecture, past):
     """A tiny model with random parameters: `(params, evaluate)`.
@@ -31,17 +38,7 @@ def model(architecture, past):
     conditional at one position and at all positions masked together; and the total energy.
     """
     sizes = Sizes(SIDE, VOCABULARY, ACTIONS, past, HORIZON, MAX_STEPS)
-    config = ModelConfig(
-        architecture,
-        layers=2,
-        heads=2,
-        width=16,
-        channels=8,
-        rounds=1,
-        fields=2,
-        sweeps=5,
-        word_heads=2,
-    )
+    config = tiny(architecture)
     module = build(config, sizes)
 
     def encode(params, context):
@@ -425,17 +422,7 @@ def test_a_goal_that_is_not_available_is_nowhere():
 @EACH_ARCHITECTURE
 def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
     sizes = Sizes(SIDE, VOCABULARY, ACTIONS, 2, HORIZON, MAX_STEPS)
-    config = ModelConfig(
-        architecture,
-        layers=2,
-        heads=2,
-        width=16,
-        channels=8,
-        rounds=1,
-        fields=2,
-        sweeps=5,
-        word_heads=2,
-    )
+    config = tiny(architecture)
     params, _ = model(architecture, 2)
     context = random_context(0, 2)
     actions = jnp.zeros(HORIZON, jnp.int32)

@@ -45,10 +45,9 @@ def make_update(
         specs = sharding.parameter_specs(params, mesh)
 
         def on_each_device(parts: Params, rows: PyTree, key: jax.Array) -> PyTree:
-            axes = (sharding.DATA, sharding.FSDP)
-            first = jax.lax.axis_index(axes) * jax.tree.leaves(rows)[0].shape[0]
+            first = jax.lax.axis_index(sharding.AXES) * jax.tree.leaves(rows)[0].shape[0]
             means, gradients = differentiate(sharding.gather(parts, specs), rows, key, first)
-            return jax.lax.pmean(means, axes), sharding.scatter_mean(gradients, specs)
+            return jax.lax.pmean(means, sharding.AXES), sharding.scatter_mean(gradients, specs)
 
         return jax.shard_map(
             on_each_device, mesh=mesh, check_vma=False,

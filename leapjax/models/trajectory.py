@@ -44,13 +44,9 @@ class ModelConfig:
                 f"unknown architecture {self.architecture!r}: "
                 f"expected one of {', '.join(ARCHITECTURES)}"
             )
-        sizes = ("layers", "heads", "width", "channels", "fields", "sweeps")
-        for name, least in {
-            **dict.fromkeys(sizes, 1),
-            "rounds": 0,
-            "radius": 0,
-            "word_heads": 0,
-        }.items():
+        may_be_none = ("rounds", "radius", "word_heads")
+        for name in ("layers", "heads", "width", "channels", "fields", "sweeps", *may_be_none):
+            least = 0 if name in may_be_none else 1
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 <= self.dropout < 1:
