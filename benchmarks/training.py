@@ -156,6 +156,7 @@ def random_steps(sizes: Sizes, words: int) -> Steps:
         LENGTH - step,
         np.arange(EPISODES, dtype=np.int32) * LENGTH,
         np.full(EPISODES, LENGTH, np.int32),
+        np.zeros((count, sizes.side, sizes.side), bool),
     )
 
 

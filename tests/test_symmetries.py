@@ -1,7 +1,5 @@
 import functools
-from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -9,24 +7,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
-from minigrid.core.grid import Grid
-from minigrid.core.mission import MissionSpace
-from minigrid.core.world_object import WorldObj
-from minigrid.minigrid_env import MiniGridEnv
 
-from leapjax.data import demonstrations, symmetries, windows
+from leapjax.data import demonstrations, symmetries
 from leapjax.data.symmetries import Renaming
-from leapjax.data.windows import GridWords
-from leapjax.envs import levels, observations, vocabulary
-from leapjax.envs.adapter import END, BabyAIAdapter
+from leapjax.envs import levels, vocabulary
+from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.types import Observation
+from tests.dynamics import FRONT, stepped
 from tests.oracles import assert_same_observation
 
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)
 EMPTY, DOOR, KEY, BALL, BOX, AGENT = 1, 4, 5, 6, 7, 10
 OPEN, CLOSED, LOCKED = 0, 1, 2
-FRONT = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Rooms, open doors, closed doors, locked doors with a key, things to pick up.
 LEVELS = (
     "GoToLocalS8N7",
@@ -38,11 +30,6 @@ LEVELS = (
 )
 WORD_IDS = vocabulary.WORD_IDS
 MIRRORED = jnp.asarray(vocabulary.mirrored_words())
-GRID_WORDS = GridWords(
-    jnp.asarray(vocabulary.colour_words()),
-    jnp.asarray(vocabulary.object_words((KEY, BALL, BOX))),
-    MIRRORED,
-)
 
 rotate = jax.jit(symmetries.rotate)
 reflect = jax.jit(symmetries.reflect)
@@ -51,39 +38,6 @@ rotate_all, reflect_all, rename_all = (
     jax.jit(jax.vmap(transform, in_axes=(0, None)))
     for transform in (symmetries.rotate, symmetries.reflect, symmetries.rename)
 )
-augment = jax.jit(windows.augment, static_argnums=3)
-window_at = jax.jit(windows.window, static_argnums=(2, 3, 4))
-
-
-class Bare(MiniGridEnv):
-    """MiniGrid's own dynamics in a state that an `Observation` describes."""
-
-    def __init__(self, observation: Observation) -> None:
-        side = observation.grid.shape[0]
-        mission = MissionSpace(mission_func=lambda: "")
-        super().__init__(mission, grid_size=side, max_steps=10**6)
-        self.grid, _ = Grid.decode(np.asarray(observation.grid))
-        self.agent_pos = tuple(int(v) for v in observation.pose[:2])
-        self.agent_dir = int(observation.pose[2])
-        kind, colour = (int(v) for v in observation.carried)
-        self.carrying = WorldObj.decode(kind, colour, 0) if kind else None
-        self.step_count = 0
-        self.rest = observation
-
-    def gen_obs(self):
-        return {}
-
-    def observe(self) -> Observation:
-        goal = tuple(int(v) for v in self.rest.goal)
-        side = self.rest.grid.shape[0]
-        return observations.observe(self, side, goal, np.asarray(self.rest.instruction))
-
-
-def stepped(observation: Observation, action: int) -> Observation:
-    """The state after an action, by MiniGrid."""
-    env = Bare(observation)
-    env.step(action)
-    return env.observe()
 
 
 def front(observation: Observation) -> np.ndarray:
@@ -344,103 +298,3 @@ def test_renaming_nothing_in_hand_leaves_nothing_in_hand():
     state = random_observation(0, 5, False)._replace(carried=np.zeros(2, np.int32))
     renaming = recolouring(np.array([3, 4, 5, 0, 1, 2]), {KEY: BOX, BOX: KEY})
     np.testing.assert_array_equal(rename(state, renaming).carried, [0, 0])
-
-
-@functools.cache
-def whole_windows(name: str, context: int, horizon: int) -> list[windows.Window]:
-    """The window at the start of each of some demonstrations."""
-    level = levels.find_level(name)
-    collected = demonstrations.collect(level, 6, seed=1).demonstrations
-    steps = windows.concatenate([d for d in collected if len(d.actions) < horizon])
-    steps = jax.tree.map(jnp.asarray, steps)
-    return [window_at(steps, i, context, horizon, END) for i in steps.starts]
-
-
-@pytest.mark.parametrize("name", ["GoToLocalS8N7", "GoToObjMazeS4R2Close", "PickUpLoc"])
-@pytest.mark.parametrize("exchange_objects", [False, True])
-def test_an_augmented_demonstration_still_does_what_it_is_told(name, exchange_objects):
-    seen = set()
-    for number, window in enumerate(whole_windows(name, 0, 32)):
-        for key in range(4):
-            fold = jax.random.key(10 * number + key)
-            changed = jax.device_get(augment(fold, window, GRID_WORDS, exchange_objects))
-            state = changed.context.observation
-            for action in changed.actions[changed.actions != END]:
-                previous, state = state, stepped(state, int(action))
-            x, y, direction = (int(v) for v in state.pose)
-            dx, dy = FRONT[direction]
-            assert (x + dx, y + dy) == tuple(state.goal)
-            words = vocabulary.decode(state.instruction).split()
-            if name == "PickUpLoc":
-                assert not previous.carried.any()
-                kind, colour = state.carried
-            else:
-                kind, colour, _ = state.grid[tuple(state.goal)]
-            kinds = {w: OBJECT_TO_IDX[w] for w in ("key", "ball", "box", "door") if w in words}
-            colours = {w: COLOR_TO_IDX[w] for w in COLOR_TO_IDX if w in words}
-            assert not kinds or list(kinds.values()) == [kind]
-            assert not colours or list(colours.values()) == [colour]
-            assert_place_holds(changed.context.observation, words)
-            seen.add((kind, colour, changed.actions.tobytes()))
-    assert len(seen) > 8  # and they were changed
-
-
-def assert_place_holds(state: Observation, words: list[str]) -> None:
-    """The goal is on the side that the instruction names."""
-    offset = np.asarray(state.goal) - state.pose[:2]
-    ahead = np.array(FRONT[state.pose[2]])
-    right = np.array([-ahead[1], ahead[0]])
-    sides = {"front": ahead, "behind": -ahead, "left": -right, "right": right}
-    for word, side in sides.items():
-        assert word not in words or offset @ side > 0
-
-
-def test_augmentation_covers_the_symmetries_and_depends_on_its_key():
-    window = whole_windows("GoToLocalS8N7", 0, 32)[0]
-    state = window.context.observation
-    (x, y), side = (int(v) for v in state.goal), state.grid.shape[0]
-
-    def draw(key: int, exchange_objects: bool) -> tuple[int, int, int]:
-        """The target's row, kind and colour."""
-        changed = augment(jax.random.key(key), window, GRID_WORDS, exchange_objects)
-        row = int(changed.context.observation.goal[1])
-        kind, colour, _ = np.asarray(changed.context.observation.grid)[x, row].tolist()
-        return row, kind, colour
-
-    draws = [draw(key, True) for key in range(200)]
-    assert draws[:20] == [draw(key, True) for key in range(20)]
-    rows, kinds, colours = (Counter(column) for column in zip(*draws, strict=True))
-    assert rows.keys() == {y, side - 1 - y} and min(rows.values()) > 60
-    assert kinds.keys() == {KEY, BALL, BOX} and min(kinds.values()) > 40
-    assert len(colours) == 6 and min(colours.values()) > 15
-    assert {draw(key, False)[1] for key in range(20)} == {int(state.grid[x, y, 0])}
-
-
-def test_the_past_is_transformed_with_the_present():
-    name, context = "GoToObjMazeS4R2Close", 3
-    level = levels.find_level(name)
-    [demonstration] = [
-        d for d in demonstrations.collect(level, 6, seed=1).demonstrations if len(d.actions) > 5
-    ][:1]
-    steps = jax.tree.map(jnp.asarray, windows.concatenate([demonstration]))
-    window = window_at(steps, jnp.int32(4), context, 2, END)
-    for key in range(6):
-        changed = jax.device_get(augment(jax.random.key(key), window, GRID_WORDS, True))
-        past = [jax.tree.map(lambda x, i=i: x[i], changed.context.past) for i in range(context)]
-        moments = [*past, changed.context.observation]
-        for (before, after), action in zip(pairwise(moments), changed.context.actions, strict=True):
-            hidden = stepped(before, int(action))
-            np.testing.assert_array_equal(hidden.pose, after.pose)
-            np.testing.assert_array_equal(before.instruction, after.instruction)
-            np.testing.assert_array_equal(before.goal, after.goal)
-
-
-def test_what_was_before_the_start_stays_blank():
-    level = levels.find_level("GoToLocalS7N5")
-    collected = demonstrations.collect(level, 1, seed=1).demonstrations
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected))
-    window = window_at(steps, jnp.int32(0), 3, 2, END)
-    for key in range(8):
-        changed = augment(jax.random.key(key), window, GRID_WORDS, True)
-        for leaf in jax.tree.leaves(changed.context.past):
-            np.testing.assert_array_equal(leaf, np.zeros_like(leaf))

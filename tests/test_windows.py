@@ -12,7 +12,7 @@ from leapjax.data.windows import Steps, Window
 from leapjax.types import Context, Observation
 from tests.oracles import assert_same_observation
 
-SIDE, WORDS = 4, 3
+SIDE, WORDS, DROP = 8, 3, 4
 END, PAD = 6, 8  # of a set of seven actions: MASK, 7, is between them
 LENGTHS = (1, 4, 2, 7)
 
@@ -61,7 +61,21 @@ def slow_window(demonstration: Demonstration, start: int, context: int, horizon:
             np.int32(start),
         ),
         np.array(planned, np.int32),
+        slow_way(demonstration, start),
     )
+
+
+def slow_way(demonstration: Demonstration, start: int) -> np.ndarray:
+    """The cells that must stay free, one step at a time."""
+    way = np.zeros(demonstration.observations.grid.shape[1:3], bool)
+    for step, (x, y, direction) in enumerate(demonstration.observations.pose.tolist()):
+        if step < start:
+            continue
+        way[x, y] = True
+        if step < len(demonstration.actions) and demonstration.actions[step] == DROP:
+            dx, dy = ((1, 0), (0, 1), (-1, 0), (0, -1))[direction]
+            way[min(max(x + dx, 0), len(way) - 1), min(max(y + dy, 0), len(way) - 1)] = True
+    return way
 
 
 @functools.cache
@@ -75,6 +89,7 @@ def assert_same_window(actual: Window, expected: Window) -> None:
     np.testing.assert_array_equal(actual.context.actions, expected.context.actions)
     np.testing.assert_array_equal(actual.context.step, expected.context.step)
     np.testing.assert_array_equal(actual.actions, expected.actions)
+    np.testing.assert_array_equal(actual.way, expected.way)
     types = jax.tree.map(lambda x: x.dtype, actual)
     assert types == jax.tree.map(lambda x: x.dtype, expected)
 

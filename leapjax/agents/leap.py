@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from leapjax import planners, schedules
 from leapjax.agents.gradients import make_update
-from leapjax.data import symmetries, windows
+from leapjax.data import augmentation, symmetries, windows
 from leapjax.data.windows import Steps, Window
 from leapjax.energy import pseudo_likelihood
 from leapjax.envs import vocabulary
@@ -37,6 +37,7 @@ class TrainingConfig:
     windows: str = "episode"  # drawn by "episode" or by "step"
     augment: bool = False  # leapjax: mirror, recolour and rename at random
     exchange_objects: bool = False  # with augment: key, ball and box are alike
+    clutter: float = 0.0  # leapjax: fill up to this share of the cells that nobody needs
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch"):
@@ -44,7 +45,7 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         ranges = {
             "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
-            "warmup": (0, math.inf), "clip": (0, math.inf),
+            "warmup": (0, math.inf), "clip": (0, math.inf), "clutter": (0, 1),
         }  # fmt: skip
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:  # false for NaN too
@@ -141,22 +142,25 @@ def make_agent(
 
 def make_batch(key: jax.Array, steps: Steps, training: TrainingConfig, sizes: Sizes) -> Window:
     """The batch `[B, ...]` of a key: windows, augmented where asked for."""
-    window_key, augment_key = jax.random.split(key)
+    window_key, augment_key, clutter_key = jax.random.split(key, 3)
     batch = windows.sample_windows(
         window_key, steps, training.batch, sizes.context, sizes.horizon,
         sizes.num_actions - 1, training.windows,
     )  # fmt: skip
-    if not training.augment:
-        return batch
-    words = windows.GridWords(
-        jnp.asarray(vocabulary.colour_words()),
-        jnp.asarray(vocabulary.object_words(symmetries.INTERCHANGEABLE)),
-        jnp.asarray(vocabulary.mirrored_words()),
-    )
-    keys = jax.random.split(augment_key, training.batch)
-    return jax.vmap(lambda k, w: windows.augment(k, w, words, training.exchange_objects))(
-        keys, batch
-    )
+    if training.clutter:
+        keys = jax.random.split(clutter_key, training.batch)
+        batch = jax.vmap(lambda k, w: augmentation.clutter(k, w, training.clutter))(keys, batch)
+    if training.augment:
+        words = augmentation.GridWords(
+            jnp.asarray(vocabulary.colour_words()),
+            jnp.asarray(vocabulary.object_words(symmetries.INTERCHANGEABLE)),
+            jnp.asarray(vocabulary.mirrored_words()),
+        )
+        keys = jax.random.split(augment_key, training.batch)
+        batch = jax.vmap(lambda k, w: augmentation.augment(k, w, words, training.exchange_objects))(
+            keys, batch
+        )
+    return batch
 
 
 def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:

@@ -15,7 +15,9 @@ import numpy as np
 from leapjax.types import Observation
 
 DIRECTION_VECTORS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], np.int32)  # [4, 2]
-LEFT, RIGHT = 0, 1  # MiniGrid's turn actions
+LEFT, RIGHT, DROP = 0, 1, 4  # MiniGrid's actions that tell left from right, or need a free cell
+EMPTY = 1  # MiniGrid's object index of a cell with nothing in it
+COLOURS = 6  # of MiniGrid
 FIRST_COLOURED, LAST_COLOURED = 4, 7  # MiniGrid's object indices: door, key, ball, box
 # Key, ball and box: alike where no door is locked and nobody toggles a box, which would vanish.
 INTERCHANGEABLE = (5, 6, 7)

@@ -2,7 +2,8 @@
 
 A window starts at one step of one demonstration. It holds the K steps before it, the
 state there, and the T actions from there on; past the end of the demonstration the action
-is `end`, predicted like any other. States after the start never enter (paper, eq. 4).
+is `end`, predicted like any other. States after the start never enter (paper, eq. 4); the
+cells that they need free are kept for augmentation, and no model sees them.
 """
 
 import hashlib
@@ -27,14 +28,7 @@ class Steps(NamedTuple):
     remaining: Array  # [M] int32: actions of the episode from here on, this one included
     starts: Array  # [E] int32: the index of each episode's first step
     lengths: Array  # [E] int32: its number of actions
-
-
-class GridWords(NamedTuple):
-    """Which token ids name what, for the symmetries of a world with instructions."""
-
-    colours: Array  # [6] int32, in MiniGrid's order of colours
-    objects: Array  # [3] int32: key, ball, box
-    mirrored: Array  # [vocabulary] int32: the word that each word becomes in a mirror
+    way: Array  # [M, S, S] bool: cells that the episode needs free from here on
 
 
 class Window(NamedTuple):
@@ -42,6 +36,7 @@ class Window(NamedTuple):
 
     context: Context
     actions: Array  # [T] int32: what to predict
+    way: Array  # [S, S] bool: cells that the rest of the demonstration needs free
 
 
 def fingerprint(steps: Steps) -> str:
@@ -66,7 +61,20 @@ def concatenate(demonstrations: Sequence[Demonstration]) -> Steps:
         np.repeat(lengths, lengths) - step,
         np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
         lengths,
+        np.concatenate([_way(d) for d in demonstrations]),
     )
+
+
+def _way(demonstration: Demonstration) -> np.ndarray:
+    """`[n, S, S]` bool: where the agent stands, or puts something down, from each step on."""
+    poses, actions = demonstration.observations.pose, demonstration.actions
+    needed = np.zeros((len(poses), *demonstration.observations.grid.shape[1:3]), bool)
+    needed[np.arange(len(poses)), poses[:, 0], poses[:, 1]] = True
+    drops = np.flatnonzero(actions == symmetries.DROP)
+    front = poses[drops, :2] + symmetries.DIRECTION_VECTORS[poses[drops, 2]]
+    front = front.clip(0, needed.shape[1] - 1)  # a user's data may face out of the grid
+    needed[drops, front[:, 0], front[:, 1]] = True
+    return np.logical_or.accumulate(needed[::-1])[::-1][:-1]
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
@@ -99,6 +107,7 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
             steps.step[index],
         ),
         actions,
+        steps.way[index],
     )
 
 
@@ -123,59 +132,3 @@ def sample_windows(
     else:
         raise ValueError(f"unknown sampling {by!r}: expected episode or step")
     return jax.vmap(lambda i: window(steps, i, context, horizon, end))(index)
-
-
-def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:
-    """A window as it could have been: mirrored, recoloured, with other objects.
-
-    Each is a symmetry of the levels, so the result is just as good a demonstration.
-
-    Args:
-        key: chooses.
-        window: one training example.
-        words: which word names what.
-        exchange_objects: whether key, ball and box are alike, which they are in
-            demonstrations that unlock no door and toggle no box.
-    """
-    flip_key, colour_key, object_key = jax.random.split(key, 3)
-    colours = jax.random.permutation(colour_key, len(words.colours))
-    objects = jnp.arange(symmetries.AGENT + 1)
-    kinds = jnp.array(symmetries.INTERCHANGEABLE)
-    vocabulary = jnp.arange(words.mirrored.shape[0])
-    vocabulary = vocabulary.at[words.colours].set(words.colours[colours])
-    if exchange_objects:
-        order = jax.random.permutation(object_key, len(kinds))
-        objects = objects.at[kinds].set(kinds[order])
-        vocabulary = vocabulary.at[words.objects].set(words.objects[order])
-    renaming = symmetries.Renaming(colours, objects, vocabulary)
-    context = window.context
-    renamed = window._replace(
-        context=context._replace(
-            observation=symmetries.rename(context.observation, renaming),
-            past=jax.vmap(lambda o: symmetries.rename(o, renaming))(context.past),
-        )
-    )
-    flip = jax.random.bernoulli(flip_key)
-    mirrored = reflect(renamed, words.mirrored)
-    return jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored, renamed)
-
-
-def reflect(window: Window, mirrored_words: jax.Array) -> Window:
-    """The mirror image of one window."""
-    context = window.context
-    past = jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past)
-    # Blank states before the start have no mirror image.
-    length = context.actions.shape[0]
-    known = jnp.arange(length, 0, -1) <= context.step
-
-    def keep_blank(mirrored: jax.Array, original: jax.Array) -> jax.Array:
-        return jnp.where(known.reshape(length, *(1,) * (mirrored.ndim - 1)), mirrored, original)
-
-    return Window(
-        context._replace(
-            observation=symmetries.reflect(context.observation, mirrored_words),
-            past=jax.tree.map(keep_blank, past, context.past),
-            actions=symmetries.reflect_actions(context.actions),
-        ),
-        symmetries.reflect_actions(window.actions),
-    )

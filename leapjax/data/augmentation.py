@@ -1,0 +1,118 @@
+"""More windows from the same demonstrations: symmetries of the world, and clutter in it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.data import symmetries
+from leapjax.data.windows import Window
+from leapjax.types import Array
+
+
+class GridWords(NamedTuple):
+    """Which token ids name what, for the symmetries of a world with instructions."""
+
+    colours: Array  # [6] int32, in MiniGrid's order of colours
+    objects: Array  # [3] int32: key, ball, box
+    mirrored: Array  # [vocabulary] int32: the word that each word becomes in a mirror
+
+
+def clutter(key: jax.Array, window: Window, share: float) -> Window:
+    """A window with objects where the demonstration never goes.
+
+    The shortest way stays the shortest when others are blocked, so the demonstration stays as
+    good as it was; what changes is what it shows: that ways lead around things.
+
+    Half of the windows stay as they are; in the others each free cell gets an object with a
+    probability that is drawn for the window, in 0 .. `share`. Kind and colour both differ from
+    the target's, so that no instruction means the new object. Windows without a goal stay as
+    they are, because what their instruction means is not known here.
+
+    Args:
+        key: chooses.
+        window: one training example.
+        share: of the cells that nobody needs, in 0 .. 1.
+    """
+    share_key, where_key, kind_key, colour_key = jax.random.split(key, 4)
+    context = window.context
+    grid, past, goal = context.observation.grid, context.past.grid, context.observation.goal
+    cells = grid.shape[:2]
+    # Free now and in all of the past, of which cells before the start are all zero.
+    free = (grid[..., 0] == symmetries.EMPTY) & (past[..., 0] <= symmetries.EMPTY).all(axis=0)
+    probability = share * jax.random.uniform(share_key, minval=-1.0)  # negative: none
+    filled = jax.random.uniform(where_key, cells) < probability
+    filled &= free & ~window.way & (goal[0] >= 0)
+    target = grid[goal[0], goal[1]].astype(jnp.int32)
+    kinds = jnp.array(symmetries.INTERCHANGEABLE)
+    # Not the target's: a shift by at least one, around a circle.
+    shift = jax.random.randint(kind_key, cells, 1, len(kinds))
+    kind = kinds[(target[0] - kinds[0] + shift) % len(kinds)]
+    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
+    colour = (target[1] + shift) % symmetries.COLOURS
+    objects = jnp.stack([kind, colour, jnp.zeros_like(kind)], axis=-1).astype(grid.dtype)
+
+    def fill(image: jax.Array) -> jax.Array:
+        known = image[..., 0] == symmetries.EMPTY
+        return jnp.where((filled & known)[..., None], objects, image)
+
+    observation = context.observation._replace(grid=fill(grid))
+    before = context.past._replace(grid=jax.vmap(fill)(past))
+    return window._replace(context=context._replace(observation=observation, past=before))
+
+
+def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:
+    """A window as it could have been: mirrored, recoloured, with other objects.
+
+    Each is a symmetry of the levels, so the result is just as good a demonstration.
+
+    Args:
+        key: chooses.
+        window: one training example.
+        words: which word names what.
+        exchange_objects: whether key, ball and box are alike, which they are in
+            demonstrations that unlock no door and toggle no box.
+    """
+    flip_key, colour_key, object_key = jax.random.split(key, 3)
+    colours = jax.random.permutation(colour_key, len(words.colours))
+    objects = jnp.arange(symmetries.AGENT + 1)
+    kinds = jnp.array(symmetries.INTERCHANGEABLE)
+    vocabulary = jnp.arange(words.mirrored.shape[0])
+    vocabulary = vocabulary.at[words.colours].set(words.colours[colours])
+    if exchange_objects:
+        order = jax.random.permutation(object_key, len(kinds))
+        objects = objects.at[kinds].set(kinds[order])
+        vocabulary = vocabulary.at[words.objects].set(words.objects[order])
+    renaming = symmetries.Renaming(colours, objects, vocabulary)
+    context = window.context
+    renamed = window._replace(
+        context=context._replace(
+            observation=symmetries.rename(context.observation, renaming),
+            past=jax.vmap(lambda o: symmetries.rename(o, renaming))(context.past),
+        )
+    )
+    flip = jax.random.bernoulli(flip_key)
+    mirrored = reflect(renamed, words.mirrored)
+    return jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored, renamed)
+
+
+def reflect(window: Window, mirrored_words: jax.Array) -> Window:
+    """The mirror image of one window."""
+    context = window.context
+    past = jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past)
+    # Blank states before the start have no mirror image.
+    length = context.actions.shape[0]
+    known = jnp.arange(length, 0, -1) <= context.step
+
+    def keep_blank(mirrored: jax.Array, original: jax.Array) -> jax.Array:
+        return jnp.where(known.reshape(length, *(1,) * (mirrored.ndim - 1)), mirrored, original)
+
+    return window._replace(
+        context=context._replace(
+            observation=symmetries.reflect(context.observation, mirrored_words),
+            past=jax.tree.map(keep_blank, past, context.past),
+            actions=symmetries.reflect_actions(context.actions),
+        ),
+        actions=symmetries.reflect_actions(window.actions),
+        way=window.way[:, ::-1],
+    )

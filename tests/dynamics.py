@@ -1,0 +1,43 @@
+"""MiniGrid's own dynamics, from a state that an `Observation` describes."""
+
+import numpy as np
+from minigrid.core.grid import Grid
+from minigrid.core.mission import MissionSpace
+from minigrid.core.world_object import WorldObj
+from minigrid.minigrid_env import MiniGridEnv
+
+from leapjax.envs import observations
+from leapjax.types import Observation
+
+FRONT = ((1, 0), (0, 1), (-1, 0), (0, -1))  # the cell ahead, by direction
+
+
+class Bare(MiniGridEnv):
+    """MiniGrid's own dynamics in a state that an `Observation` describes."""
+
+    def __init__(self, observation: Observation) -> None:
+        side = observation.grid.shape[0]
+        mission = MissionSpace(mission_func=lambda: "")
+        super().__init__(mission, grid_size=side, max_steps=10**6)
+        self.grid, _ = Grid.decode(np.asarray(observation.grid))
+        self.agent_pos = tuple(int(v) for v in observation.pose[:2])
+        self.agent_dir = int(observation.pose[2])
+        kind, colour = (int(v) for v in observation.carried)
+        self.carrying = WorldObj.decode(kind, colour, 0) if kind else None
+        self.step_count = 0
+        self.rest = observation
+
+    def gen_obs(self):
+        return {}
+
+    def observe(self) -> Observation:
+        goal = tuple(int(v) for v in self.rest.goal)
+        side = self.rest.grid.shape[0]
+        return observations.observe(self, side, goal, np.asarray(self.rest.instruction))
+
+
+def stepped(observation: Observation, action: int) -> Observation:
+    """The state after an action, by MiniGrid."""
+    env = Bare(observation)
+    env.step(action)
+    return env.observe()
