@@ -7,7 +7,6 @@ in the same run on the same layer shapes.
 """
 
 import dataclasses
-import json
 import resource
 import sys
 import time
@@ -24,9 +23,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.timing import fastest, matmul_peak
+from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments import runtime
-from leapjax import files
 from leapjax.agents import leap
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys, split_batch
 from leapjax.envs import vocabulary
@@ -47,7 +45,6 @@ MODELS = {
     "leapjax": ModelConfig("leapjax", dropout=0.0, sweeps=14),
 }
 PREFIX_TOKENS = 4  # of the leapjax model
-Row = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.large:
         for name in MODELS:
             console.print(plan_many(name, options.large))
-    if options.json:
-        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
     return 0

@@ -6,12 +6,11 @@ first states of those levels, because an early stop depends on them.
 """
 
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import matplotlib
 import numpy as np
@@ -19,9 +18,9 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.timing import fastest
+from benchmarks.timing import Row, fastest, write_rows
 from experiments import results, runtime
-from leapjax import files, pretrained, rollouts
+from leapjax import pretrained, rollouts
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
 from leapjax.envs import levels
@@ -35,7 +34,6 @@ import matplotlib.pyplot as plt
 
 # Plans per second of the authors' code, by (T, N), one by one on two cores.
 AUTHORS = {(5, 10): 11.8, (10, 30): 2.9, (15, 50): 1.2}
-Row = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     Console().print(table(rows))
-    if options.json:
-        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
     return 0

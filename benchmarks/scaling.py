@@ -22,17 +22,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.timing import fastest
-from benchmarks.training import random_steps
+from benchmarks.timing import Row, fastest, write_rows
+from benchmarks.training import Stepper
 from experiments import runtime
 from experiments.config import preset
 from experiments.runtime import Cluster
-from leapjax import files, pretrained, processes, sharding, training
-from leapjax.agents import leap
+from leapjax import processes, sharding
 from leapjax.envs import levels
 from leapjax.errors import UserError
 
-Row = dict[str, Any]
 # (processes, devices of each, devices that share parameters)
 SETTINGS = ((1, 1, 1), (1, 2, 1), (2, 1, 1), (1, 2, 2), (1, 4, 1), (1, 8, 1), (1, 8, 8))
 
@@ -71,8 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     Console().print(table(rows))
-    if options.json:
-        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    write_rows(options.json, rows)
     return 0
 
 
@@ -111,22 +108,11 @@ def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
 
 def measure(options: Options) -> Row:
     """One setting, on all devices of all processes."""
-    level = levels.find_level(options.level)
-    config = preset(level, "leapjax")
+    config = preset(levels.find_level(options.level), "leapjax")
     batch = options.per_device * jax.device_count()
     chosen = dataclasses.replace(config.training, batch=batch)
-    sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
     mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)
-    agent = leap.make_agent(config.model, chosen, config.planner, sizes, level.words, mesh)
-    state, key = training.make_begin(agent, mesh)(0)
-    data = sharding.replicate(random_steps(sizes, level.words), mesh)
-    step = training.make_train_step(agent, lambda k, d: leap.make_batch(k, d, chosen, sizes))
-    compiled = step.lower(state, data, key).compile()  # type: ignore[attr-defined]
-
-    def advance() -> jax.Array:
-        nonlocal state
-        state, metrics = compiled(state, data, key)
-        return metrics["loss"]
+    advance = Stepper(dataclasses.replace(config, training=chosen), mesh)
 
     # Every process must do as many steps, so none may decide by its own clock.
     for _ in range(3):
@@ -134,10 +120,10 @@ def measure(options: Options) -> Row:
     repeats = max(processes.gather(int(options.seconds / fastest(advance, 0) / 5) + 1))
     taken = min(fastest(lambda: [advance() for _ in range(5)], 0) / 5 for _ in range(repeats))
 
-    communicate = partial(exchange(state.params, mesh), state.params)
+    communicate = partial(exchange(advance.state.params, mesh), advance.state.params)
     jax.block_until_ready(communicate())
     alone = min(fastest(communicate, 0) for _ in range(50))
-    parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(advance.state.params))
     return {
         "level": options.level,
         "processes": jax.process_count(),

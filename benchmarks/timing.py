@@ -1,16 +1,20 @@
 """How long something takes, and how long it could take at best on this machine."""
 
 import functools
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding
 
-from leapjax import sharding
+from leapjax import files, sharding
+
+Row = dict[str, Any]  # one measurement, as JSON values
 
 
 def fastest(run: Callable[[], Any], seconds: float) -> float:
@@ -55,3 +59,9 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
         jax.block_until_ready(run())
         best = min(best, fastest(run, seconds / 4))
     return repeats * flops / best / 1e9
+
+
+def write_rows(path: Path | None, rows: Sequence[Row]) -> None:
+    """Writes the rows where `--json` asked for them."""
+    if path is not None:
+        files.write_text(path, json.dumps(rows, indent=1) + "\n")

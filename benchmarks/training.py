@@ -7,7 +7,6 @@ matrix-multiply peak measured in the same run.
 """
 
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -18,24 +17,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.planning import random_contexts
-from benchmarks.timing import fastest, matmul_peak
+from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments import runtime
 from experiments.config import PRESETS, Config, preset
-from leapjax import files, pretrained, sharding, training
+from leapjax import pretrained, sharding, training
 from leapjax.agents import leap
 from leapjax.data.windows import Steps
 from leapjax.envs import levels
 from leapjax.errors import UserError
 from leapjax.models.trajectory import Sizes
-from leapjax.types import Params, PyTree
+from leapjax.types import Agent, Params, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
 EPISODES, LENGTH = 100, 20  # of the made-up demonstrations
-Row = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,41 +66,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     rows = [measure(config, options.seconds) for config in configs]
     Console().print(table(rows))
-    if options.json:
-        files.write_text(options.json, json.dumps(rows, indent=1) + "\n")
+    write_rows(options.json, rows)
     return 0
+
+
+class Stepper:
+    """Training steps of a configuration on made-up demonstrations, compiled; a call makes one."""
+
+    def __init__(self, config: Config, mesh: Mesh) -> None:
+        level = levels.find_level(config.level)
+        self.sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
+        self._config, self._words = config, level.words
+        agent = self._agent(mesh)
+        self.state, self._key = training.make_begin(agent, mesh)(0)
+        self._data = sharding.replicate(random_steps(self.sizes, level.words), mesh)
+        self._compiled = self._lower(agent).compile()
+
+    def __call__(self) -> jax.Array:
+        """Makes one step; its loss."""
+        self.state, metrics = self._compiled(self.state, self._data, self._key)
+        return metrics["loss"]
+
+    def flops(self) -> float:
+        """Of one step, counted by XLA for the whole batch on one device."""
+        return self._lower(self._agent(None)).cost_analysis()["flops"]
+
+    def _agent(self, mesh: Mesh | None) -> Agent:
+        c = self._config
+        return leap.make_agent(c.model, c.training, c.planner, self.sizes, self._words, mesh)
+
+    def _lower(self, agent: Agent) -> Any:
+        step = training.make_train_step(
+            agent, lambda k, d: leap.make_batch(k, d, self._config.training, self.sizes)
+        )
+        return step.lower(self.state, self._data, self._key)  # type: ignore[attr-defined]
 
 
 def measure(config: Config, seconds: float) -> Row:
     """One preset on one level."""
-    level = levels.find_level(config.level)
-    sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
     batch = config.training.batch
     mesh = sharding.make_mesh(batch)
-    agent = leap.make_agent(config.model, config.training, config.planner, sizes, level.words, mesh)
-    state, key = training.make_begin(agent, mesh)(0)
-    data = sharding.replicate(random_steps(sizes, level.words), mesh)
-
-    def make_batch(key: jax.Array, data: PyTree) -> PyTree:
-        return leap.make_batch(key, data, config.training, sizes)
-
-    step = training.make_train_step(agent, make_batch)
-    lowered = step.lower(state, data, key)  # type: ignore[attr-defined]
-    compiled = lowered.compile()
-
-    def advance() -> jax.Array:
-        nonlocal state
-        state, metrics = compiled(state, data, key)
-        return metrics["loss"]
-
-    def seconds_per_step() -> float:
-        return fastest(lambda: [advance() for _ in range(5)], seconds) / 5
-
-    taken = seconds_per_step()
-    encoder = encoder_seconds(config, sizes, state.params, batch, seconds)
-    single = leap.make_agent(config.model, config.training, config.planner, sizes, level.words)
-    alone = training.make_train_step(single, make_batch)
-    flops = alone.lower(state, data, key).cost_analysis()["flops"]  # type: ignore[attr-defined]
+    step = Stepper(config, mesh)
+    sizes = step.sizes
+    taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
+    encoder = encoder_seconds(config, sizes, step.state.params, batch, seconds)
+    flops = step.flops()
     tokens = batch * config.planner.horizon
     peak = matmul_peak(tokens, config.model.width, seconds)
     return {

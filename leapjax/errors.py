@@ -16,3 +16,14 @@ class UserError(ValueError):
 def first_line(error: Exception) -> str:
     """What another library's error says, short enough for one line of ours."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def check_at_least(config: object, least: int, *names: str) -> None:
+    """Refuses a configuration some of whose numbers are too small.
+
+    Raises:
+        ValueError: says which, and what is possible.
+    """
+    for name in names:
+        if getattr(config, name) < least:
+            raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")

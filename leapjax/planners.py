@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax import schedules
+from leapjax.errors import check_at_least
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 ORDERS = ("random", "sequential", "uncertain")
@@ -34,7 +35,7 @@ class GibbsConfig:
     score_trace: bool = False  # also return the energy after every iteration (N * T passes)
 
     def __post_init__(self) -> None:
-        _check_positive(self, "horizon", "iterations", "resampled", "restarts")
+        check_at_least(self, 1, "horizon", "iterations", "resampled", "restarts")
         if self.resampled > self.horizon:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
@@ -63,7 +64,7 @@ class ShootingConfig:
     score: bool = False  # also return the energy of the plan (known anyway)
 
     def __post_init__(self) -> None:
-        _check_positive(self, "horizon", "candidates")
+        check_at_least(self, 1, "horizon", "candidates")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +79,7 @@ class CrossEntropyConfig:
     score: bool = False
 
     def __post_init__(self) -> None:
-        _check_positive(self, "horizon", "iterations", "candidates", "elites")
+        check_at_least(self, 1, "horizon", "iterations", "candidates", "elites")
         if self.elites > self.candidates:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
 
@@ -315,9 +316,3 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
     if type(config) not in planners:
         raise TypeError(f"no planner takes a {type(config).__name__}")
     return functools.partial(planners[type(config)], energy, config=config)
-
-
-def _check_positive(config: PlannerConfig, *names: str) -> None:
-    for name in names:
-        if getattr(config, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}")

@@ -41,10 +41,11 @@ def test_the_library_never_imports_experiments():
 
 def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/types.py")
+    may_import("leapjax/errors.py")
     may_import("leapjax/schedules.py", "types")
     may_import("leapjax/energy.py", "types")
     may_import("leapjax/sharding.py", "types")
-    may_import("leapjax/planners.py", "types", "schedules")
+    may_import("leapjax/planners.py", "types", "schedules", "errors")
     may_import("leapjax/batching.py", "types", "planners", "sharding")
     may_import("leapjax/scores.py")
     may_import("leapjax/training.py", "types", "sharding")

@@ -14,6 +14,7 @@ from leapjax.data import augmentation, symmetries, windows
 from leapjax.data.windows import Steps, Window
 from leapjax.energy import pseudo_likelihood
 from leapjax.envs import vocabulary
+from leapjax.errors import check_at_least
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Agent, Context, Energy, Params, TrainState, mask_token
@@ -40,9 +41,7 @@ class TrainingConfig:
     clutter: float = 0.0  # leapjax: fill up to this share of the cells that nobody needs
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_at_least(self, 1, "steps", "batch")
         ranges = {
             "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
             "warmup": (0, math.inf), "clip": (0, math.inf), "clutter": (0, 1),

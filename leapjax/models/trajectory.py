@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.data import symmetries
-from leapjax.errors import UserError
+from leapjax.errors import UserError, check_at_least
 from leapjax.models import encoders
 from leapjax.models.transformer import Transformer, dense
 from leapjax.types import Context, Observation, PyTree
@@ -44,11 +44,8 @@ class ModelConfig:
                 f"unknown architecture {self.architecture!r}: "
                 f"expected one of {', '.join(ARCHITECTURES)}"
             )
-        may_be_none = ("rounds", "radius", "word_heads")
-        for name in ("layers", "heads", "width", "channels", "fields", "sweeps", *may_be_none):
-            least = 0 if name in may_be_none else 1
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_at_least(self, 1, "layers", "heads", "width", "channels", "fields", "sweeps")
+        check_at_least(self, 0, "rounds", "radius", "word_heads")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
         if self.dtype not in DTYPES:
