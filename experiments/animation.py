@@ -12,6 +12,7 @@ from leapjax import rollouts
 from leapjax.batching import plan_keys
 from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.envs.levels import Level
+from leapjax.envs.observations import Cell
 from leapjax.pretrained import Pretrained
 
 SIDE = 336  # pixels of a level, about
@@ -48,8 +49,9 @@ def episode_frames(
         plan = planner(keys, rollouts.stack_contexts([history]))
         trace = np.asarray(plan.trace[0])
         for iteration in _distinct(trace):
-            text = f"plan {replan + 1}, iteration {iteration + 1} of {len(trace)}"
-            image = picture(adapter, mission, text, trace[iteration])
+            actions = " ".join(GLYPHS[int(action)] for action in trace[iteration])
+            text = f"plan {replan + 1}, iteration {iteration + 1} of {len(trace)}: {actions}"
+            image = picture(adapter, mission, text, way(adapter.env, trace[iteration]))
             frames.append((image, REFINE_MS))
         frames[-1] = (frames[-1][0], PAUSE_MS)
         for action in np.asarray(plan.actions[0]):
@@ -60,7 +62,7 @@ def episode_frames(
             over = transition.terminated or transition.truncated
             outcome = ("success" if transition.success else "failed") if over else "executing"
             text = f"step {history.step}: {ACTIONS[action]}; {outcome}"
-            frames.append((picture(adapter, mission, text, None), STEP_MS))
+            frames.append((picture(adapter, mission, text), STEP_MS))
             if over:
                 frames[-1] = (frames[-1][0], PAUSE_MS)
                 return frames
@@ -74,9 +76,9 @@ def _distinct(trace: np.ndarray) -> list[int]:
 
 
 def picture(
-    adapter: BabyAIAdapter, mission: str, text: str, actions: np.ndarray | None
+    adapter: BabyAIAdapter, mission: str, text: str, cells: Sequence[Cell] = ()
 ) -> Image.Image:
-    """The level, the goal, the way of a plan if given, and a caption."""
+    """The level, the goal, a way through some cells if given, and a caption."""
     env = adapter.env
     tile = SIDE // adapter.side
     level_image = Image.fromarray(env.grid.render(tile, tuple(env.agent_pos), env.agent_dir))
@@ -88,18 +90,17 @@ def picture(
         box = [x * tile, y * tile, (x + 1) * tile - 1, (y + 1) * tile - 1]
         pen.rectangle(box, outline="white", width=2)
     pen.text((4, SIDE + 2), mission[:60], fill="black")
-    if actions is not None:
-        points = [((x + 0.5) * tile, (y + 0.5) * tile) for x, y in way(env, actions)]
+    if cells:
+        points = [((x + 0.5) * tile, (y + 0.5) * tile) for x, y in cells]
         if len(points) > 1:
             pen.line(points, fill=(80, 160, 255), width=4, joint="curve")
         last_x, last_y = points[-1]
         pen.ellipse([last_x - 5, last_y - 5, last_x + 5, last_y + 5], fill=(80, 160, 255))
-        text = f"{text}: {' '.join(GLYPHS[int(action)] for action in actions)}"
     pen.text((4, SIDE + 18), text, fill="black")
     return image
 
 
-def way(env: RoomGridLevel, actions: np.ndarray) -> list[tuple[int, int]]:
+def way(env: RoomGridLevel, actions: np.ndarray) -> list[Cell]:
     """The cells that a plan leads through, found by playing it on a copy of the level."""
     copied = copy.deepcopy(env)
     cells = [(int(copied.agent_pos[0]), int(copied.agent_pos[1]))]

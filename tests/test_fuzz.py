@@ -329,9 +329,9 @@ def test_a_damaged_specification(tmp_path_factory, data):
 WORDS = [f"--{name.replace('_', '-')}" for name in (
     "level preset seeds demos demonstrations episodes test_seed validation context executed "
     "checkpoint record runs pictures checkpoint_seconds architecture layers heads width dropout "
-    "channels rounds fields sweeps radius dtype steps batch learning_rate warmup betas clip "
-    "masking windows augment horizon iterations resampled order temperature restarts coordinator "
-    "num_processes process_id fsdp"
+    "channels rounds fields sweeps word_heads radius dtype steps batch learning_rate warmup "
+    "betas clip masking windows augment exchange_objects clutter horizon iterations resampled "
+    "order temperature restarts coordinator num_processes process_id fsdp"
 ).split()]  # fmt: skip
 VALUES = st.sampled_from(
     ["0", "1", "-1", "7", "1e9", "nan", "inf", "-inf", "99999999999999999999", "None", "all",
