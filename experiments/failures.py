@@ -1,0 +1,214 @@
+"""Which episodes fail, and why: `python -m experiments.failures runs/NAME [runs/NAME ...]`.
+
+Plays validation levels (never test levels) with trained planners, counts the failures by what
+happened and by how long a detour the level asks for, and draws some of them.
+"""
+
+import dataclasses
+import enum
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from PIL import Image
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from experiments import animation, runtime
+from leapjax import pretrained, rollouts
+from leapjax.batching import NotANumber
+from leapjax.data import seeds
+from leapjax.envs import levels, observations
+from leapjax.envs.adapter import BabyAIAdapter, Transition
+from leapjax.envs.levels import Level
+from leapjax.envs.observations import Cell
+from leapjax.errors import UserError, first_line
+from leapjax.types import Observation
+
+FEW_CELLS = 6  # that an agent which goes in circles stays within
+COLUMNS = 4  # of the gallery
+
+
+class Cause(enum.Enum):
+    """What happened in an episode that failed; the first that applies."""
+
+    GAVE_UP = "planned to stop before it was there"
+    REFUSED = "did what ends the episode as a failure"
+    HOLDS = "time ran out with an object in its hands"
+    CIRCLES = f"time ran out going round within {FEW_CELLS} cells"
+    WANDERS = "time ran out elsewhere"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Say why episodes fail."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs of one level, for instance of several seeds."""
+    episodes: int = 500
+    """Validation episodes for each."""
+    executed: int | None = None
+    """Actions to execute before replanning; None: the whole plan."""
+    gallery: Path | None = None
+    """The picture to draw; None: failures.png in the first run's folder."""
+    drawn: int = 8
+    """Failures in it, at most."""
+
+
+class Recorder(BabyAIAdapter):
+    """An episode that remembers what it began with, where the agent went, and how it ended."""
+
+    def __init__(self, level: Level) -> None:
+        super().__init__(level)
+        self.cells: list[Cell] = []
+        self.detour: int | None = None
+        self.last: Transition | None = None
+
+    def reset(self, seed: int) -> Observation:
+        """Starts the level of a seed."""
+        observation = super().reset(seed)
+        self.cells = [self._cell()]
+        self.detour = detour(self)
+        return observation
+
+    def step(self, action: int) -> Transition:
+        """Takes one of MiniGrid's first six actions."""
+        self.last = super().step(action)
+        self.cells.append(self._cell())
+        return self.last
+
+    def _cell(self) -> Cell:
+        x, y = self.env.agent_pos
+        return int(x), int(y)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Plays, counts, draws; the exit code."""
+    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    console = Console()
+    try:
+        played = seeds.validation_seeds(0, options.episodes)
+        level = only_level(options.runs)
+        runtime.start()
+        recorders: list[Recorder] = []
+        successes: list[bool] = []
+        for run in track(options.runs, "playing", console=console):
+            found, good = play(run, level, played, options.executed)
+            recorders += found
+            successes += good
+        failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
+        console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
+        console.print(by_cause(failed), by_detour(recorders, failed))
+        if failed and options.drawn > 0:
+            path = options.gallery or options.runs[0] / "failures.png"
+            draw(failed[: options.drawn], path)
+            console.print(f"gallery: {path}", highlight=False)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except NotANumber as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def only_level(runs: Sequence[Path]) -> Level:
+    """The level of all of these runs.
+
+    Raises:
+        UserError: no run, one that cannot be read, or several levels.
+    """
+    names = sorted({pretrained.read_specification(run).level for run in runs})
+    if len(names) != 1:
+        raise UserError(f"expected runs of one level, got {', '.join(names) or 'none'}")
+    return levels.find_level(names[0])
+
+
+def play(
+    run: Path, level: Level, played: range, executed: int | None
+) -> tuple[list[Recorder], list[bool]]:
+    """The episodes of one planner, and whether each succeeded."""
+    planner = pretrained.load(run)
+    horizon = planner.specification.planner.horizon
+    if executed is not None and not 1 <= executed <= horizon:
+        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon of {run}")
+    recorders = [Recorder(level) for _ in played]
+    waiting = iter(recorders)
+    episodes = rollouts.evaluate(
+        lambda: next(waiting), played, planner.plan, planner.params,
+        context=planner.specification.sizes.context, executed=executed,
+    )  # fmt: skip
+    return recorders, episodes.successes.tolist()
+
+
+def detour(adapter: BabyAIAdapter) -> int | None:
+    """Cells that the shortest free way is longer than the straight one; None: no way, no goal."""
+    start, goal = (int(adapter.env.agent_pos[0]), int(adapter.env.agent_pos[1])), adapter.goal
+    if goal == observations.NO_GOAL:
+        return None
+    length = observations.path_lengths(adapter.env.grid, start, through_objects=False).get(goal)
+    if length is None:
+        return None
+    return length - abs(start[0] - goal[0]) - abs(start[1] - goal[1])
+
+
+def cause(recorder: Recorder) -> Cause:
+    """Why an episode failed."""
+    last, cells = recorder.last, recorder.cells
+    if last is not None and last.terminated:
+        return Cause.REFUSED
+    if last is None or not last.truncated:
+        return Cause.GAVE_UP
+    if recorder.env.carrying is not None:
+        return Cause.HOLDS
+    return Cause.CIRCLES if len(set(cells[len(cells) // 2 :])) <= FEW_CELLS else Cause.WANDERS
+
+
+def by_cause(failed: Sequence[Recorder]) -> Table:
+    """Failures by what happened."""
+    counts = Counter(cause(recorder) for recorder in failed)
+    result = Table("what happened", "episodes")
+    for each in Cause:
+        if counts[each]:
+            result.add_row(each.value, str(counts[each]))
+    return result
+
+
+def by_detour(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
+    """Failures by how much longer than straight the shortest free way is."""
+    totals, failures = (Counter(r.detour for r in some) for some in (played, failed))
+    result = Table("detour (cells)", "episodes", "failed")
+    for length in sorted(totals, key=lambda n: (n is None, n)):
+        name = "no free way, or no goal" if length is None else str(length)
+        share = failures[length] / totals[length]
+        result.add_row(name, str(totals[length]), f"{failures[length]} ({share:.1%})")
+    return result
+
+
+def draw(failed: Sequence[Recorder], path: Path) -> None:
+    """How each episode ended, with all of its way.
+
+    Raises:
+        UserError: the picture cannot be written.
+    """
+    pictures = [
+        animation.picture(r, r.env.mission, f"{len(r.cells) - 1} steps: {cause(r).value}", r.cells)
+        for r in failed
+    ]
+    width, height = pictures[0].size
+    columns = min(COLUMNS, len(pictures))
+    sheet = Image.new("RGB", (width * columns, height * -(-len(pictures) // columns)), "white")
+    for index, picture in enumerate(pictures):
+        sheet.paste(picture, (width * (index % columns), height * (index // columns)))
+    try:
+        sheet.save(path)
+    except (OSError, ValueError) as error:  # ValueError: a suffix that names no format
+        raise UserError(f"cannot draw {path}: {first_line(error)}") from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""Why episodes fail: causes, detours, and the command on trained toy runs."""
+
+from PIL import Image
+
+from experiments import babyai, failures
+from experiments.failures import Cause
+from leapjax.data.demonstrations import make_bot
+from leapjax.envs.adapter import END
+from leapjax.envs.levels import find_level
+
+LEFT, FORWARD, PICKUP = 0, 2, 3
+TOY = (
+    "--demos 4 --episodes 3 --steps 2 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
+    "--rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures"
+).split()
+
+
+def recorder(level: str, seed: int = 0) -> failures.Recorder:
+    found = failures.Recorder(find_level(level))
+    found.reset(seed)
+    return found
+
+
+def test_causes_of_failure():
+    idle = recorder("GoToLocalS7N5")
+    assert failures.cause(idle) == Cause.GAVE_UP
+    idle.step(LEFT)
+    assert failures.cause(idle) == Cause.GAVE_UP
+    while not idle.last.truncated:
+        idle.step(LEFT)
+    assert failures.cause(idle) == Cause.CIRCLES
+
+    walker = recorder("GoToObjMazeS7")
+    walker.cells += [(x, 0) for x in range(20)]
+    walker.last = idle.last
+    assert failures.cause(walker) == Cause.WANDERS
+    walker.env.carrying = object()
+    assert failures.cause(walker) == Cause.HOLDS
+
+
+def test_a_detour_is_what_the_way_is_longer_than_straight():
+    found = recorder("GoToLocalS7N5")
+    found.env.grid.horz_wall(1, 3, 4)  # open at x = 5 only
+    found.env.agent_pos, found.goal = (1, 2), (1, 4)
+    for x in range(1, 6):
+        for y in (2, 4):
+            found.env.grid.set(x, y, None)
+    found.env.grid.set(5, 3, None)
+    assert failures.detour(found) == 8
+    found.env.grid.horz_wall(1, 3, 5)
+    assert failures.detour(found) is None
+
+
+def test_a_recorder_knows_the_way_that_was_walked():
+    found = recorder("GoToObjMazeS4", seed=3)
+    bot, action = make_bot(found.env), None
+    while found.last is None or not found.last.terminated:
+        action = int(bot.replan(action))
+        assert action != END
+        found.step(action)
+    assert len(found.cells) == found.env.step_count + 1
+    assert found.cells[-1] == tuple(found.env.agent_pos)
+
+
+def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+    assert babyai.main(TOY) == 0
+    (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert failures.main([str(run), "--episodes", "6"]) == 0
+    said = capsys.readouterr().out
+    assert "of 6 episodes failed" in said and "what happened" in said
+    assert Image.open(run / "failures.png").size[0] >= 336
+    assert failures.main([str(run), "--episodes", "2", "--executed", "9"]) == 2
+    assert "not in 1 .. 5" in capsys.readouterr().err
+    assert failures.main([str(tmp_path)]) == 2
+    assert "not a checkpoint" in capsys.readouterr().err
+
+
+def test_without_one_goal_there_is_no_detour():
+    assert recorder("BabyAI-PutNextLocal-v0").detour is None
