@@ -12,7 +12,7 @@ from leapjax import rollouts
 from leapjax.batching import plan_keys
 from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.envs.levels import Level
-from leapjax.envs.observations import Cell
+from leapjax.envs.observations import Cell, agent_cell
 from leapjax.pretrained import Pretrained
 
 SIDE = 336  # pixels of a level, about
@@ -103,12 +103,12 @@ def picture(
 def way(env: RoomGridLevel, actions: np.ndarray) -> list[Cell]:
     """The cells that a plan leads through, found by playing it on a copy of the level."""
     copied = copy.deepcopy(env)
-    cells = [(int(copied.agent_pos[0]), int(copied.agent_pos[1]))]
+    cells = [agent_cell(copied)]
     for action in actions:
         if action == END:
             break
         _, _, terminated, truncated, _ = copied.step(int(action))
-        cells.append((int(copied.agent_pos[0]), int(copied.agent_pos[1])))
+        cells.append(agent_cell(copied))
         if terminated or truncated:
             break
     return cells

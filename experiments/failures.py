@@ -71,19 +71,15 @@ class Recorder(BabyAIAdapter):
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""
         observation = super().reset(seed)
-        self.cells = [self._cell()]
+        self.cells = [observations.agent_cell(self.env)]
         self.detour = detour(self)
         return observation
 
     def step(self, action: int) -> Transition:
         """Takes one of MiniGrid's first six actions."""
         self.last = super().step(action)
-        self.cells.append(self._cell())
+        self.cells.append(observations.agent_cell(self.env))
         return self.last
-
-    def _cell(self) -> Cell:
-        x, y = self.env.agent_pos
-        return int(x), int(y)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -147,7 +143,7 @@ def play(
 
 def detour(adapter: BabyAIAdapter) -> int | None:
     """Cells that the shortest free way is longer than the straight one; None: no way, no goal."""
-    start, goal = (int(adapter.env.agent_pos[0]), int(adapter.env.agent_pos[1])), adapter.goal
+    start, goal = observations.agent_cell(adapter.env), adapter.goal
     if goal == observations.NO_GOAL:
         return None
     length = observations.path_lengths(adapter.env.grid, start, through_objects=False).get(goal)

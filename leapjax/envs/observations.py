@@ -62,7 +62,7 @@ def nearest_goal(env: RoomGridLevel) -> Cell:
     matches = [(int(x), int(y)) for x, y in instruction.desc.obj_poss]
     if not matches:
         return NO_GOAL
-    start = (int(env.agent_pos[0]), int(env.agent_pos[1]))
+    start = agent_cell(env)
     free = path_lengths(env.grid, start, through_objects=False)
     blocked = path_lengths(env.grid, start, through_objects=True)
     far = env.grid.width * env.grid.height
@@ -95,6 +95,12 @@ def path_lengths(grid: Grid, start: Cell, through_objects: bool) -> dict[Cell, i
                 lengths[near] = lengths[cell] + 1
                 queue.append(near)
     return lengths
+
+
+def agent_cell(env: RoomGridLevel) -> Cell:
+    """The cell that the agent stands in."""
+    x, y = env.agent_pos
+    return int(x), int(y)
 
 
 def front_cell(env: RoomGridLevel) -> Cell:

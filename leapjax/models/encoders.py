@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
+from leapjax.data import symmetries
 from leapjax.types import Observation
 
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
-OBJECTS, COLOURS, STATES = 11, 6, 4
+OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
