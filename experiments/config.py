@@ -181,16 +181,23 @@ def check(config: Config) -> None:
         raise UserError(f"--checkpoint-seconds must be at least 0, got {config.checkpoint_seconds}")
     if config.context < 0:
         raise UserError(f"--context must be at least 0, got {config.context}")
-    if config.executed is not None and not 1 <= config.executed <= config.planner.horizon:
-        raise UserError(
-            f"--executed {config.executed} is not in 1 .. {config.planner.horizon}, the horizon"
-        )
+    check_executed(config.executed, config.planner.horizon)
     limit = shortest_limit(level)
     if config.planner.horizon > limit:
         raise UserError(
             f"--horizon {config.planner.horizon} is longer than an episode of {level.name} "
             f"may last: its step limit is {limit}"
         )
+
+
+def check_executed(executed: int | None, horizon: int) -> None:
+    """Refuses to execute more of a plan than there is.
+
+    Raises:
+        UserError: says how much there is.
+    """
+    if executed is not None and not 1 <= executed <= horizon:
+        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon")
 
 
 def episode_seeds(config: Config) -> range:

@@ -1,7 +1,8 @@
 """Which episodes fail, and why: `python -m experiments.failures runs/NAME [runs/NAME ...]`.
 
 Plays validation levels (never test levels) with trained planners, counts the failures by what
-happened and by how long a detour the level asks for, and draws some of them.
+happened, by how much of the instruction was done and by how long a detour the level asks for, and
+draws some of them.
 """
 
 import dataclasses
@@ -13,12 +14,14 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from minigrid.envs.babyai.core.verifier import Instr, SeqInstr
 from PIL import Image
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from experiments import animation, runtime
+from experiments.config import check_executed
 from leapjax import pretrained, rollouts
 from leapjax.batching import NotANumber
 from leapjax.data import seeds
@@ -68,6 +71,11 @@ class Recorder(BabyAIAdapter):
         self.detour: int | None = None
         self.last: Transition | None = None
 
+    @property
+    def tasks(self) -> list[bool]:
+        """Which single tasks of the instruction are done by now."""
+        return tasks_done(self.env.instrs)  # type: ignore[attr-defined]
+
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""
         observation = super().reset(seed)
@@ -98,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             successes += good
         failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
         console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
-        console.print(by_cause(failed), by_detour(recorders, failed))
+        console.print(by_cause(failed), by_tasks(recorders, failed), by_detour(recorders, failed))
         if failed and options.drawn > 0:
             path = options.gallery or options.runs[0] / "failures.png"
             draw(failed[: options.drawn], path)
@@ -129,9 +137,7 @@ def play(
 ) -> tuple[list[Recorder], list[bool]]:
     """The episodes of one planner, and whether each succeeded."""
     planner = pretrained.load(run)
-    horizon = planner.specification.planner.horizon
-    if executed is not None and not 1 <= executed <= horizon:
-        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon of {run}")
+    check_executed(executed, planner.specification.planner.horizon)
     recorders = [Recorder(level) for _ in played]
     waiting = iter(recorders)
     episodes = rollouts.evaluate(
@@ -164,6 +170,18 @@ def cause(recorder: Recorder) -> Cause:
     return Cause.CIRCLES if len(set(cells[len(cells) // 2 :])) <= FEW_CELLS else Cause.WANDERS
 
 
+def tasks_done(instruction: Instr) -> list[bool]:
+    """Which single tasks of an instruction are done, in its order."""
+
+    def visit(part: Instr, done: bool) -> list[bool]:
+        if not isinstance(part, SeqInstr):
+            return [done]
+        first, second = (getattr(part, name) == "success" for name in ("a_done", "b_done"))
+        return [*visit(part.instr_a, done or first), *visit(part.instr_b, done or second)]
+
+    return visit(instruction, False)
+
+
 def by_cause(failed: Sequence[Recorder]) -> Table:
     """Failures by what happened."""
     counts = Counter(cause(recorder) for recorder in failed)
@@ -171,6 +189,19 @@ def by_cause(failed: Sequence[Recorder]) -> Table:
     for each in Cause:
         if counts[each]:
             result.add_row(each.value, str(counts[each]))
+    return result
+
+
+def by_tasks(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
+    """Failures by how many tasks the instruction has, and how many of them were done."""
+    totals = Counter(len(r.tasks) for r in played)
+    failures = Counter((len(done), sum(done)) for done in (r.tasks for r in failed))
+    result = Table("tasks of the instruction", "episodes", "failed, by how many were done")
+    for count in sorted(totals):
+        found = {done: n for (of, done), n in sorted(failures.items()) if of == count}
+        share = sum(found.values()) / totals[count]
+        details = ", ".join(f"{n} with {done} done" for done, n in found.items()) or "none"
+        result.add_row(str(count), str(totals[count]), f"{share:.1%}: {details}")
     return result
 
 

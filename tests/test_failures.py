@@ -1,5 +1,6 @@
 """Why episodes fail: causes, detours, and the command on trained toy runs."""
 
+from minigrid.envs.babyai.core.verifier import AfterInstr, AndInstr, GoToInstr, ObjDesc
 from PIL import Image
 
 from experiments import babyai, failures
@@ -75,6 +76,40 @@ def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
     assert "not in 1 .. 5" in capsys.readouterr().err
     assert failures.main([str(tmp_path)]) == 2
     assert "not a checkpoint" in capsys.readouterr().err
+
+
+def test_tasks_that_are_done_are_counted_through_nested_instructions():
+    def goto():
+        return GoToInstr(ObjDesc("ball"))
+
+    both = AndInstr(goto(), goto())
+    after = AfterInstr(goto(), both)
+    for part in (both, after):
+        part.a_done = part.b_done = False
+    assert failures.tasks_done(goto()) == [False]
+    assert failures.tasks_done(after) == [False, False, False]
+    both.b_done = "success"
+    assert failures.tasks_done(after) == [False, False, True]
+    both.a_done, after.b_done, after.a_done = "continue", "success", "continue"
+    assert failures.tasks_done(after) == [False, True, True]
+
+
+def test_a_done_task_is_counted_in_a_level():
+    found = recorder("GoToSeqS5R2", seed=next_sequence())
+    bot, action = make_bot(found.env), None
+    seen = [sum(found.tasks)]
+    while found.last is None or not found.last.terminated:
+        action = int(bot.replan(action))
+        found.step(action)
+        seen.append(sum(found.tasks))
+    assert seen == sorted(seen) and seen[0] == 0
+    # The level ends with the last task, which a "then" no longer writes down.
+    assert seen[-1] >= len(found.tasks) - 1 > 0
+
+
+def next_sequence() -> int:
+    """The first level seed whose instruction has several tasks."""
+    return next(s for s in range(50) if len(recorder("GoToSeqS5R2", s).tasks) > 1)
 
 
 def test_without_one_goal_there_is_no_detour():
