@@ -21,6 +21,7 @@ GRID_WORDS = augmentation.GridWords(
     jnp.asarray(vocabulary.colour_words()),
     jnp.asarray(vocabulary.object_words((KEY, BALL, BOX))),
     jnp.asarray(vocabulary.mirrored_words()),
+    *map(jnp.asarray, vocabulary.joining_words()),
 )
 
 augment = jax.jit(augmentation.augment, static_argnums=3)
@@ -98,8 +99,9 @@ def test_augmentation_covers_the_symmetries_and_depends_on_its_key():
     assert {draw(key, False)[1] for key in range(20)} == {int(state.grid[x, y, 0])}
 
 
-def test_the_past_is_transformed_with_the_present():
-    name, context = "GoToObjMazeS4R2Close", 3
+@pytest.mark.parametrize("name", ["GoToObjMazeS4R2Close", "GoToSeqS5R2"])
+def test_the_past_is_transformed_with_the_present(name):
+    context = 3
     level = levels.find_level(name)
     [demonstration] = [
         d for d in demonstrations.collect(level, 6, seed=1).demonstrations if len(d.actions) > 5
@@ -115,6 +117,19 @@ def test_the_past_is_transformed_with_the_present():
             np.testing.assert_array_equal(hidden.pose, after.pose)
             np.testing.assert_array_equal(before.instruction, after.instruction)
             np.testing.assert_array_equal(before.goal, after.goal)
+
+
+def test_half_of_the_sequences_are_said_the_other_way_round():
+    window = next(
+        window
+        for window in whole_windows("GoToSeqS5R2", 0, 200)
+        if ", then" in vocabulary.decode(window.context.observation.instruction)
+    )
+    said = Counter(
+        "after you" in vocabulary.decode(changed.context.observation.instruction)
+        for changed in (augment(jax.random.key(k), window, GRID_WORDS, True) for k in range(100))
+    )
+    assert min(said[False], said[True]) > 30
 
 
 def test_what_was_before_the_start_stays_blank():

@@ -17,6 +17,7 @@ from tests.enumerable import all_plans, quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
 SIDE = 7
+EMPTY, WALL, BALL = 1, 2, 6
 VOCABULARY, ACTIONS, HORIZON, WORDS, MAX_STEPS = 9, 5, 3, 4, 20
 END, MASK, PAD = ACTIONS - 1, mask_token(ACTIONS), pad_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
@@ -239,18 +240,57 @@ def test_what_the_model_must_know_changes_its_logits(architecture, past):
         assert largest_change(after, before) > 1e-4, name
 
 
-@EACH_ARCHITECTURE
-def test_past_actions_and_poses_are_seen(architecture):
-    context = random_context(9, 2)
-    before = run(architecture, 2, context, [0, MASK, 1])["logits"]
+def with_kind(context, kind):
+    """The same, with objects of one kind everywhere but where the agent is."""
+    observation = context.observation
+    grid = observation.grid.copy()
+    grid[..., 0] = kind
+    grid[tuple(observation.pose[:2])] = observation.grid[tuple(observation.pose[:2])]
+    return context._replace(observation=observation._replace(grid=grid))
+
+
+def moved_past(context):
     pose = context.past.pose.copy()
     pose[1, :2] = (pose[1, :2] + 2) % SIDE
-    moved = context._replace(past=context.past._replace(pose=pose))
-    after = run(architecture, 2, moved, [0, MASK, 1])["logits"]
+    return context._replace(past=context.past._replace(pose=pose))
+
+
+@EACH_ARCHITECTURE
+def test_past_actions_and_poses_are_seen(architecture):
+    context = with_kind(random_context(9, 2), BALL)
+    before = run(architecture, 2, context, [0, MASK, 1])["logits"]
+    after = run(architecture, 2, moved_past(context), [0, MASK, 1])["logits"]
     assert largest_change(after, before) > 1e-4
     swapped = context._replace(past=jax.tree.map(lambda x: x[::-1], context.past))
     after = run(architecture, 2, swapped, [0, MASK, 1])["logits"]
     assert largest_change(after, before) > 1e-4
+
+
+@pytest.mark.parametrize("kind", [EMPTY, WALL])
+def test_ours_remembers_only_what_has_a_name(kind):
+    context = with_kind(random_context(9, 2), kind)
+    before = run("leapjax", 2, context, [0, MASK, 1])["logits"]
+    after = run("leapjax", 2, moved_past(context), [0, MASK, 1])["logits"]
+    np.testing.assert_array_equal(after, before)
+
+
+@pytest.mark.parametrize("faced_now", [False, True])
+def test_ours_sees_what_the_agent_faces_now_and_forgets_what_was_before_the_start(faced_now):
+    context = with_kind(random_context(9, 2), EMPTY)
+    x, y, direction = context.observation.pose.tolist()
+    assert 0 < x < SIDE - 1 and 0 < y < SIDE - 1
+    behind = (direction + 2) % 4
+    past = np.tile([x, y, behind], (2, 1)).astype(np.int32)
+    context = context._replace(past=context.past._replace(pose=past))
+    dx, dy = symmetries.DIRECTION_VECTORS[direction if faced_now else behind]
+    context.observation.grid[x + dx, y + dy] = BALL, 2, 0
+    begun = context._replace(actions=np.full(2, ACTIONS + 1, np.int32))  # all PAD
+    known = run("leapjax", 2, context, [0, MASK, 1])["logits"]
+    unknown = run("leapjax", 2, begun, [0, MASK, 1])["logits"]
+    if faced_now:  # the past adds nothing to it
+        np.testing.assert_array_equal(known, unknown)
+    else:
+        assert largest_change(known, unknown) > 1e-4
 
 
 def test_episodes_longer_than_expected_stay_finite():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from minigrid.envs.babyai.core.verifier import AfterInstr, BeforeInstr
 
 from leapjax.data import demonstrations, symmetries
 from leapjax.data.symmetries import Renaming
@@ -298,3 +299,56 @@ def test_renaming_nothing_in_hand_leaves_nothing_in_hand():
     state = random_observation(0, 5, False)._replace(carried=np.zeros(2, np.int32))
     renaming = recolouring(np.array([3, 4, 5, 0, 1, 2]), {KEY: BOX, BOX: KEY})
     np.testing.assert_array_equal(rename(state, renaming).carried, [0, 0])
+
+
+def said_otherwise(text: str) -> str:
+    """The oracle of `restate`, on strings."""
+    if ", then " in text:
+        first, second = text.split(", then ")
+        return f"{second} after you {first}"
+    if " after you " in text:
+        second, first = text.split(" after you ")
+        return f"{first}, then {second}"
+    return text
+
+
+def restate(instruction: np.ndarray) -> np.ndarray:
+    return np.asarray(symmetries.restate(instruction, *vocabulary.joining_words()))
+
+
+def test_other_words_for_a_sequence_are_bound_to_be_true():
+    """MiniGrid's own judgement of both instructions is the same at every step."""
+    level = levels.find_level("GoToSeqS5R2")
+    compared = 0
+    for seed in range(40):
+        one, other = (BabyAIAdapter(level) for _ in range(2))
+        state = one.reset(seed)
+        other.reset(seed)
+        said = one.env.instrs
+        if not isinstance(said, BeforeInstr | AfterInstr):
+            np.testing.assert_array_equal(restate(state.instruction), state.instruction)
+            continue
+        swapped = AfterInstr if isinstance(said, BeforeInstr) else BeforeInstr
+        instruction = other.env.instrs
+        other.env.instrs = swapped(instruction.instr_b, instruction.instr_a)
+        other.env.instrs.reset_verifier(other.env)
+        assert vocabulary.decode(restate(state.instruction)) == other.env.instrs.surface(other.env)
+        assert said_otherwise(one.env.mission) == other.env.instrs.surface(other.env)
+        bot, transition = demonstrations.make_bot(one.env), None
+        while transition is None or not (transition.terminated or transition.truncated):
+            action = int(bot.replan())
+            transition, same = one.step(action), other.step(action)
+            assert (transition.terminated, transition.success) == (same.terminated, same.success)
+        compared += transition.success
+    assert compared > 10
+
+
+@settings(deadline=None)
+@given(st.integers(1, 4), st.integers(1, 4), st.booleans(), st.integers(0, 6), st.data())
+def test_saying_it_twice_the_other_way_is_saying_it(first, second, then, padding, data):
+    words = st.sampled_from(["ball", "red", "and", "go", "door"])
+    parts = [" ".join(data.draw(st.lists(words, min_size=n, max_size=n))) for n in (first, second)]
+    text = (", then " if then else " after you ").join(parts)
+    ids = vocabulary.encode(text, first + second + 2 + padding)
+    assert vocabulary.decode(restate(ids)) == said_otherwise(text)
+    np.testing.assert_array_equal(restate(restate(ids)), ids)

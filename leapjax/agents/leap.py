@@ -36,7 +36,7 @@ class TrainingConfig:
     clip: float = 1.0  # global norm of the gradient
     masking: str = "one"  # "one", "each" or "random": see leapjax.schedules
     windows: str = "episode"  # drawn by "episode" or by "step"
-    augment: bool = False  # leapjax: mirror, recolour and rename at random
+    augment: bool = False  # leapjax: mirror, recolour, rename, restate at random
     exchange_objects: bool = False  # with augment: key, ball and box are alike
     clutter: float = 0.0  # leapjax: fill up to this share of the cells that nobody needs
 
@@ -154,6 +154,7 @@ def make_batch(key: jax.Array, steps: Steps, training: TrainingConfig, sizes: Si
             jnp.asarray(vocabulary.colour_words()),
             jnp.asarray(vocabulary.object_words(symmetries.INTERCHANGEABLE)),
             jnp.asarray(vocabulary.mirrored_words()),
+            *map(jnp.asarray, vocabulary.joining_words()),
         )
         keys = jax.random.split(augment_key, training.batch)
         batch = jax.vmap(lambda k, w: augmentation.augment(k, w, words, training.exchange_objects))(

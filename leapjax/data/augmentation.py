@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from leapjax.data import symmetries
 from leapjax.data.windows import Window
-from leapjax.types import Array
+from leapjax.types import Array, Observation
 
 
 class GridWords(NamedTuple):
@@ -16,6 +16,8 @@ class GridWords(NamedTuple):
     colours: Array  # [6] int32, in MiniGrid's order of colours
     objects: Array  # [3] int32: key, ball, box
     mirrored: Array  # [vocabulary] int32: the word that each word becomes in a mirror
+    then: Array  # [2] int32: ", then"
+    after: Array  # [2] int32: "after you"
 
 
 def clutter(key: jax.Array, window: Window, share: float) -> Window:
@@ -62,7 +64,7 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
 
 
 def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:
-    """A window as it could have been: mirrored, recoloured, with other objects.
+    """A window as it could have been: mirrored, recoloured, with other objects, in other words.
 
     Each is a symmetry of the levels, so the result is just as good a demonstration.
 
@@ -73,7 +75,7 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
         exchange_objects: whether key, ball and box are alike, which they are in
             demonstrations that unlock no door and toggle no box.
     """
-    flip_key, colour_key, object_key = jax.random.split(key, 3)
+    flip_key, colour_key, object_key, restate_key = jax.random.split(key, 4)
     colours = jax.random.permutation(colour_key, len(words.colours))
     objects = jnp.arange(symmetries.AGENT + 1)
     kinds = jnp.array(symmetries.INTERCHANGEABLE)
@@ -91,9 +93,29 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
             past=jax.vmap(lambda o: symmetries.rename(o, renaming))(context.past),
         )
     )
-    flip = jax.random.bernoulli(flip_key)
-    mirrored = reflect(renamed, words.mirrored)
-    return jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored, renamed)
+    restated = _either(restate_key, restate(renamed, words), renamed)
+    return _either(flip_key, reflect(restated, words.mirrored), restated)
+
+
+def _either(key: jax.Array, first: Window, second: Window) -> Window:
+    """One of two windows, with equal chances."""
+    take = jax.random.bernoulli(key)
+    return jax.tree.map(lambda a, b: jnp.where(take, a, b), first, second)
+
+
+def restate(window: Window, words: GridWords) -> Window:
+    """The same window, told with the other of ", then" and "after you"."""
+
+    def say(observation: Observation) -> Observation:
+        said = symmetries.restate(observation.instruction, words.then, words.after)
+        return observation._replace(instruction=said)
+
+    context = window.context
+    return window._replace(
+        context=context._replace(
+            observation=say(context.observation), past=jax.vmap(say)(context.past)
+        )
+    )
 
 
 def reflect(window: Window, mirrored_words: jax.Array) -> Window:

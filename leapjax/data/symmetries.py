@@ -120,6 +120,25 @@ def rename(observation: Observation, renaming: Renaming) -> Observation:
     )
 
 
+def restate(instruction: jax.Array, then: jax.Array, after: jax.Array) -> jax.Array:
+    """Says "A, then B" as "B after you A" and the other way round: both mean the same.
+
+    Args:
+        instruction: `[L]` token ids, 0 pads on the right; without either of them it is unchanged.
+        then: `[2]` the ids of ", then".
+        after: `[2]` the ids of "after you".
+    """
+    place = jnp.arange(instruction.shape[0])
+    joins = (instruction == then[0]) | (instruction == after[0])
+    first = jnp.argmax(joins)  # tokens of the first part
+    second = jnp.sum(instruction > 0) - first - 2  # tokens of the second
+    swapped = instruction[jnp.where(place < second, place + first + 2, place - second - 2)]
+    join = jnp.where(instruction[first] == then[0], after, then)
+    swapped = jnp.where(place == second, join[0], swapped)
+    swapped = jnp.where(place == second + 1, join[1], swapped)
+    return jnp.where(joins.any() & (instruction > 0), swapped, instruction)
+
+
 def _turn_agent(grid: jax.Array, turn: Callable[[jax.Array], jax.Array]) -> jax.Array:
     """The agent's cell holds its direction as its state: turn that too."""
     state = grid[..., 2]

@@ -75,3 +75,9 @@ def colour_words() -> np.ndarray:
 def object_words(objects: tuple[int, ...]) -> np.ndarray:
     """int32: the id of the word for each of MiniGrid's object indices."""
     return np.array([WORD_IDS[IDX_TO_OBJECT[i]] for i in objects], np.int32)
+
+
+def joining_words() -> tuple[np.ndarray, np.ndarray]:
+    """The ids of ", then" and of "after you", `[2]` int32 each."""
+    then, after = [WORD_IDS[","], WORD_IDS["then"]], [WORD_IDS["after"], WORD_IDS["you"]]
+    return np.array(then, np.int32), np.array(after, np.int32)

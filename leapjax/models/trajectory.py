@@ -155,8 +155,8 @@ class ContextTokens(nn.Module):
         instruction = words(observation.instruction)
         cells = encoders.CellEmbedding(c.channels, name="cells")(observation)
         if self.sizes.context:
-            visits = self._visits(context, direction)
-            cells += nn.Dense(c.channels, use_bias=False, name="visited")(visits)
+            faced = self._faced(context, observation.grid)
+            cells += nn.Dense(c.channels, use_bias=False, name="faced")(faced)
         scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction.whole), 2)
         modulated = cells * (1 + scale) + shift
         if c.word_heads:
@@ -179,24 +179,33 @@ class ContextTokens(nn.Module):
         whole = read(grid.reshape(side * side, -1).max(axis=0), "read_all")
         return jnp.stack([agent, goal, whole, instruction.whole])
 
-    def _visits(self, context: Context, direction: jax.Array) -> jax.Array:
-        """When the agent last stood in, and last faced, each cell: `[S, S, 4]`.
+    def _faced(self, context: Context, turned: jax.Array) -> jax.Array:
+        """Which objects and doors the agent has faced in the context, and when: `[S, S, 2]`.
 
-        The context drawn on the grid: each mark once as 1, once as its recency in (0, 1].
+        1 where it has, and how recently, in (0, 1]: 1 is now. That is what says which part of
+        an instruction is done. Where the agent went besides would let the network recognise
+        the demonstrations: with it, it learned less (docs/experiments.md).
+
+        Args:
+            context: what is known.
+            turned: `[S, S, 3]` the current grid, turned so that the agent faces right.
         """
         side, past = self.sizes.side, self.sizes.context
-        valid = context.actions <= self.sizes.num_actions  # PAD before the start
-        recency = jnp.arange(1, past + 1) / past
+        direction = context.observation.pose[2]
+        poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
+        known = jnp.append(context.actions <= self.sizes.num_actions, True)  # PAD: before the start
+        recency = jnp.arange(1, past + 2) / (past + 1)
 
-        def marks(pose: jax.Array) -> jax.Array:
-            turned = symmetries.rotate_pose(pose, direction, side)
-            front = turned[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[turned[2]]
-            cells = [encoders.one_cell(turned[:2], side), encoders.one_cell(front, side)]
-            return jnp.stack(cells, axis=-1)  # [S, S, 2]
+        def mark(pose: jax.Array) -> jax.Array:
+            pose = symmetries.rotate_pose(pose, direction, side)
+            front = pose[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[pose[2]]
+            return encoders.one_cell(front, side)
 
-        drawn = jax.vmap(marks)(context.past.pose) * valid[:, None, None, None]
-        latest = (drawn * recency[:, None, None, None]).max(axis=0)
-        return jnp.concatenate([drawn.max(axis=0), latest], axis=-1)
+        kinds = turned[..., 0]
+        named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
+        drawn = jax.vmap(mark)(poses) * known[:, None, None] * named
+        latest = (drawn * recency[:, None, None]).max(axis=0)
+        return jnp.stack([drawn.max(axis=0), latest], axis=-1)
 
 
 class LeapModel(nn.Module):
