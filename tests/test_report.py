@@ -8,7 +8,8 @@ from experiments import plots, report
 def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
     return {
         "level": level, "preset": "leapjax", "demos": demos, "seed": seed, "episodes": 10,
-        "successes": successes, "validation": False, "paper_success": 95.0, **others,
+        "successes": successes, "validation": False, "paper_success": 95.0, "horizon": 5,
+        "executed": 5, "mean_length": 6.0, **others,
     }  # fmt: skip
 
 
@@ -21,6 +22,15 @@ ROWS = [
 def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_papers():
     (line,) = (line for line in report.success(ROWS).splitlines() if "S8N7" in line)
     assert line.startswith("| GoToLocalS8N7 | 95.0% | - | 95.0% [") and "2 seeds" in line
+
+
+def test_the_papers_protocol_and_replanning_sooner_are_kept_apart():
+    rows = [*ROWS, row(executed=3, successes=10, mean_length=4.0), row(executed=1, successes=0)]
+    (line,) = (line for line in report.success(rows).splitlines() if "S8N7" in line)
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[2] == "-" and cells[3].startswith("95.0% [") and cells[4].startswith("100.0% [")
+    (line,) = (line for line in report.replanning(rows).splitlines() if "S8N7" in line)
+    assert [cell.strip() for cell in line.strip("|").split("|")[1:]] == ["-", "6.0", "4.0"]
 
 
 def test_fewer_demonstrations_are_side_by_side():
