@@ -1,5 +1,6 @@
 """Tables in the documents, made from the committed rows: `python -m experiments.report`."""
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -12,8 +13,35 @@ from leapjax.envs.levels import LEVELS
 from leapjax.files import write_text
 
 PAPER_DEMOS = 500
-REPLANNED = 3  # actions executed before replanning, where it is not all: docs/experiments.md
-SETTINGS = f"preset `paper` | preset `leapjax` | the same, replanning after {REPLANNED} actions"
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """A column of the tables: which rows belong in it."""
+
+    title: str
+    preset: str
+    masking: str
+    executed: int | None = None  # actions executed before replanning; None: the whole plan
+
+    def has(self, row: Row) -> bool:
+        """Whether a row is a result of this setting: all of it played on test levels."""
+        return (
+            not row["validation"]
+            and row["preset"] == self.preset
+            and row["configuration"]["training"]["masking"] == self.masking
+            and row["executed"] == (self.executed or row["horizon"])
+        )
+
+
+OURS = Setting("preset `leapjax`", "leapjax", "random")
+SETTINGS = (
+    Setting("preset `paper`", "paper", "one"),
+    Setting("`paper`, `--masking each`", "paper", "each"),
+    OURS,
+    # Chosen on validation levels: docs/experiments.md.
+    Setting("`leapjax`, `--executed 3`", "leapjax", "random", executed=3),
+)
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experiments.md")
 
 
@@ -39,7 +67,7 @@ def documents(root: Path) -> dict[Path, str]:
         "training": (training, "training"),
         "scaling": (scaling, "scaling"),
         "efficiency": (efficiency, "babyai"),
-        "replanning": (replanning, "babyai"),
+        "steps": (steps, "babyai"),
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -65,63 +93,45 @@ def success(rows: Sequence[Row]) -> str:
     A cell is the mean over seeds, the 95% interval of all their episodes together, and the
     number of seeds.
     """
-    settings = _settings(rows)
+    papers = {name: f"{level.paper_success:.1f}%" for name, level in LEVELS.items()}
+    return _by_setting(rows, _rate, papers)
+
+
+def steps(rows: Sequence[Row]) -> str:
+    """Steps per episode, failed episodes included, of every setting."""
+    return _by_setting(rows, _mean_length)
+
+
+def _by_setting(
+    rows: Sequence[Row], cell: Callable[[Sequence[Row]], str], papers: dict[str, str] | None = None
+) -> str:
+    """A table of levels by settings."""
+    columns = [_by_level_and_demos(rows, setting) for setting in SETTINGS]
     lines = [
         [
-            level.name,
-            f"{level.paper_success:.1f}%",
-            *(_rate(s.get(level.name, [])) for s in settings),
+            level,
+            *([papers[level]] if papers else []),
+            *(cell(column.get((level, PAPER_DEMOS), [])) for column in columns),
         ]
-        for level in LEVELS.values()
+        for level in LEVELS
     ]
-    return _table(f"level | paper | {SETTINGS}", lines)
+    titles = [*(["paper"] if papers else []), *(setting.title for setting in SETTINGS)]
+    return _table(" | ".join(["level", *titles]), lines)
 
 
-def replanning(rows: Sequence[Row]) -> str:
-    """Steps per episode, failed episodes included, of every setting."""
-    settings = _settings(rows)
-    lines = [[name, *(_steps(s.get(name, [])) for s in settings)] for name in LEVELS]
-    return _table(f"level | {SETTINGS}", lines)
-
-
-def _settings(rows: Sequence[Row]) -> list[dict[str, list[Row]]]:
-    """Rows by level of each of `SETTINGS`, from as many demonstrations as the paper's."""
-    return [
-        {
-            level: chosen
-            for (level, preset, demos), chosen in _latest(rows, executed).items()
-            if (preset, demos) == (name, PAPER_DEMOS)
-        }
-        for name, executed in (("paper", None), ("leapjax", None), ("leapjax", REPLANNED))
-    ]
-
-
-def _latest(
-    rows: Sequence[Row], executed: int | None = None
-) -> dict[tuple[str, str, int], list[Row]]:
-    """Rows by level, preset and number of demonstrations.
-
-    Only test episodes count, and of two rows of one seed the later one.
-
-    Args:
-        rows: all there are.
-        executed: only those that executed so many actions before replanning; None: the whole
-            plan, as in the paper.
-    """
-    found: dict[tuple[str, str, int], dict[int, Row]] = {}
-    for row in rows:
-        if not row["validation"] and row["executed"] == (executed or row["horizon"]):
-            setting = row["level"], row["preset"], row["demos"]
-            found.setdefault(setting, {})[row["seed"]] = row
-    return {setting: list(by_seed.values()) for setting, by_seed in found.items()}
+def _by_level_and_demos(rows: Sequence[Row], setting: Setting) -> dict[tuple[str, int], list[Row]]:
+    """The rows of a setting by level and number of demonstrations; of two of one seed the later."""
+    found: dict[tuple[str, int], dict[int, Row]] = {}
+    for row in filter(setting.has, rows):
+        found.setdefault((row["level"], row["demos"]), {})[row["seed"]] = row
+    return {key: list(by_seed.values()) for key, by_seed in found.items()}
 
 
 def efficiency_by_level(rows: Sequence[Row]) -> dict[str, dict[int, list[Row]]]:
     """Rows of preset `leapjax` by number of demonstrations, of levels that have several."""
     found: dict[str, dict[int, list[Row]]] = {}
-    for (level, name, demos), chosen in sorted(_latest(rows).items()):
-        if name == "leapjax":
-            found.setdefault(level, {})[demos] = chosen
+    for (level, demos), chosen in sorted(_by_level_and_demos(rows, OURS).items()):
+        found.setdefault(level, {})[demos] = chosen
     return {level: by_demos for level, by_demos in found.items() if len(by_demos) > 1}
 
 
@@ -243,11 +253,11 @@ def _rate(rows: Sequence[Row]) -> str:
     return f"{rate}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}" if seeds else rate
 
 
-def _steps(rows: Sequence[Row]) -> str:
+def _mean_length(rows: Sequence[Row]) -> str:
     """Mean length of the episodes of some rows."""
     episodes = sum(row["episodes"] for row in rows)
-    steps = sum(row["mean_length"] * row["episodes"] for row in rows)
-    return f"{steps / episodes:.1f}" if rows else "-"
+    total = sum(row["mean_length"] * row["episodes"] for row in rows)
+    return f"{total / episodes:.1f}" if rows else "-"
 
 
 def _table(header: str, lines: Sequence[Sequence[str]]) -> str:

@@ -9,7 +9,8 @@ def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
     return {
         "level": level, "preset": "leapjax", "demos": demos, "seed": seed, "episodes": 10,
         "successes": successes, "validation": False, "paper_success": 95.0, "horizon": 5,
-        "executed": 5, "mean_length": 6.0, **others,
+        "executed": 5, "mean_length": 6.0, "configuration": {"training": {"masking": "random"}},
+        **others,
     }  # fmt: skip
 
 
@@ -20,17 +21,26 @@ ROWS = [
 
 
 def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_papers():
-    (line,) = (line for line in report.success(ROWS).splitlines() if "S8N7" in line)
-    assert line.startswith("| GoToLocalS8N7 | 95.0% | - | 95.0% [") and "2 seeds" in line
+    found = cells(report.success(ROWS), "S8N7")
+    assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
+    assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
 
 
-def test_the_papers_protocol_and_replanning_sooner_are_kept_apart():
-    rows = [*ROWS, row(executed=3, successes=10, mean_length=4.0), row(executed=1, successes=0)]
-    (line,) = (line for line in report.success(rows).splitlines() if "S8N7" in line)
-    cells = [cell.strip() for cell in line.strip("|").split("|")]
-    assert cells[2] == "-" and cells[3].startswith("95.0% [") and cells[4].startswith("100.0% [")
-    (line,) = (line for line in report.replanning(rows).splitlines() if "S8N7" in line)
-    assert [cell.strip() for cell in line.strip("|").split("|")[1:]] == ["-", "6.0", "4.0"]
+def cells(table, level):
+    (line,) = (line for line in table.splitlines() if level in line)
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_settings_are_kept_apart():
+    paper = [
+        row(preset="paper", successes=successes, configuration={"training": {"masking": masking}})
+        for masking, successes in (("one", 7), ("each", 8), ("random", 0))
+    ]
+    sooner = [row(executed=3, successes=10, mean_length=4.0), row(executed=1, successes=0)]
+    found = cells(report.success([*ROWS, *paper, *sooner]), "S8N7")
+    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "70.0", "80.0", "95.0", "100.0"]
+    found = cells(report.steps([*ROWS, *sooner]), "S8N7")
+    assert found[1:] == ["-", "-", "6.0", "4.0"]
 
 
 def test_fewer_demonstrations_are_side_by_side():
