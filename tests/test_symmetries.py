@@ -316,7 +316,7 @@ def restate(instruction: np.ndarray) -> np.ndarray:
     return np.asarray(symmetries.restate(instruction, *vocabulary.joining_words()))
 
 
-def test_other_words_for_a_sequence_are_bound_to_be_true():
+def test_both_ways_to_tell_a_sequence_mean_the_same():
     """MiniGrid's own judgement of both instructions is the same at every step."""
     level = levels.find_level("GoToSeqS5R2")
     compared = 0
@@ -345,7 +345,7 @@ def test_other_words_for_a_sequence_are_bound_to_be_true():
 
 @settings(deadline=None)
 @given(st.integers(1, 4), st.integers(1, 4), st.booleans(), st.integers(0, 6), st.data())
-def test_saying_it_twice_the_other_way_is_saying_it(first, second, then, padding, data):
+def test_told_the_other_way_twice_it_is_told_as_before(first, second, then, padding, data):
     words = st.sampled_from(["ball", "red", "and", "go", "door"])
     parts = [" ".join(data.draw(st.lists(words, min_size=n, max_size=n))) for n in (first, second)]
     text = (", then " if then else " after you ").join(parts)
