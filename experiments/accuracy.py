@@ -1,0 +1,159 @@
+"""What a trained model knows of demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
+
+How often the action that the model finds most likely is the demonstrator's, at each position of
+the plan, given all actions before it: on demonstrations that it has learned from, and on others.
+A gap between the two says that the network recognises demonstrations where it should understand
+the level; a fall along the plan says that the end of a plan is not to be trusted.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments import runtime
+from leapjax import checkpoints, pretrained
+from leapjax.data import demonstrations, seeds, storage, windows
+from leapjax.data.demonstrations import Demonstration
+from leapjax.data.windows import Window
+from leapjax.envs import levels
+from leapjax.errors import UserError
+from leapjax.pretrained import Pretrained
+from leapjax.types import Energy, Params, mask_token
+
+TOGETHER = 64  # windows scored in one go
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Say what models know of demonstrations that they have, and have not, learned from."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs."""
+    demos: int = 200
+    """Demonstrations of each kind."""
+    samples: int = 2000
+    """Steps of them to predict from."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints one table per run; the exit code."""
+    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    console = Console()
+    try:
+        for name in ("demos", "samples"):
+            if getattr(options, name) < 1:
+                raise UserError(f"--{name} must be at least 1, got {getattr(options, name)}")
+        if not options.runs:
+            raise UserError("expected at least one folder of a run")
+        trained_on = {run: Origin.of(run) for run in options.runs}
+        runtime.start()
+        for run, origin in trained_on.items():
+            planner = pretrained.load(run)
+            console.print(describe(planner, origin, options, run.name))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where a run had its demonstrations from."""
+
+    level: str
+    seed: int
+    demos: int
+    demonstrations: str | None
+
+    @classmethod
+    def of(cls, run: Path) -> "Origin":
+        """What the folder of a run says.
+
+        Raises:
+            UserError: not the folder of a run.
+        """
+        pretrained.read_specification(run)
+        path = run / "config.json"
+        values = checkpoints.read_json(path)
+        if isinstance(values, dict):  # of all the settings only these
+            values = {field.name: values.get(field.name) for field in dataclasses.fields(cls)}
+        try:
+            return checkpoints.from_json(cls, values)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
+
+    def learned(self, count: int, side: int) -> Sequence[Demonstration]:
+        """Some demonstrations that the run has learned from."""
+        level, count = levels.find_level(self.level), min(count, self.demos)
+        if self.demonstrations is not None:
+            return storage.load(self.demonstrations, level, side)[:count]
+        return demonstrations.collect(level, count, self.seed).demonstrations
+
+    def others(self, count: int) -> Sequence[Demonstration]:
+        """As many that no run has learned from but that of the last training seed."""
+        last = seeds.MAX_TRAINING_SEED - 1
+        seed = last if self.seed != last else last - 1
+        return demonstrations.collect(levels.find_level(self.level), count, seed).demonstrations
+
+
+def describe(planner: Pretrained, origin: Origin, options: Options, title: str) -> Table:
+    """Accuracy by position, of both kinds of demonstrations."""
+    side = planner.specification.sizes.side
+    kinds = origin.learned(options.demos, side), origin.others(options.demos)
+    learned, others = (accuracy(planner, data, options.samples) for data in kinds)
+    table = Table("position in the plan", "learned from", "others", title=title)
+    for position, shares in enumerate(zip(learned, others, strict=True), start=1):
+        table.add_row(str(position), *(f"{share:.1%}" for share in shares))
+    table.add_section()
+    table.add_row("all", f"{learned.mean():.1%}", f"{others.mean():.1%}")
+    return table
+
+
+def accuracy(planner: Pretrained, data: Sequence[Demonstration], samples: int) -> np.ndarray:
+    """The share `[T]` of actions that the model finds most likely, at each position of a plan.
+
+    Args:
+        planner: the model.
+        data: demonstrations.
+        samples: windows to draw from them.
+    """
+    sizes = planner.specification.sizes
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
+    drawn = windows.sample_windows(
+        jax.random.key(0), steps, samples, sizes.context, sizes.horizon, sizes.num_actions - 1,
+        "step",
+    )  # fmt: skip
+
+    @jax.jit
+    def score(params: Params, batch: Window) -> jax.Array:
+        return jax.lax.map(
+            lambda window: hits(planner.energy, params, window), batch, batch_size=TOGETHER
+        ).mean(axis=0)
+
+    return np.asarray(score(planner.params, drawn))
+
+
+def hits(energy: Energy, params: Params, window: Window) -> jax.Array:
+    """Whether each action `[T]` is the likeliest, given those before it and MASK after it."""
+    memory = energy.encode(params, window.context)
+    places = jnp.arange(window.actions.shape[0])
+
+    def hit(place: jax.Array) -> jax.Array:
+        tokens = jnp.where(places < place, window.actions, mask_token(energy.num_actions))
+        energies = energy.conditional(params, memory, tokens, place[None])[0]
+        return jnp.argmin(energies) == window.actions[place]
+
+    return jax.vmap(hit)(places)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
