@@ -1,7 +1,8 @@
-"""Symmetries of a grid world: rotations and reflection, as pure functions.
+"""Symmetries of a grid world and of its language, as pure functions.
 
 MiniGrid's dynamics are equivariant: stepping then transforming equals transforming then
-stepping, where a reflection exchanges the two turns. Grids must be square.
+stepping, where a reflection exchanges the two turns. Grids must be square. Names can be exchanged,
+and a sequence of tasks can be told from its beginning or from its end.
 """
 
 import functools
