@@ -1,9 +1,9 @@
 """What a trained model knows of demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
 
 How often the action that the model finds most likely is the demonstrator's, at each position of
-the plan, given all actions before it: on demonstrations that it has learned from, and on others.
-A gap between the two says that the network recognises demonstrations where it should understand
-the level; a fall along the plan says that the end of a plan is not to be trusted.
+the plan, given all actions before it: on demonstrations that it has learned from, and on others
+of MiniGrid's bot. A gap between the two says that the network recognises demonstrations where it
+should understand the level; a fall along the plan says that its end is not to be trusted.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from experiments import runtime
 from leapjax import checkpoints, pretrained
 from leapjax.data import demonstrations, seeds, storage, windows
 from leapjax.data.demonstrations import Demonstration
-from leapjax.data.windows import Window
+from leapjax.data.windows import Steps, Window
 from leapjax.envs import levels
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
@@ -41,7 +41,7 @@ class Options:
     demos: int = 200
     """Demonstrations of each kind."""
     samples: int = 2000
-    """Steps of them to predict from."""
+    """Steps of them to predict from, at most."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -99,8 +99,8 @@ class Origin:
         return demonstrations.collect(level, count, self.seed).demonstrations
 
     def others(self, count: int) -> Sequence[Demonstration]:
-        """As many that no run has learned from but that of the last training seed."""
-        last = seeds.MAX_TRAINING_SEED - 1
+        """As many of the bot, of another training seed."""
+        last, count = seeds.MAX_TRAINING_SEED - 1, min(count, self.demos)
         seed = last if self.seed != last else last - 1
         return demonstrations.collect(levels.find_level(self.level), count, seed).demonstrations
 
@@ -109,50 +109,68 @@ def describe(planner: Pretrained, origin: Origin, options: Options, title: str) 
     """Accuracy by position, of both kinds of demonstrations."""
     side = planner.specification.sizes.side
     kinds = origin.learned(options.demos, side), origin.others(options.demos)
-    learned, others = (accuracy(planner, data, options.samples) for data in kinds)
+    columns = [accuracy(planner, data, options.samples) for data in kinds]
     table = Table("position in the plan", "learned from", "others", title=title)
-    for position, shares in enumerate(zip(learned, others, strict=True), start=1):
-        table.add_row(str(position), *(f"{share:.1%}" for share in shares))
+    for position in range(planner.specification.sizes.horizon):
+        shares = (_share(right[position], asked[position]) for right, asked in columns)
+        table.add_row(str(position + 1), *shares)
     table.add_section()
-    table.add_row("all", f"{learned.mean():.1%}", f"{others.mean():.1%}")
+    table.add_row("all", *(_share(right.sum(), asked.sum()) for right, asked in columns))
     return table
 
 
-def accuracy(planner: Pretrained, data: Sequence[Demonstration], samples: int) -> np.ndarray:
-    """The share `[T]` of actions that the model finds most likely, at each position of a plan.
+def _share(right: int, asked: int) -> str:
+    return f"{right / asked:.1%}" if asked else "-"
+
+
+def accuracy(
+    planner: Pretrained, data: Sequence[Demonstration], samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many actions the model finds most likely, of how many: `[T]` each, by position.
 
     Args:
         planner: the model.
         data: demonstrations.
-        samples: windows to draw from them.
+        samples: how many of their steps to predict from, evenly spaced.
     """
     sizes = planner.specification.sizes
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
-    drawn = windows.sample_windows(
-        jax.random.key(0), steps, samples, sizes.context, sizes.horizon, sizes.num_actions - 1,
-        "step",
-    )  # fmt: skip
+    count = steps.actions.shape[0]
+    starts = jnp.asarray(np.linspace(0, count - 1, min(samples, count)).astype(np.int32))
 
     @jax.jit
-    def score(params: Params, batch: Window) -> jax.Array:
-        return jax.lax.map(
-            lambda window: hits(planner.energy, params, window), batch, batch_size=TOGETHER
-        ).mean(axis=0)
+    def score(params: Params, steps: Steps) -> tuple[jax.Array, jax.Array]:
+        def one(start: jax.Array) -> tuple[jax.Array, jax.Array]:
+            end = sizes.num_actions - 1
+            window = windows.window(steps, start, sizes.context, sizes.horizon, end)
+            return hits(planner.energy, params, window)
 
-    return np.asarray(score(planner.params, drawn))
+        right, asked = jax.lax.map(one, starts, batch_size=TOGETHER)
+        return right.sum(axis=0), asked.sum(axis=0)
+
+    right, asked = jax.device_get(score(planner.params, steps))
+    return right, asked
 
 
-def hits(energy: Energy, params: Params, window: Window) -> jax.Array:
-    """Whether each action `[T]` is the likeliest, given those before it and MASK after it."""
+def hits(energy: Energy, params: Params, window: Window) -> tuple[jax.Array, jax.Array]:
+    """Whether each action is the likeliest, given those before it and MASK after it.
+
+    After the end action there is nothing to predict but more of it: those do not count.
+
+    Returns:
+        `[T]` bool: it is, and it counts; `[T]` bool: it counts.
+    """
     memory = energy.encode(params, window.context)
     places = jnp.arange(window.actions.shape[0])
+    ended = window.actions == energy.num_actions - 1
+    counts = jnp.cumsum(ended) - ended == 0  # up to the first end action
 
     def hit(place: jax.Array) -> jax.Array:
         tokens = jnp.where(places < place, window.actions, mask_token(energy.num_actions))
         energies = energy.conditional(params, memory, tokens, place[None])[0]
         return jnp.argmin(energies) == window.actions[place]
 
-    return jax.vmap(hit)(places)
+    return jax.vmap(hit)(places) & counts, counts
 
 
 if __name__ == "__main__":

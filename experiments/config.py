@@ -190,14 +190,14 @@ def check(config: Config) -> None:
         )
 
 
-def check_executed(executed: int | None, horizon: int) -> None:
+def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
     """Refuses to execute more of a plan than there is.
 
     Raises:
         UserError: says how much there is.
     """
     if executed is not None and not 1 <= executed <= horizon:
-        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon")
+        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
 
 
 def episode_seeds(config: Config) -> range:

@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     try:
         played = seeds.validation_seeds(0, options.episodes)
-        level = only_level(options.runs)
+        level = only_level(options.runs, options.executed)
         runtime.start()
         recorders: list[Recorder] = []
         successes: list[bool] = []
@@ -106,7 +106,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             successes += good
         failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
         console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
-        console.print(by_cause(failed), by_tasks(recorders, failed), by_detour(recorders, failed))
+        console.print(by_cause(failed))
+        if any(len(recorder.tasks) > 1 for recorder in recorders):
+            console.print(by_tasks(recorders, failed))
+        console.print(by_detour(recorders, failed))
         if failed and options.drawn > 0:
             path = options.gallery or options.runs[0] / "failures.png"
             draw(failed[: options.drawn], path)
@@ -120,16 +123,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def only_level(runs: Sequence[Path]) -> Level:
+def only_level(runs: Sequence[Path], executed: int | None) -> Level:
     """The level of all of these runs.
 
     Raises:
-        UserError: no run, one that cannot be read, or several levels.
+        UserError: no run, one that cannot be read or cannot execute so many actions, or several
+            levels.
     """
-    names = sorted({pretrained.read_specification(run).level for run in runs})
+    names = set()
+    for run in runs:
+        specification = pretrained.read_specification(run)
+        check_executed(executed, specification.planner.horizon, f" of {run}")
+        names.add(specification.level)
     if len(names) != 1:
-        raise UserError(f"expected runs of one level, got {', '.join(names) or 'none'}")
-    return levels.find_level(names[0])
+        raise UserError(f"expected runs of one level, got {', '.join(sorted(names)) or 'none'}")
+    return levels.find_level(names.pop())
 
 
 def play(
@@ -137,7 +145,6 @@ def play(
 ) -> tuple[list[Recorder], list[bool]]:
     """The episodes of one planner, and whether each succeeded."""
     planner = pretrained.load(run)
-    check_executed(executed, planner.specification.planner.horizon)
     recorders = [Recorder(level) for _ in played]
     waiting = iter(recorders)
     episodes = rollouts.evaluate(
@@ -171,7 +178,10 @@ def cause(recorder: Recorder) -> Cause:
 
 
 def tasks_done(instruction: Instr) -> list[bool]:
-    """Which single tasks of an instruction are done, in its order."""
+    """Which single tasks of an instruction are done, in its order.
+
+    A task that is the whole instruction never counts as done: its success ends the episode.
+    """
 
     def visit(part: Instr, done: bool) -> list[bool]:
         if not isinstance(part, SeqInstr):

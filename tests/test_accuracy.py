@@ -1,15 +1,20 @@
 """How much of demonstrations a model knows: against a model whose answers are known."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from experiments import accuracy, babyai
+from leapjax.data import demonstrations, storage
 from leapjax.data.windows import Window
 from leapjax.energy import pseudo_likelihood
-from leapjax.types import Context, mask_token
+from leapjax.envs.levels import find_level
+from leapjax.types import Context, Observation, mask_token
 from tests.test_failures import TOY
 
-ACTIONS, HORIZON = 4, 5
+ACTIONS, HORIZON, END = 4, 5, 3
 
 
 def window(actions):
@@ -35,8 +40,45 @@ def counting_model():
 
 
 def test_actions_are_predicted_from_those_before_and_none_after():
-    hits = accuracy.hits(counting_model(), None, window([0, 1, 2, 0, 1]))
-    np.testing.assert_array_equal(hits, [True, True, True, False, True])
+    right, counts = accuracy.hits(counting_model(), None, window([0, 1, 2, 0, 1]))
+    np.testing.assert_array_equal(right, [True, True, True, False, True])
+    assert counts.all()
+
+
+@pytest.mark.parametrize("actions", [[0, 1, 2, END, END], [0, 1, 1, END, END]])
+def test_what_comes_after_the_end_does_not_count(actions):
+    right, counts = accuracy.hits(counting_model(), None, window(actions))
+    np.testing.assert_array_equal(counts, [True, True, True, True, False])
+    # The end is expected after 2 only.
+    follows = actions[2] == 2
+    np.testing.assert_array_equal(right, [True, True, follows, follows, False])
+
+
+def test_counts_are_those_of_every_step():
+    """Three demonstrations of 2, 3 and 7 steps that count up from 0, or stand still."""
+    level = find_level("GoToLocalS7N5")
+    whole = max(demonstrations.collect(level, 20, 0).demonstrations, key=lambda d: len(d.actions))
+    assert len(whole.actions) >= 7
+
+    def told(actions):
+        observations = Observation(*(part[: len(actions) + 1] for part in whole.observations))
+        return whole._replace(observations=observations, actions=np.array(actions, np.int32))
+
+    data = [told([0, 1]), told([0, 1, 2]), told([0] * 7)]
+    sizes = SimpleNamespace(context=0, horizon=HORIZON, num_actions=ACTIONS)
+    planner = SimpleNamespace(
+        specification=SimpleNamespace(sizes=sizes), energy=counting_model(), params=None
+    )
+    expected = np.zeros((2, HORIZON), int)
+    for demonstration in data:
+        for start in range(len(demonstration.actions)):
+            ahead = [*demonstration.actions[start:], END][:HORIZON]
+            for place, action in enumerate(ahead):
+                expected[0, place] += action == (ahead[place - 1] + 1 if place else 0)
+                expected[1, place] += 1
+    found = accuracy.accuracy(planner, data, 10**15)
+    np.testing.assert_array_equal(found, expected)
+    assert accuracy.accuracy(planner, data, 3)[1][0] == 3
 
 
 def test_the_demonstrations_of_both_kinds_are_different_levels():
@@ -46,7 +88,16 @@ def test_the_demonstrations_of_both_kinds_are_different_levels():
         others = origin.others(3)
         assert (len(learned), len(others)) == (3, 3)
         assert not {d.seed for d in learned} & {d.seed for d in others}
-        assert len(origin.learned(9, 7)) == 4  # no more than there were
+        assert len(origin.learned(9, 7)) == len(origin.others(9)) == 4  # what there was
+
+
+def test_a_users_data_set_is_what_was_learned_from():
+    level = find_level("GoToLocalS7N5")
+    collection = demonstrations.collect(level, 3, 5)
+    storage.save("accuracy/mine-v0", collection, "three demonstrations")
+    origin = accuracy.Origin(level.name, 0, 2, "accuracy/mine-v0")
+    learned = origin.learned(9, 7)
+    assert [d.seed for d in learned] == [d.seed for d in collection.demonstrations[:2]]
 
 
 def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch, capsys):
@@ -59,8 +110,9 @@ def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch,
     said = capsys.readouterr().out
     assert "learned from" in said and "others" in said and "%" in said
 
-    assert accuracy.main([str(run), "--demos", "0"]) == 2
-    assert "--demos must be at least 1" in capsys.readouterr().err
+    for option in ("--demos", "--samples"):
+        assert accuracy.main([str(run), option, "0"]) == 2
+        assert f"{option} must be at least 1" in capsys.readouterr().err
     assert accuracy.main([str(tmp_path)]) == 2
     assert "not a checkpoint" in capsys.readouterr().err
     for broken, expected in (

@@ -71,9 +71,11 @@ def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
     assert failures.main([str(run), "--episodes", "6"]) == 0
     said = capsys.readouterr().out
     assert "of 6 episodes failed" in said and "what happened" in said
+    assert "tasks of the instruction" not in said  # there is one only
     assert Image.open(run / "failures.png").size[0] >= 336
     assert failures.main([str(run), "--episodes", "2", "--executed", "9"]) == 2
-    assert "not in 1 .. 5" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "not in 1 .. 5" in error and str(run) in error
     assert failures.main([str(tmp_path)]) == 2
     assert "not a checkpoint" in capsys.readouterr().err
 
@@ -103,8 +105,17 @@ def test_a_done_task_is_counted_in_a_level():
         found.step(action)
         seen.append(sum(found.tasks))
     assert seen == sorted(seen) and seen[0] == 0
-    # The level ends with the last task, which a "then" no longer writes down.
-    assert seen[-1] >= len(found.tasks) - 1 > 0
+    assert seen[-1] == len(found.tasks) > 1
+
+
+def test_failures_are_counted_by_the_tasks_that_were_done():
+    both = recorder("GoToSeqS5R2", seed=next_sequence())
+    count = len(both.tasks)
+    one = recorder("GoToLocalS7N5")
+    lines = [list(column.cells) for column in failures.by_tasks([both, both, one], [both]).columns]
+    assert lines == [
+        ["1", str(count)], ["1", "2"], ["0.0%: none", "50.0%: 1 with 0 done"],
+    ]  # fmt: skip
 
 
 def next_sequence() -> int:

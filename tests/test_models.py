@@ -256,7 +256,7 @@ def moved_past(context):
 
 
 @EACH_ARCHITECTURE
-def test_past_actions_and_poses_are_seen(architecture):
+def test_past_states_are_seen(architecture):
     context = with_kind(random_context(9, 2), BALL)
     before = run(architecture, 2, context, [0, MASK, 1])["logits"]
     after = run(architecture, 2, moved_past(context), [0, MASK, 1])["logits"]
@@ -264,6 +264,15 @@ def test_past_actions_and_poses_are_seen(architecture):
     swapped = context._replace(past=jax.tree.map(lambda x: x[::-1], context.past))
     after = run(architecture, 2, swapped, [0, MASK, 1])["logits"]
     assert largest_change(after, before) > 1e-4
+
+
+@EACH_ARCHITECTURE
+def test_only_the_papers_model_reads_past_actions(architecture):
+    context = random_context(9, 2)
+    before = run(architecture, 2, context, [0, MASK, 1])["logits"]
+    others = context._replace(actions=(context.actions + 1) % (ACTIONS - 1))
+    after = run(architecture, 2, others, [0, MASK, 1])["logits"]
+    assert (largest_change(after, before) > 1e-4) == (architecture == "paper")
 
 
 @pytest.mark.parametrize("kind", [EMPTY, WALL])

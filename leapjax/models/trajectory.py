@@ -183,8 +183,8 @@ class ContextTokens(nn.Module):
         """Which objects and doors the agent has faced in the context, and when: `[S, S, 2]`.
 
         1 where it has, and how recently, in (0, 1]: 1 is now. That is what says which part of
-        an instruction is done. Where the agent went besides would let the network recognise
-        the demonstrations: with it, it learned less (docs/experiments.md).
+        an instruction is done. The past actions, and where the agent went besides, are left
+        out: by them a network can recognise a demonstration (docs/experiments.md).
 
         Args:
             context: what is known.
