@@ -1,6 +1,7 @@
 """What several tests share."""
 
 import os
+from pathlib import Path
 
 # Tests compile much and compute little: without optimisations they take a fraction of the time.
 # XLA reads this when JAX starts, so it comes before every import of JAX.
@@ -13,6 +14,7 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", "8")
 import jax
 import pytest
 
+from experiments import babyai
 from leapjax.data import demonstrations
 from leapjax.data.demonstrations import Demonstration
 from leapjax.envs import levels
@@ -34,3 +36,22 @@ def local_demonstrations() -> list[Demonstration]:
     for leaf in jax.tree.leaves([(d.observations, d.actions) for d in collected]):
         leaf.setflags(write=False)
     return collected
+
+
+TOY = (
+    "--demos 4 --episodes 3 --steps 2 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
+    "--rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures"
+).split()
+
+
+@pytest.fixture(scope="session")
+def toy_run(tmp_path_factory) -> Path:
+    """The folder of a run of two steps; not to be changed."""
+    folder = tmp_path_factory.mktemp("toy")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+        patch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+        assert babyai.main(TOY) == 0
+    (run,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
+    return run

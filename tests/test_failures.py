@@ -1,19 +1,18 @@
 """Why episodes fail: causes, detours, and the command on trained toy runs."""
 
+import shutil
+from pathlib import Path
+
 from minigrid.envs.babyai.core.verifier import AfterInstr, AndInstr, GoToInstr, ObjDesc
 from PIL import Image
 
-from experiments import babyai, failures
+from experiments import failures
 from experiments.failures import Cause
 from leapjax.data.demonstrations import make_bot
 from leapjax.envs.adapter import END
 from leapjax.envs.levels import find_level
 
 LEFT, FORWARD, PICKUP = 0, 2, 3
-TOY = (
-    "--demos 4 --episodes 3 --steps 2 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
-    "--rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures"
-).split()
 
 
 def recorder(level: str, seed: int = 0) -> failures.Recorder:
@@ -63,11 +62,9 @@ def test_a_recorder_knows_the_way_that_was_walked():
     assert found.cells[-1] == tuple(found.env.agent_pos)
 
 
-def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_counts_and_draws(toy_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
-    assert babyai.main(TOY) == 0
-    (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    run = Path(shutil.copytree(toy_run, tmp_path / "run"))
     assert failures.main([str(run), "--episodes", "6"]) == 0
     said = capsys.readouterr().out
     assert "of 6 episodes failed" in said and "what happened" in said
