@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import runtime
+from experiments.config import check_counts
 from leapjax import checkpoints, pretrained
 from leapjax.data import demonstrations, seeds, storage, windows
 from leapjax.data.demonstrations import Demonstration
@@ -49,9 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = tyro.cli(Options, args=None if arguments is None else list(arguments))
     console = Console()
     try:
-        for name in ("demos", "samples"):
-            if getattr(options, name) < 1:
-                raise UserError(f"--{name} must be at least 1, got {getattr(options, name)}")
+        check_counts(options, "demos", "samples")
         if not options.runs:
             raise UserError("expected at least one folder of a run")
         trained_on = {run: Origin.of(run) for run in options.runs}

@@ -167,9 +167,7 @@ def check(config: Config) -> None:
         UserError: says what.
     """
     level = levels.find_level(config.level)
-    for name in ("demos", "episodes"):
-        if getattr(config, name) < 1:
-            raise UserError(f"--{name} must be at least 1, got {getattr(config, name)}")
+    check_counts(config, "demos", "episodes")
     if not config.seeds:
         raise UserError("--seeds needs at least one seed")
     for seed in config.seeds:
@@ -188,6 +186,17 @@ def check(config: Config) -> None:
             f"--horizon {config.planner.horizon} is longer than an episode of {level.name} "
             f"may last: its step limit is {limit}"
         )
+
+
+def check_counts(options: object, *names: str) -> None:
+    """Refuses options that count something and are not positive.
+
+    Raises:
+        UserError: says which.
+    """
+    for name in names:
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} must be at least 1, got {getattr(options, name)}")
 
 
 def check_executed(executed: int | None, horizon: int, of: str = "") -> None:

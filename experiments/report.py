@@ -42,6 +42,7 @@ SETTINGS = (
     # Chosen on validation levels: docs/experiments.md.
     Setting("`leapjax`, `--executed 3`", "leapjax", "random", executed=3),
 )
+TITLES = " | ".join(setting.title for setting in SETTINGS)
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experiments.md")
 
 
@@ -93,30 +94,23 @@ def success(rows: Sequence[Row]) -> str:
     A cell is the mean over seeds, the 95% interval of all their episodes together, and the
     number of seeds.
     """
-    papers = {name: f"{level.paper_success:.1f}%" for name, level in LEVELS.items()}
-    return _by_setting(rows, _rate, papers)
+    lines = [
+        [level.name, f"{level.paper_success:.1f}%", *cells]
+        for level, cells in zip(LEVELS.values(), _by_setting(rows, _rate), strict=True)
+    ]
+    return _table(f"level | paper | {TITLES}", lines)
 
 
 def steps(rows: Sequence[Row]) -> str:
     """Steps per episode, failed episodes included, of every setting."""
-    return _by_setting(rows, _mean_length)
+    found = zip(LEVELS, _by_setting(rows, _mean_length), strict=True)
+    return _table(f"level | {TITLES}", [[level, *cells] for level, cells in found])
 
 
-def _by_setting(
-    rows: Sequence[Row], cell: Callable[[Sequence[Row]], str], papers: dict[str, str] | None = None
-) -> str:
-    """A table of levels by settings."""
+def _by_setting(rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> list[list[str]]:
+    """For each level what `cell` makes of its rows, setting by setting."""
     columns = [_by_level_and_demos(rows, setting) for setting in SETTINGS]
-    lines = [
-        [
-            level,
-            *([papers[level]] if papers else []),
-            *(cell(column.get((level, PAPER_DEMOS), [])) for column in columns),
-        ]
-        for level in LEVELS
-    ]
-    titles = [*(["paper"] if papers else []), *(setting.title for setting in SETTINGS)]
-    return _table(" | ".join(["level", *titles]), lines)
+    return [[cell(column.get((level, PAPER_DEMOS), [])) for column in columns] for level in LEVELS]
 
 
 def _by_level_and_demos(rows: Sequence[Row], setting: Setting) -> dict[tuple[str, int], list[Row]]:

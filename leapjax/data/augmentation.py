@@ -1,5 +1,6 @@
 """More windows from the same demonstrations: symmetries of the world, and clutter in it."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -86,15 +87,19 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
         objects = objects.at[kinds].set(kinds[order])
         vocabulary = vocabulary.at[words.objects].set(words.objects[order])
     renaming = symmetries.Renaming(colours, objects, vocabulary)
-    context = window.context
-    renamed = window._replace(
-        context=context._replace(
-            observation=symmetries.rename(context.observation, renaming),
-            past=jax.vmap(lambda o: symmetries.rename(o, renaming))(context.past),
-        )
-    )
+    renamed = _throughout(window, lambda observation: symmetries.rename(observation, renaming))
     restated = _either(restate_key, restate(renamed, words), renamed)
     return _either(flip_key, reflect(restated, words.mirrored), restated)
+
+
+def _throughout(window: Window, change: Callable[[Observation], Observation]) -> Window:
+    """A window with every state changed, the past ones too."""
+    context = window.context
+    return window._replace(
+        context=context._replace(
+            observation=change(context.observation), past=jax.vmap(change)(context.past)
+        )
+    )
 
 
 def _either(key: jax.Array, first: Window, second: Window) -> Window:
@@ -110,12 +115,7 @@ def restate(window: Window, words: GridWords) -> Window:
         said = symmetries.restate(observation.instruction, words.then, words.after)
         return observation._replace(instruction=said)
 
-    context = window.context
-    return window._replace(
-        context=context._replace(
-            observation=say(context.observation), past=jax.vmap(say)(context.past)
-        )
-    )
+    return _throughout(window, say)
 
 
 def reflect(window: Window, mirrored_words: jax.Array) -> Window:

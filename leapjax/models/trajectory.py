@@ -194,7 +194,7 @@ class ContextTokens(nn.Module):
         direction = context.observation.pose[2]
         poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
         known = jnp.append(context.actions <= self.sizes.num_actions, True)  # PAD: before the start
-        recency = jnp.arange(1, past + 2) / (past + 1)
+        recency = known * jnp.arange(1, past + 2) / (past + 1)
 
         def mark(pose: jax.Array) -> jax.Array:
             pose = symmetries.rotate_pose(pose, direction, side)
@@ -203,9 +203,8 @@ class ContextTokens(nn.Module):
 
         kinds = turned[..., 0]
         named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
-        drawn = jax.vmap(mark)(poses) * known[:, None, None] * named
-        latest = (drawn * recency[:, None, None]).max(axis=0)
-        return jnp.stack([drawn.max(axis=0), latest], axis=-1)
+        latest = (jax.vmap(mark)(poses) * recency[:, None, None]).max(axis=0) * named
+        return jnp.stack([latest > 0, latest], axis=-1)
 
 
 class LeapModel(nn.Module):
