@@ -90,13 +90,13 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
         watch.look()
     with capsys.disabled():
         print("\nsoak, library:", watch.report())
-    # Episodes leave a batch one by one, so a chunk of another size may still be compiled.
-    assert sum(watch.compiled[CYCLES // 4 :]) == 0
+    # Episodes leave a batch one by one, so a chunk of another size may still be compiled; what
+    # that takes is no leak, so memory counts from where nothing is compiled any more.
+    settled = CYCLES // 4
+    assert sum(watch.compiled[settled:]) == 0
     assert max(watch.files[1:]) <= watch.files[1] + 2
-    fifth = CYCLES // 5
-    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing. What
-    # the allocator holds on to varies by a dozen MiB.
-    assert watch.memory[-1] < watch.memory[fifth] + 20 + 0.3 * (CYCLES - fifth)
+    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing.
+    assert watch.memory[-1] < watch.memory[settled] + 10 + 0.3 * (CYCLES - settled)
     assert len(results.read(tmp_path / "rows.jsonl")) == min(CYCLES, 7)
 
 
