@@ -11,8 +11,9 @@ READY := .venv/ready
 babyai: $(READY)
 	$(BIN)/python -m experiments.babyai $(ARGS)
 
+# Two files at a time, in the order of their names: most of a test is compilation, on one core.
 test: $(READY)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # The long form of the tests that have one: docs/reliability.md.
 test-long: $(READY)

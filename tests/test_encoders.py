@@ -64,6 +64,17 @@ def test_a_way_is_found_only_within_the_sweeps():
     np.testing.assert_array_equal(distance[..., 0], expected)
 
 
+def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
+    odds = np.full((SIDE, SIDE, 1), 0.001 / 0.999)  # of being blocked
+    odds[2, :-1] = 0.95 / 0.05  # a wall with a gap at its end
+    cost = encoders.entering_cost(jnp.log(odds))
+    np.testing.assert_allclose(cost[2, 0, 0], 1 - encoders.BARRIER * np.log(0.05), rtol=1e-5)
+    start = jnp.full((SIDE, SIDE, 1), encoders.FAR).at[3, 0].set(0.0)
+    distance = encoders.min_plus(start, cost, SIDE**2)[..., 0]
+    around = 2 * (SIDE - 1) + 2
+    np.testing.assert_allclose(distance[1, 0], around, rtol=0.01)
+
+
 def test_the_gradient_is_autodiffs(field):
     weights = jax.random.normal(jax.random.key(2), (SIDE, SIDE, 2))
 

@@ -21,6 +21,7 @@ OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
+BARRIER = 8.0  # steps that one goes round for each nat
 _OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
 
 
@@ -183,10 +184,11 @@ class GridEncoder(nn.Module):
     """Cell features that know the way: learned distances, then local convolutions.
 
     Distances are value iteration in the min-plus sense (Tamar et al., Value Iteration
-    Networks). What it costs to enter a cell is learned from the demonstrations, per field:
-    nothing says that walls are in the way. Half of the fields measure from the goal, where
-    it is observed; where the others measure from is learned too. A sweep carries a distance
-    one cell further and has no matrix product, so the dozens that mazes need cost little.
+    Networks). How likely it is that a cell can be entered is learned from the demonstrations,
+    per field: nothing says that walls are in the way. Half of the fields measure from the goal,
+    where it is observed; where the others measure from is learned too. A sweep carries a
+    distance one cell further and has no matrix product, so the dozens that mazes need cost
+    little.
     """
 
     channels: int
@@ -207,8 +209,8 @@ class GridEncoder(nn.Module):
             goal: `[2]` its cell; (-1, -1) where it is not available.
         """
         local = nn.relu(_convolution(self.channels, "local", self.dtype)(cells))
-        bias = nn.initializers.constant(1.0)
-        cost = nn.softplus(nn.Dense(self.fields, bias_init=bias, name="cost")(local))
+        free = nn.initializers.constant(-3.0)
+        cost = entering_cost(nn.Dense(self.fields, bias_init=free, name="blocked")(local))
         from_goal = (1 - one_cell(goal, cells.shape[0]))[..., None] * FAR
         far = nn.initializers.constant(10.0)
         learned = nn.softplus(
@@ -228,6 +230,16 @@ class GridEncoder(nn.Module):
         for _ in range(self.rounds):
             h = nn.relu(step(h) + source)
         return h, jnp.tanh(here / 16)
+
+
+def entering_cost(blocked: jax.Array) -> jax.Array:
+    """What it costs to enter a cell, in steps, from the log-odds `[...]` that it is blocked.
+
+    One step, and `BARRIER` for each nat of -log P(free), so that distances prefer ways that are
+    likely to be free, however long. Demonstrations alone ask for little: a cost that makes their
+    own detours worthwhile, which are short.
+    """
+    return 1 + BARRIER * nn.softplus(blocked)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
