@@ -25,10 +25,13 @@ from rich.table import Table
 
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments import runtime
+from experiments.config import preset
+from leapjax import pretrained
 from leapjax.agents import leap
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys, split_batch
-from leapjax.envs import vocabulary
+from leapjax.envs import levels
 from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.envs.levels import Level
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import GibbsConfig
@@ -37,13 +40,10 @@ from leapjax.types import Params
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SETTINGS = ((5, 10, 7), (10, 30, 10), (15, 50, 19))  # T, N, S of the paper's levels
+# One for each of the paper's (T, N): (5, 10), (10, 30) and (15, 50), on grids of side 7, 10, 19.
+LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
+COMPARED = ("paper", "leapjax")
 BATCHES = (1, 4, 16, 64, 256, 1024)
-WORDS = 5
-MODELS = {
-    "paper": ModelConfig("paper"),
-    "leapjax": ModelConfig("leapjax", dropout=0.0, sweeps=14),
-}
 PREFIX_TOKENS = 4  # of the leapjax model
 
 
@@ -52,9 +52,9 @@ class Options:
     """Measure batched planning."""
 
     quick: bool = False
-    """Only (T, N) = (5, 10), at batch 1 and 256."""
+    """Only the first level, (T, N) = (5, 10), at batch 1 and 256."""
     large: int = 0
-    """Also plan so many contexts of (15, 50) in one call, and report the memory it took."""
+    """Also plan so many contexts of the last level in one call, and report the memory it took."""
     json: Path | None = None
     """Write the rows here."""
     plot: Path | None = None
@@ -67,37 +67,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
     runtime.use_every_core()  # and no compilation cache: compile times are real
     options = tyro.cli(Options, args=None if arguments is None else list(arguments))
-    settings = SETTINGS[:1] if options.quick else SETTINGS
+    chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
     batches = (1, 256) if options.quick else BATCHES
     console = Console()
     rows = []
-    for horizon, iterations, side in settings:
-        for name in MODELS:
-            rows += measure(name, horizon, iterations, side, batches, options.seconds)
-            console.print(f"measured {name} (T, N) = ({horizon}, {iterations}), side {side}")
+    for level in chosen:
+        for name in COMPARED:
+            rows += measure(name, level, batches, options.seconds)
+            console.print(f"measured {name} on {level.name}")
     compare_with_peak(rows)
     console.print(table(rows))
     if options.large:
-        for name in MODELS:
-            console.print(plan_many(name, options.large))
+        for name in COMPARED:
+            console.print(plan_many(name, chosen[-1], options.large))
     write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
     return 0
 
 
-def measure(
-    name: str, horizon: int, iterations: int, side: int, batches: Sequence[int], seconds: float
-) -> list[Row]:
-    """One preset and setting at every batch size."""
-    model = MODELS[name]
-    planner, params, sizes = make_planner(name, horizon, iterations, side)
-    flops = needed_flops(model, horizon, iterations)
+def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> list[Row]:
+    """One preset and level at every batch size."""
+    model, horizon = preset(level, name).model, level.horizon
+    planner, params, sizes = make_planner(name, level)
+    flops = needed_flops(model, horizon, level.iterations)
     rows: list[Row] = []
     compiled: set[int] = set()
     for batch in batches:
         keys = jax.random.split(jax.random.key(1), batch)
-        contexts = random_contexts(sizes, batch)
+        contexts = random_contexts(sizes, batch, level.words)
         begun = time.perf_counter()
         jax.block_until_ready(planner(params, keys, contexts))
         first = time.perf_counter() - begun
@@ -109,9 +107,10 @@ def measure(
         rows.append(
             {
                 "preset": name,
+                "level": level.name,
                 "horizon": horizon,
-                "iterations": iterations,
-                "side": side,
+                "iterations": level.iterations,
+                "side": sizes.side,
                 "batch": batch,
                 "chunk": chunk,
                 # 0 where a smaller batch has compiled what this one needs
@@ -137,31 +136,29 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
         row["fraction_of_peak"] = row["gflops"] / row["peak_gflops"]
 
 
-def make_planner(
-    name: str, horizon: int, iterations: int, side: int
-) -> tuple[CompiledPlanner, Params, Sizes]:
-    """A planner with random parameters."""
-    sizes = Sizes(side, vocabulary.SIZE, NUM_ACTIONS, 0, horizon, 64)
-    config = GibbsConfig(horizon, iterations)
-    agent = leap.make_agent(MODELS[name], leap.TrainingConfig(), config, sizes, WORDS)
+def make_planner(name: str, level: Level) -> tuple[CompiledPlanner, Params, Sizes]:
+    """A preset's planner with the paper's N and random parameters."""
+    settings = preset(level, name)
+    sizes = pretrained.sizes_for(level, level.context, level.horizon)
+    config = GibbsConfig(level.horizon, level.iterations)
+    agent = leap.make_agent(settings.model, settings.training, config, sizes, level.words)
     assert agent.energy is not None
     params = jax.jit(agent.init)(jax.random.key(0)).params
     return compile_planner(agent.energy, config), params, sizes
 
 
-def plan_many(name: str, count: int) -> str:
+def plan_many(name: str, level: Level, count: int) -> str:
     """Plans for very many contexts at once, and says what it took."""
-    horizon, iterations, side = SETTINGS[-1]
-    planner, params, sizes = make_planner(name, horizon, iterations, side)
-    contexts = jax.tree.map(np.asarray, random_contexts(sizes, count))
+    planner, params, sizes = make_planner(name, level)
+    contexts = jax.tree.map(np.asarray, random_contexts(sizes, count, level.words))
     keys = plan_keys(0, np.arange(count), np.zeros(count, int))
     begun = time.perf_counter()
     planner(params, keys, contexts)
     taken = time.perf_counter() - begun
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return (
-        f"{name}: {count} plans of ({horizon}, {iterations}) in {taken:.0f} s, compilation "
-        f"included; at most {most:.2f} GiB of memory in the whole process"
+        f"{name}: {count} plans of ({level.horizon}, {level.iterations}) in {taken:.0f} s, "
+        f"compilation included; at most {most:.2f} GiB of memory in the whole process"
     )
 
 
@@ -190,7 +187,7 @@ def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
     return one_pass(horizon) + (iterations - 1) * one_pass(1)
 
 
-def random_contexts(sizes: Sizes, batch: int, words: int = WORDS) -> Any:
+def random_contexts(sizes: Sizes, batch: int, words: int) -> Any:
     """`[B]` contexts of the right shapes with random grids and poses."""
     blank = trajectory.blank_context(sizes, words)
     contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
@@ -222,8 +219,8 @@ def table(rows: Sequence[Row]) -> Table:
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Plans per second, and fraction of peak, against batch size."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
-    for name in MODELS:
-        for horizon, iterations, _ in SETTINGS:
+    for name in COMPARED:
+        for horizon, iterations in dict.fromkeys((r["horizon"], r["iterations"]) for r in rows):
             chosen = [r for r in rows if (r["preset"], r["horizon"]) == (name, horizon)]
             label = f"{name}, T = {horizon}, N = {iterations}"
             batches = [row["batch"] for row in chosen]

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
-from experiments import results, runtime
+from experiments import runtime
 from leapjax import pretrained, rollouts
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
@@ -126,7 +126,6 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
         "paper_iterations": level.iterations,
         "run": options.run.resolve().name,
         "training_steps": specification.training.steps,
-        "versions": results.versions(),
         "plans_per_second": options.batch / taken,
         "episodes": options.episodes,
         "successes": int(episodes.successes.sum()),

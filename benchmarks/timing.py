@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding
 
+from experiments import results
 from leapjax import files, sharding
 
 Row = dict[str, Any]  # one measurement, as JSON values
@@ -62,6 +63,7 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
 
 
 def write_rows(path: Path | None, rows: Sequence[Row]) -> None:
-    """Writes the rows where `--json` asked for them."""
+    """Writes the rows where `--json` asked for them, with what they were made with."""
     if path is not None:
-        files.write_text(path, json.dumps(rows, indent=1) + "\n")
+        made = {"date": results.today(), "versions": results.versions()}
+        files.write_text(path, json.dumps([{**row, **made} for row in rows], indent=1) + "\n")

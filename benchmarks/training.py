@@ -148,7 +148,8 @@ def encoder_seconds(
         return jax.tree.map(lambda leaf: leaf[None], jax.grad(total)(params))
 
     run = partial(sharding.split_batches(gradient, mesh), None)
-    contexts = jax.tree.map(np.asarray, random_contexts(sizes, batch))
+    words = levels.find_level(config.level).words
+    contexts = jax.tree.map(np.asarray, random_contexts(sizes, batch, words))
     jax.block_until_ready(run(params, contexts))
     return fastest(partial(run, params, contexts), seconds)
 

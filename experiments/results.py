@@ -3,6 +3,7 @@
 import datetime
 import json
 import platform
+import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -82,7 +83,29 @@ def versions() -> dict[str, str]:
     """What a result was made with."""
     names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
+    found["leapjax"] += code_version(Path(__file__).parent.parent)
     return {**found, "python": platform.python_version(), "machine": platform.machine()}
+
+
+def code_version(root: Path) -> str:
+    """Which commit last changed the code of a checkout, as a local version: "+g1a2b3c4".
+
+    With ".dirty" where the code differs from it; empty where there is no repository. Rows are
+    committed too, so it is not simply the last commit.
+    """
+    code = ("--", "leapjax", "experiments", "benchmarks")
+
+    def git(*arguments: str) -> str:
+        command = ("git", "-C", str(root), *arguments, *code)
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    if not (root / ".git").exists():
+        return ""
+    try:
+        changed = git("status", "--porcelain")
+        return f"+g{git('log', '-1', '--format=%h')}{'.dirty' if changed else ''}"
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def today() -> str:

@@ -9,19 +9,31 @@ import pytest
 
 from benchmarks import planning, scaling, training
 from experiments.config import preset
-from leapjax.envs import vocabulary
+from leapjax import pretrained
+from leapjax.envs import levels
 from leapjax.models import trajectory
-from leapjax.models.trajectory import ModelConfig, Sizes
 
 HORIZON = 5
 
 
+def tiny_preset(level, name):
+    """The settings of a preset, with a network and batches that take no time."""
+    config = preset(level, name)
+    small = {"width": 16, "heads": 2, "layers": 1, "channels": 4, "rounds": 1, "sweeps": 2}
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **small),
+        training=dataclasses.replace(config.training, batch=4),
+    )
+
+
 @pytest.mark.parametrize("name", ["paper", "leapjax"])
 def test_needed_flops_are_what_xla_counts(name):
-    model = planning.MODELS[name]
-    sizes = Sizes(7, vocabulary.SIZE, planning.NUM_ACTIONS, 0, HORIZON, 64)
+    level = levels.find_level("GoToLocalS7N5")
+    model = preset(level, name).model
+    sizes = pretrained.sizes_for(level, 0, HORIZON)
     module = trajectory.build(model, sizes)
-    context = trajectory.blank_context(sizes, planning.WORDS)
+    context = trajectory.blank_context(sizes, level.words)
     actions = jnp.zeros(HORIZON, jnp.int32)
 
     def everything(module, context):
@@ -42,36 +54,28 @@ def test_needed_flops_are_what_xla_counts(name):
 
 
 def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
-    tiny = ModelConfig("leapjax", layers=1, width=16, heads=2, channels=4, rounds=1, sweeps=2)
-    monkeypatch.setattr(planning, "MODELS", {"leapjax": tiny})
-    monkeypatch.setattr(planning, "SETTINGS", ((2, 3, 5),))
+    monkeypatch.setattr(planning, "preset", tiny_preset)
+    monkeypatch.setattr(planning, "COMPARED", ("leapjax",))
+    monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
     monkeypatch.setattr(planning, "BATCHES", (1, 9))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
     written = ["--json", str(rows), "--plot", str(plot)]
     assert planning.main([*written, "--seconds", "0.01", "--large", "20"]) == 0
-    assert "20 plans of (2, 3)" in capsys.readouterr().out
+    assert "20 plans of (5, 10)" in capsys.readouterr().out
     fields = (
         "horizon iterations batch preset compile_seconds plans_per_second gflops peak_gflops "
         "fraction_of_peak"
     ).split()
     written = json.loads(rows.read_text())
     assert [row["batch"] for row in written] == [1, 9]
+    assert all(row["versions"]["leapjax"].startswith("0.") for row in written)
     assert all(set(fields) <= row.keys() for row in written)
     assert all(row[field] > 0 for row in written for field in fields[4:])
     assert plot.stat().st_size > 1000
 
 
 def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
-    def tiny(level, name):
-        config = preset(level, name)
-        small = {"width": 16, "heads": 2, "layers": 1, "channels": 4, "rounds": 1, "sweeps": 2}
-        return dataclasses.replace(
-            config,
-            model=dataclasses.replace(config.model, **small),
-            training=dataclasses.replace(config.training, batch=4),
-        )
-
-    monkeypatch.setattr(training, "preset", tiny)
+    monkeypatch.setattr(training, "preset", tiny_preset)
     rows = tmp_path / "rows.json"
     arguments = ["--levels", "GoToLocalS7N5", "--presets", "leapjax", "--seconds", "0.01"]
     assert training.main([*arguments, "--json", str(rows)]) == 0

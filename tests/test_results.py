@@ -1,0 +1,48 @@
+"""Rows say what they were made with."""
+
+import subprocess
+
+import pytest
+
+from experiments import results
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A repository with one commit of code."""
+    (tmp_path / "leapjax").mkdir()
+    (tmp_path / "leapjax" / "code.py").write_text("1")
+    git(tmp_path, "init", "--quiet")
+    commit(tmp_path)
+    return tmp_path
+
+
+def git(folder, *arguments):
+    identity = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    done = subprocess.run(
+        ("git", "-C", folder, *identity, *arguments), capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def commit(folder):
+    git(folder, "add", ".")
+    git(folder, "commit", "--quiet", "--message", "a")
+    return git(folder, "log", "-1", "--format=%h")
+
+
+def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
+    version = results.code_version(checkout)
+    (checkout / "rows").write_text("new")
+    commit(checkout)
+    assert results.code_version(checkout) == version
+    (checkout / "leapjax" / "code.py").write_text("2")
+    assert results.code_version(checkout) == f"{version}.dirty"
+    latest = commit(checkout)
+    assert results.code_version(checkout) == f"+g{latest}" != version
+
+
+def test_without_a_repository_only_the_version_is_known(tmp_path):
+    assert results.code_version(tmp_path) == ""
+    (tmp_path / ".git").write_text("damaged")
+    assert results.code_version(tmp_path) == ""
