@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.print(table(rows))
     if options.large:
         for name in COMPARED:
-            console.print(plan_many(name, chosen[-1], options.large))
+            console.print(plan_many(name, levels.find_level(LEVELS[-1]), options.large))
     write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
