@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import runtime
-from experiments.config import check_counts
-from leapjax import checkpoints, pretrained
+from experiments.config import Origin, check_counts, read_origin
+from leapjax import pretrained
 from leapjax.data import demonstrations, seeds, storage, windows
 from leapjax.data.demonstrations import Demonstration
 from leapjax.data.windows import Steps, Window
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_counts(options, "demos", "samples")
         if not options.runs:
             raise UserError("expected at least one folder of a run")
-        trained_on = {run: Origin.of(run) for run in options.runs}
+        trained_on = {run: read_origin(run) for run in options.runs}
         runtime.start()
         for run, origin in trained_on.items():
             planner = pretrained.load(run)
@@ -64,50 +64,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-@dataclasses.dataclass(frozen=True)
-class Origin:
-    """Where a run had its demonstrations from."""
+def learned(origin: Origin, count: int, side: int) -> Sequence[Demonstration]:
+    """Some demonstrations that a run has learned from."""
+    level, count = levels.find_level(origin.level), min(count, origin.demos)
+    if origin.demonstrations is not None:
+        return storage.load(origin.demonstrations, level, side)[:count]
+    return demonstrations.collect(level, count, origin.seed).demonstrations
 
-    level: str
-    seed: int
-    demos: int
-    demonstrations: str | None
 
-    @classmethod
-    def of(cls, run: Path) -> "Origin":
-        """What the folder of a run says.
-
-        Raises:
-            UserError: not the folder of a run.
-        """
-        pretrained.read_specification(run)
-        path = run / "config.json"
-        values = checkpoints.read_json(path)
-        if isinstance(values, dict):  # of all the settings only these
-            values = {field.name: values.get(field.name) for field in dataclasses.fields(cls)}
-        try:
-            return checkpoints.from_json(cls, values)
-        except UserError as error:
-            raise UserError(f"{path}: {error}") from None
-
-    def learned(self, count: int, side: int) -> Sequence[Demonstration]:
-        """Some demonstrations that the run has learned from."""
-        level, count = levels.find_level(self.level), min(count, self.demos)
-        if self.demonstrations is not None:
-            return storage.load(self.demonstrations, level, side)[:count]
-        return demonstrations.collect(level, count, self.seed).demonstrations
-
-    def others(self, count: int) -> Sequence[Demonstration]:
-        """As many of the bot, of another training seed."""
-        last, count = seeds.MAX_TRAINING_SEED - 1, min(count, self.demos)
-        seed = last if self.seed != last else last - 1
-        return demonstrations.collect(levels.find_level(self.level), count, seed).demonstrations
+def others(origin: Origin, count: int) -> Sequence[Demonstration]:
+    """As many of the bot, of another training seed."""
+    last, count = seeds.MAX_TRAINING_SEED - 1, min(count, origin.demos)
+    seed = last if origin.seed != last else last - 1
+    return demonstrations.collect(levels.find_level(origin.level), count, seed).demonstrations
 
 
 def describe(planner: Pretrained, origin: Origin, options: Options, title: str) -> Table:
     """Accuracy by position, of both kinds of demonstrations."""
     side = planner.specification.sizes.side
-    kinds = origin.learned(options.demos, side), origin.others(options.demos)
+    kinds = learned(origin, options.demos, side), others(origin, options.demos)
     columns = [accuracy(planner, data, options.samples) for data in kinds]
     table = Table("position in the plan", "learned from", "others", title=title)
     for position in range(planner.specification.sizes.horizon):

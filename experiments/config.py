@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from experiments.runtime import Cluster
-from leapjax import pretrained
+from leapjax import checkpoints, pretrained
 from leapjax.agents.leap import TrainingConfig
 from leapjax.data import seeds
 from leapjax.envs import levels
@@ -22,6 +22,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 
 PRESETS = ("leapjax", "paper")
+CONFIGURATION = "config.json"  # in the folder of a run: all its settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +65,33 @@ class Config:
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
     planner: Annotated[GibbsConfig, tyro.conf.arg(name="")] = GibbsConfig()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """What a trained model was trained on: its level, and where the demonstrations came from."""
+
+    level: str
+    seed: int
+    demos: int
+    demonstrations: str | None
+
+
+def read_origin(run: Path) -> Origin:
+    """What the folder of a run says of its training.
+
+    Raises:
+        UserError: not the folder of a run.
+    """
+    pretrained.read_specification(run)
+    path = run / CONFIGURATION
+    values = checkpoints.read_json(path)
+    if isinstance(values, dict):  # of all the settings only these
+        values = {field.name: values.get(field.name) for field in dataclasses.fields(Origin)}
+    try:
+        return checkpoints.from_json(Origin, values)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
 
 
 # What a result does not depend on, or what its row holds on its own.
@@ -131,21 +159,25 @@ def parse(arguments: Sequence[str]) -> list[Config]:
     for name in ("--level", "--preset", "--checkpoint"):
         first.add_argument(name)
     chosen, _ = first.parse_known_args(list(arguments))
-    trained = None
+    trained = origin = None
     if chosen.checkpoint is not None:
         trained = pretrained.read_specification(Path(chosen.checkpoint))
+        origin = read_origin(Path(chosen.checkpoint))
     level = chosen.level or (trained.level if trained else Config.level)
     name = chosen.preset or (trained.model.architecture if trained else Config.preset)
     configs = []
     for each in list(levels.LEVELS) if level == "all" else [level]:
         default = preset(levels.find_level(each), name)
-        if trained:
+        if trained and origin:
             default = dataclasses.replace(
                 default,
                 model=trained.model,
                 training=trained.training,
                 planner=trained.planner,
                 context=trained.sizes.context,
+                seeds=(origin.seed,),
+                demos=origin.demos,
+                demonstrations=origin.demonstrations,
             )
         config = dataclasses.replace(_parse(arguments, default), level=each)
         check(config)

@@ -20,7 +20,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from experiments import animation, plots
-from experiments.config import Config, resolved
+from experiments.config import CONFIGURATION, Config, read_origin, resolved
 from experiments.interruption import Interruption
 from experiments.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
@@ -97,7 +97,7 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
 
     def describe() -> None:
         pretrained.save_specification(folder, specification)
-        files.write_text(folder / "config.json", json.dumps(resolved(config, run.seed), indent=1))
+        files.write_text(folder / CONFIGURATION, json.dumps(resolved(config, run.seed), indent=1))
 
     processes.first_does(describe)
     begun = time.perf_counter()
@@ -195,7 +195,11 @@ def reuse(run: Run) -> Pretrained:
     config, level, sizes = run.config, run.level, run.sizes
     assert config.checkpoint is not None
     specification = pretrained.read_specification(config.checkpoint)
+    origin = read_origin(config.checkpoint)
     wanted = {
+        "seed": run.seed,
+        "demos": config.demos,
+        "demonstrations": config.demonstrations,
         "level": config.level,
         "side": sizes.side,
         "context": config.context,
@@ -204,6 +208,9 @@ def reuse(run: Run) -> Pretrained:
         "model": config.model,
     }
     found = {
+        "seed": origin.seed,
+        "demos": origin.demos,
+        "demonstrations": origin.demonstrations,
         "level": specification.level,
         "side": specification.sizes.side,
         "context": specification.sizes.context,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import accuracy
+from experiments.config import Origin
 from leapjax.data import demonstrations, storage
 from leapjax.data.windows import Window
 from leapjax.energy import pseudo_likelihood
@@ -84,20 +85,21 @@ def test_counts_are_those_of_every_step():
 
 def test_the_demonstrations_of_both_kinds_are_different_levels():
     for seed in (0, 999):
-        origin = accuracy.Origin("GoToLocalS7N5", seed, 4, None)
-        learned = origin.learned(3, 7)
-        others = origin.others(3)
+        origin = Origin("GoToLocalS7N5", seed, 4, None)
+        learned = accuracy.learned(origin, 3, 7)
+        others = accuracy.others(origin, 3)
         assert (len(learned), len(others)) == (3, 3)
         assert not {d.seed for d in learned} & {d.seed for d in others}
-        assert len(origin.learned(9, 7)) == len(origin.others(9)) == 4  # what there was
+        everything = accuracy.learned(origin, 9, 7), accuracy.others(origin, 9)
+        assert [len(each) for each in everything] == [4, 4]  # what there was
 
 
 def test_a_users_data_set_is_what_was_learned_from():
     level = find_level("GoToLocalS7N5")
     collection = demonstrations.collect(level, 3, 5)
     storage.save("accuracy/mine-v0", collection, "three demonstrations")
-    origin = accuracy.Origin(level.name, 0, 2, "accuracy/mine-v0")
-    learned = origin.learned(9, 7)
+    origin = Origin(level.name, 0, 2, "accuracy/mine-v0")
+    learned = accuracy.learned(origin, 9, 7)
     assert [d.seed for d in learned] == [d.seed for d in collection.demonstrations[:2]]
 
 

@@ -91,6 +91,23 @@ def test_a_checkpoint_needs_no_other_setting(workplace):
     (after,) = results.read(workplace / "alone" / "babyai.jsonl")
     assert after["successes"] == before["successes"]
     assert after["configuration"]["model"] == before["configuration"]["model"]
+    assert after["demos"] == before["demos"] == 6
+
+
+def test_a_row_of_a_checkpoint_has_the_seed_that_it_was_trained_with(workplace, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(run_folder(workplace), copy)
+    settings = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**settings, "seed": 2}))
+    arguments = ["--checkpoint", str(copy), "--no-pictures", "--runs", str(tmp_path / "again")]
+    assert babyai.main([*arguments, "--episodes", "1"]) == 0
+    (row,) = results.read(tmp_path / "again" / "babyai.jsonl")
+    assert row["seed"] == row["configuration"]["seed"] == 2
+    capsys.readouterr()
+    assert babyai.main([*arguments, "--seeds", "0"]) == 2
+    assert "does not fit: seed is 2, not 0" in capsys.readouterr().err
+    assert babyai.main([*arguments, "--demos", "5"]) == 2
+    assert "does not fit: demos is 6, not 5" in capsys.readouterr().err
 
 
 def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
