@@ -53,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_counts(options, "demos", "samples")
         if not options.runs:
             raise UserError("expected at least one folder of a run")
+        for run in options.runs:
+            pretrained.read_specification(run)
         trained_on = {run: read_origin(run) for run in options.runs}
         runtime.start()
         for run, origin in trained_on.items():

@@ -81,9 +81,8 @@ def read_origin(run: Path) -> Origin:
     """What the folder of a run says of its training.
 
     Raises:
-        UserError: not the folder of a run.
+        UserError: there are no settings in it, or damaged ones.
     """
-    pretrained.read_specification(run)
     path = run / CONFIGURATION
     values = checkpoints.read_json(path)
     if isinstance(values, dict):  # of all the settings only these
@@ -159,16 +158,16 @@ def parse(arguments: Sequence[str]) -> list[Config]:
     for name in ("--level", "--preset", "--checkpoint"):
         first.add_argument(name)
     chosen, _ = first.parse_known_args(list(arguments))
-    trained = origin = None
+    trained = None
     if chosen.checkpoint is not None:
         trained = pretrained.read_specification(Path(chosen.checkpoint))
-        origin = read_origin(Path(chosen.checkpoint))
     level = chosen.level or (trained.level if trained else Config.level)
     name = chosen.preset or (trained.model.architecture if trained else Config.preset)
     configs = []
     for each in list(levels.LEVELS) if level == "all" else [level]:
         default = preset(levels.find_level(each), name)
-        if trained and origin:
+        if trained:
+            origin = read_origin(Path(chosen.checkpoint))
             default = dataclasses.replace(
                 default,
                 model=trained.model,
