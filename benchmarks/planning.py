@@ -24,16 +24,15 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
-from experiments import runtime
-from experiments.config import preset
+from experiments.common import runtime
+from experiments.common.config import make_domain, preset, specify
 from leapjax import pretrained
-from leapjax.agents import leap
+from leapjax.babyai import levels
+from leapjax.babyai.adapter import NUM_ACTIONS
+from leapjax.babyai.levels import Level
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys, split_batch
-from leapjax.envs import levels
-from leapjax.envs.adapter import NUM_ACTIONS
-from leapjax.envs.levels import Level
-from leapjax.models import trajectory
-from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.domain import Domain, blank_context
+from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.types import Params
 
@@ -88,14 +87,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> list[Row]:
     """One preset and level at every batch size."""
-    model, horizon = preset(level, name).model, level.horizon
-    planner, params, sizes = make_planner(name, level)
+    model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon
+    planner, params, domain = make_planner(name, level)
     flops = needed_flops(model, horizon, level.iterations)
     rows: list[Row] = []
     compiled: set[int] = set()
     for batch in batches:
         keys = jax.random.split(jax.random.key(1), batch)
-        contexts = random_contexts(sizes, batch, level.words)
+        contexts = random_contexts(domain, level.context, batch)
         begun = time.perf_counter()
         jax.block_until_ready(planner(params, keys, contexts))
         first = time.perf_counter() - begun
@@ -110,7 +109,7 @@ def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> 
                 "level": level.name,
                 "horizon": horizon,
                 "iterations": level.iterations,
-                "side": sizes.side,
+                "side": domain.blank.grid.shape[0],
                 "batch": batch,
                 "chunk": chunk,
                 # 0 where a smaller batch has compiled what this one needs
@@ -136,21 +135,20 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
         row["fraction_of_peak"] = row["gflops"] / row["peak_gflops"]
 
 
-def make_planner(name: str, level: Level) -> tuple[CompiledPlanner, Params, Sizes]:
+def make_planner(name: str, level: Level) -> tuple[CompiledPlanner, Params, Domain]:
     """A preset's planner with the paper's N and random parameters."""
-    settings = preset(level, name)
-    sizes = pretrained.sizes_for(level, level.context, level.horizon)
-    config = GibbsConfig(level.horizon, level.iterations)
-    agent = leap.make_agent(settings.model, settings.training, config, sizes, level.words)
-    assert agent.energy is not None
+    config = preset("babyai", level.name, "leap", name)
+    domain = make_domain(config)
+    agent = pretrained.make_agent(specify(config, 0, domain), domain)
     params = jax.jit(agent.init)(jax.random.key(0)).params
-    return compile_planner(agent.energy, config), params, sizes
+    search = GibbsConfig(level.horizon, level.iterations)
+    return compile_planner(agent.energy, search), params, domain
 
 
 def plan_many(name: str, level: Level, count: int) -> str:
     """Plans for very many contexts at once, and says what it took."""
-    planner, params, sizes = make_planner(name, level)
-    contexts = jax.tree.map(np.asarray, random_contexts(sizes, count, level.words))
+    planner, params, domain = make_planner(name, level)
+    contexts = jax.tree.map(np.asarray, random_contexts(domain, level.context, count))
     keys = plan_keys(0, np.arange(count), np.zeros(count, int))
     begun = time.perf_counter()
     planner(params, keys, contexts)
@@ -187,15 +185,17 @@ def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
     return one_pass(horizon) + (iterations - 1) * one_pass(1)
 
 
-def random_contexts(sizes: Sizes, batch: int, words: int) -> Any:
-    """`[B]` contexts of the right shapes with random grids and poses."""
-    blank = trajectory.blank_context(sizes, words)
+def random_contexts(domain: Domain, length: int, batch: int) -> Any:
+    """`[B]` contexts of the right shapes with random grids and poses, and one instruction."""
+    blank = blank_context(domain, length)
     contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
     key = jax.random.key(2)
-    shape = contexts.observation.grid.shape
-    grid = jax.random.randint(key, shape, 0, 4).astype(jnp.uint8)
+    grid = jax.random.randint(key, contexts.observation.grid.shape, 0, 4).astype(jnp.uint8)
     pose = jax.random.randint(key, (batch, 3), 1, 4)
-    observation = contexts.observation._replace(grid=grid, pose=pose, goal=pose[:, 1:])
+    words = jnp.ones_like(contexts.observation.instruction)
+    observation = contexts.observation._replace(
+        grid=grid, pose=pose, goal=pose[:, 1:], instruction=words
+    )
     return contexts._replace(observation=observation)
 
 

@@ -2,7 +2,7 @@
 
 Success on validation levels (never on test levels) against plans per second, for one
 trained planner and many search settings. Speed is measured at one batch of contexts, the
-first states of those levels, because an early stop depends on them.
+first states of those levels.
 """
 
 import dataclasses
@@ -19,12 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
-from experiments import runtime
+from experiments.common import runtime
 from leapjax import pretrained, rollouts
+from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
-from leapjax.envs import levels
-from leapjax.envs.adapter import BabyAIAdapter
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.scores import wilson_interval
@@ -75,21 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:
     """Search settings to compare, by what to call them; the paper's N is `most`."""
-    greedy = dataclasses.replace(trained, temperature=0.0, final_temperature=None)
+    greedy = dataclasses.replace(trained, temperature=0.0)
     result = {}
     for n in sorted({1, 2, 3, 5, 10, most}):
         if n <= most:
             result[f"random, N = {n}"] = dataclasses.replace(trained, iterations=n)
             result[f"random, N = {n}, temperature 0"] = dataclasses.replace(greedy, iterations=n)
     half = max(2, most // 2)
-    for order in ("sequential", "uncertain"):
-        result[f"{order}, N = {half}"] = dataclasses.replace(trained, iterations=half, order=order)
-    for order in ("random", "uncertain"):
-        result[f"{order}, N = {most}, early stop, temperature 0"] = dataclasses.replace(
-            greedy, order=order, early_stop=True
-        )
-    result[f"random, N = {most}, cooling to 0"] = dataclasses.replace(
-        trained, final_temperature=0.0
+    result[f"sequential, N = {half}"] = dataclasses.replace(
+        trained, iterations=half, order="sequential"
     )
     if trained.horizon > 1:
         result[f"random, N = {half}, P = 2"] = dataclasses.replace(
@@ -103,8 +96,8 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
     """Success and speed of one setting."""
     planner = pretrained.load(options.run, config)
     specification = planner.specification
-    level, context = levels.find_level(specification.level), specification.sizes.context
-    adapter = BabyAIAdapter(level)
+    domain, context = pretrained.make_domain(specification), specification.context
+    adapter = domain.make_adapter()
     firsts = seeds.validation_seeds(0, min(options.batch, options.episodes))
     histories = [
         rollouts.History(adapter.reset(int(seed)), context, adapter.num_actions)
@@ -115,7 +108,7 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
     planner(keys, contexts)
     taken = fastest(partial(planner, keys, contexts), options.seconds)
     episodes = rollouts.evaluate(
-        lambda: BabyAIAdapter(level), seeds.validation_seeds(0, options.episodes), planner.plan,
+        domain.make_adapter, seeds.validation_seeds(0, options.episodes), planner.plan,
         planner.params, context=context,
     )  # fmt: skip
     row: Row = {
@@ -123,7 +116,7 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
         "level": specification.level,
         "horizon": config.horizon,
         "iterations": config.iterations,
-        "paper_iterations": level.iterations,
+        "paper_iterations": levels.find_level(specification.level).iterations,
         "run": options.run.resolve().name,
         "training_steps": specification.training.steps,
         "plans_per_second": options.batch / taken,

@@ -24,11 +24,10 @@ from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
 from benchmarks.training import Stepper
-from experiments import runtime
-from experiments.config import preset
-from experiments.runtime import Cluster
+from experiments.common import runtime
+from experiments.common.config import preset
+from experiments.common.runtime import Cluster
 from leapjax import processes, sharding
-from leapjax.envs import levels
 from leapjax.errors import UserError
 
 # (processes, devices of each, devices that share parameters)
@@ -57,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     options = tyro.cli(Options, args=arguments)
     try:
-        levels.find_level(options.level)
+        preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
         if options.worker:
             runtime.connect(options.cluster)
             row = measure(options)
@@ -108,7 +107,7 @@ def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
 
 def measure(options: Options) -> Row:
     """One setting, on all devices of all processes."""
-    config = preset(levels.find_level(options.level), "leapjax")
+    config = preset("babyai", options.level, "leap", "leapjax")
     batch = options.per_device * jax.device_count()
     chosen = dataclasses.replace(config.training, batch=batch)
     mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding
 
-from experiments import results
+from experiments.common import results
 from leapjax import files, sharding
 
 Row = dict[str, Any]  # one measurement, as JSON values

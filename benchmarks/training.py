@@ -23,15 +23,13 @@ from rich.table import Table
 
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
-from experiments import runtime
-from experiments.config import PRESETS, Config, preset
+from experiments.common import runtime
+from experiments.common.config import Config, make_domain, preset, specify
 from leapjax import pretrained, sharding, training
-from leapjax.agents import leap
-from leapjax.data.windows import Steps
-from leapjax.envs import levels
+from leapjax.data.windows import Steps, concatenate
+from leapjax.domain import Domain
 from leapjax.errors import UserError
-from leapjax.models.trajectory import Sizes
-from leapjax.types import Agent, Params, PyTree
+from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
 EPISODES, LENGTH = 100, 20  # of the made-up demonstrations
@@ -43,7 +41,7 @@ class Options:
 
     levels: tuple[str, ...] = LEVELS
     """Whose settings to measure: horizon, context, grid."""
-    presets: tuple[str, ...] = PRESETS
+    presets: tuple[str, ...] = ("leapjax", "paper")
     """Which presets."""
     json: Path | None = None
     """Write the rows here."""
@@ -57,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runtime.use_every_core()  # and no compilation cache: compile times are real
     try:
         configs = [
-            preset(levels.find_level(level), name)
+            preset("babyai", level, "leap", name)
             for level in options.levels
             for name in options.presets
         ]
@@ -73,13 +71,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 class Stepper:
     """Training steps of a configuration on made-up demonstrations, compiled; a call makes one."""
 
-    def __init__(self, config: Config, mesh: Mesh) -> None:
-        level = levels.find_level(config.level)
-        self.sizes = pretrained.sizes_for(level, config.context, config.planner.horizon)
-        self._config, self._words = config, level.words
+    def __init__(self, config: Config[Any, Any], mesh: Mesh) -> None:
+        self._config, self._domain = config, make_domain(config)
         agent = self._agent(mesh)
+        self.energy = agent.energy
         self.state, self._key = training.make_begin(agent, mesh)(0)
-        self._data = sharding.replicate(random_steps(self.sizes, level.words), mesh)
+        self._data = sharding.replicate(random_steps(self._domain), mesh)
         self._compiled = self._lower(agent).compile()
 
     def __call__(self) -> jax.Array:
@@ -91,25 +88,39 @@ class Stepper:
         """Of one step, counted by XLA for the whole batch on one device."""
         return self._lower(self._agent(None)).cost_analysis()["flops"]
 
+    def encoder_seconds(self, mesh: Mesh, seconds: float) -> float:
+        """Seconds for the encoder of a batch and its gradient, on as many devices."""
+
+        def gradient(_: None, params: PyTree, contexts: PyTree) -> PyTree:
+            def total(params: PyTree) -> jax.Array:
+                memory = jax.vmap(self.energy.encode, in_axes=(None, 0))(params, contexts)
+                return jax.tree.reduce(jnp.add, jax.tree.map(jnp.sum, memory))
+
+            # One row per device, so that the result is split as the batch is.
+            return jax.tree.map(lambda leaf: leaf[None], jax.grad(total)(params))
+
+        run = partial(sharding.split_batches(gradient, mesh), None)
+        config = self._config
+        contexts = random_contexts(self._domain, config.context, config.training.batch)
+        contexts = jax.tree.map(np.asarray, contexts)
+        jax.block_until_ready(run(self.state.params, contexts))
+        return fastest(partial(run, self.state.params, contexts), seconds)
+
     def _agent(self, mesh: Mesh | None) -> Agent:
-        c = self._config
-        return leap.make_agent(c.model, c.training, c.planner, self.sizes, self._words, mesh)
+        return pretrained.make_agent(specify(self._config, 0, self._domain), self._domain, mesh)
 
     def _lower(self, agent: Agent) -> Any:
-        step = training.make_train_step(
-            agent, lambda k, d: leap.make_batch(k, d, self._config.training, self.sizes)
-        )
+        step = training.make_train_step(agent)
         return step.lower(self.state, self._data, self._key)  # type: ignore[attr-defined]
 
 
-def measure(config: Config, seconds: float) -> Row:
+def measure(config: Config[Any, Any], seconds: float) -> Row:
     """One preset on one level."""
     batch = config.training.batch
     mesh = sharding.make_mesh(batch)
     step = Stepper(config, mesh)
-    sizes = step.sizes
     taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
-    encoder = encoder_seconds(config, sizes, step.state.params, batch, seconds)
+    encoder = step.encoder_seconds(mesh, seconds)
     flops = step.flops()
     tokens = batch * config.planner.horizon
     peak = matmul_peak(tokens, config.model.width, seconds)
@@ -117,7 +128,6 @@ def measure(config: Config, seconds: float) -> Row:
         "level": config.level,
         "preset": config.preset,
         "horizon": config.planner.horizon,
-        "side": sizes.side,
         "context": config.context,
         "batch": batch,
         "devices": mesh.size,
@@ -132,42 +142,19 @@ def measure(config: Config, seconds: float) -> Row:
     }
 
 
-def encoder_seconds(
-    config: Config, sizes: Sizes, params: Params, batch: int, seconds: float
-) -> float:
-    """Seconds for the encoder of a batch and its gradient, on as many devices."""
-    energy = leap.make_energy(config.model, sizes)
-    mesh = sharding.make_mesh(batch)
-
-    def gradient(_: None, params: Params, contexts: PyTree) -> PyTree:
-        def total(params: Params) -> jax.Array:
-            memory = jax.vmap(energy.encode, in_axes=(None, 0))(params, contexts)
-            return jax.tree.reduce(jnp.add, jax.tree.map(jnp.sum, memory))
-
-        # One row per device, so that the result is split as the batch is.
-        return jax.tree.map(lambda leaf: leaf[None], jax.grad(total)(params))
-
-    run = partial(sharding.split_batches(gradient, mesh), None)
-    words = levels.find_level(config.level).words
-    contexts = jax.tree.map(np.asarray, random_contexts(sizes, batch, words))
-    jax.block_until_ready(run(params, contexts))
-    return fastest(partial(run, params, contexts), seconds)
-
-
-def random_steps(sizes: Sizes, words: int) -> Steps:
+def random_steps(domain: Domain) -> Steps:
     """Demonstrations of the right shapes, of nothing in particular."""
-    count = EPISODES * LENGTH
-    contexts = random_contexts(dataclasses.replace(sizes, context=0), count, words)
-    step = np.tile(np.arange(LENGTH, dtype=np.int32), EPISODES)
-    return Steps(
-        jax.tree.map(np.asarray, contexts.observation),
-        np.random.default_rng(0).integers(0, 3, count).astype(np.int32),
-        step,
-        LENGTH - step,
-        np.arange(EPISODES, dtype=np.int32) * LENGTH,
-        np.full(EPISODES, LENGTH, np.int32),
-        np.zeros((count, sizes.side, sizes.side), bool),
-    )
+    contexts = random_contexts(domain, 0, LENGTH + 1)
+    states = jax.tree.map(np.asarray, contexts.observation)
+    choose = np.random.default_rng(0)
+    played = [
+        Demonstration(
+            states, choose.integers(0, 3, LENGTH).astype(np.int32),
+            np.zeros(LENGTH, np.float32), True, False, episode,
+        )
+        for episode in range(EPISODES)
+    ]  # fmt: skip
+    return concatenate(played, domain.extras)
 
 
 def table(rows: Sequence[Row]) -> Table:

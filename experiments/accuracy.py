@@ -2,8 +2,8 @@
 
 How often the action that the model finds most likely is the demonstrator's, at each position of
 the plan, given all actions before it: on demonstrations that it has learned from, and on others
-of MiniGrid's bot. A gap between the two says that the network recognises demonstrations where it
-should understand the level; a fall along the plan says that its end is not to be trusted.
+of the same demonstrator. A gap between the two says that the network recognises demonstrations
+where it should understand the level; a fall along the plan says that its end is not to be trusted.
 """
 
 import dataclasses
@@ -19,16 +19,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments import runtime
-from experiments.config import Origin, check_counts, read_origin
+from experiments.common import program, runtime
+from experiments.common.config import check_counts
 from leapjax import pretrained
-from leapjax.data import demonstrations, seeds, storage, windows
-from leapjax.data.demonstrations import Demonstration
+from leapjax.data import seeds, storage, windows
 from leapjax.data.windows import Steps, Window
-from leapjax.envs import levels
+from leapjax.domain import Domain
 from leapjax.errors import UserError
-from leapjax.pretrained import Pretrained
-from leapjax.types import Energy, Params, mask_token
+from leapjax.pretrained import Origin, Pretrained
+from leapjax.types import Demonstration, Energy, Params, mask_token
 
 TOGETHER = 64  # windows scored in one go
 
@@ -47,47 +46,51 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
-    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
-    console = Console()
-    try:
-        check_counts(options, "demos", "samples")
-        if not options.runs:
-            raise UserError("expected at least one folder of a run")
-        for run in options.runs:
-            pretrained.read_specification(run)
-        trained_on = {run: read_origin(run) for run in options.runs}
-        runtime.start()
-        for run, origin in trained_on.items():
-            planner = pretrained.load(run)
-            console.print(describe(planner, origin, options, run.name))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("experiments.accuracy", given, lambda: report(options))
 
 
-def learned(origin: Origin, count: int, side: int) -> Sequence[Demonstration]:
+def report(options: Options) -> None:
+    """Prints one table per run."""
+    check_counts(options, "demos", "samples")
+    if not options.runs:
+        raise UserError("expected at least one folder of a run")
+    for run in options.runs:
+        specification = pretrained.read_specification(run)
+        if specification.method != "leap":
+            raise UserError(f"{run} is of method {specification.method}: only leap masks actions")
+    runtime.start()
+    for run in options.runs:
+        Console().print(describe(pretrained.load(run), options, run.name))
+
+
+def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
     """Some demonstrations that a run has learned from."""
-    level, count = levels.find_level(origin.level), min(count, origin.demos)
+    count = min(count, origin.demos)
     if origin.demonstrations is not None:
-        return storage.load(origin.demonstrations, level, side)[:count]
-    return demonstrations.collect(level, count, origin.seed).demonstrations
+        return storage.load(origin.demonstrations, domain)[:count]
+    return _collect(domain, count, origin.seed)
 
 
-def others(origin: Origin, count: int) -> Sequence[Demonstration]:
-    """As many of the bot, of another training seed."""
-    last, count = seeds.MAX_TRAINING_SEED - 1, min(count, origin.demos)
-    seed = last if origin.seed != last else last - 1
-    return demonstrations.collect(levels.find_level(origin.level), count, seed).demonstrations
+def others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
+    """As many of the domain's demonstrator, of another training seed."""
+    last = seeds.MAX_TRAINING_SEED - 1
+    return _collect(domain, min(count, origin.demos), last - (origin.seed == last))
 
 
-def describe(planner: Pretrained, origin: Origin, options: Options, title: str) -> Table:
+def _collect(domain: Domain, count: int, seed: int) -> Sequence[Demonstration]:
+    return domain.collect(count, seed, lambda done: None).demonstrations
+
+
+def describe(planner: Pretrained, options: Options, title: str) -> Table:
     """Accuracy by position, of both kinds of demonstrations."""
-    side = planner.specification.sizes.side
-    kinds = learned(origin, options.demos, side), others(origin, options.demos)
+    specification = planner.specification
+    domain, origin = pretrained.make_domain(specification), specification.origin
+    kinds = learned(domain, origin, options.demos), others(domain, origin, options.demos)
     columns = [accuracy(planner, data, options.samples) for data in kinds]
     table = Table("position in the plan", "learned from", "others", title=title)
-    for position in range(planner.specification.sizes.horizon):
+    for position in range(specification.planner.horizon):
         shares = (_share(right[position], asked[position]) for right, asked in columns)
         table.add_row(str(position + 1), *shares)
     table.add_section()
@@ -109,7 +112,7 @@ def accuracy(
         data: demonstrations.
         samples: how many of their steps to predict from, evenly spaced.
     """
-    sizes = planner.specification.sizes
+    specification, end = planner.specification, planner.energy.num_actions - 1
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
     count = steps.actions.shape[0]
     starts = jnp.asarray(np.linspace(0, count - 1, min(samples, count)).astype(np.int32))
@@ -117,8 +120,8 @@ def accuracy(
     @jax.jit
     def score(params: Params, steps: Steps) -> tuple[jax.Array, jax.Array]:
         def one(start: jax.Array) -> tuple[jax.Array, jax.Array]:
-            end = sizes.num_actions - 1
-            window = windows.window(steps, start, sizes.context, sizes.horizon, end)
+            horizon = specification.planner.horizon
+            window = windows.window(steps, start, specification.context, horizon, end)
             return hits(planner.energy, params, window)
 
         right, asked = jax.lax.map(one, starts, batch_size=TOGETHER)

@@ -8,11 +8,13 @@ import numpy as np
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from PIL import Image, ImageDraw
 
+from experiments.common.run import Run
 from leapjax import rollouts
+from leapjax.babyai import levels
+from leapjax.babyai.adapter import ACTIONS, END, BabyAIAdapter
+from leapjax.babyai.levels import Level
+from leapjax.babyai.observations import Cell, agent_cell
 from leapjax.batching import plan_keys
-from leapjax.envs.adapter import ACTIONS, END, BabyAIAdapter
-from leapjax.envs.levels import Level
-from leapjax.envs.observations import Cell, agent_cell
 from leapjax.pretrained import Pretrained
 
 SIDE = 336  # pixels of a level, about
@@ -22,12 +24,13 @@ MAX_PLANS = 8  # an episode that needs more is cut off
 GLYPHS = dict(zip(range(len(ACTIONS)), ["L", "R", "F", "pick", "drop", "open", "end"], strict=True))
 
 
-def animate(planner: Pretrained, level: Level, seeds: Sequence[int], seed: int, path: Path) -> None:
+def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws one episode per level seed, one after the other, with MiniGrid's renderer."""
+    level = levels.find_level(run.config.level)
     frames: list[Image.Image] = []
     durations: list[int] = []
     for level_seed in seeds:
-        for frame, duration in episode_frames(planner, level, level_seed, seed):
+        for frame, duration in episode_frames(planner, level, level_seed, run.seed):
             frames.append(frame)
             durations.append(duration)
     frames[0].save(
@@ -40,7 +43,7 @@ def episode_frames(
 ) -> list[tuple[Image.Image, int]]:
     """The frames of one episode with their durations in milliseconds."""
     adapter = BabyAIAdapter(level)
-    context = planner.specification.sizes.context
+    context = planner.specification.context
     history = rollouts.History(adapter.reset(level_seed), context, adapter.num_actions)
     mission = adapter.env.mission
     frames = []
@@ -58,7 +61,7 @@ def episode_frames(
             if action == END:
                 break
             transition = adapter.step(int(action))
-            history.advance(int(action), transition.observation)
+            history.advance(int(action), transition.observation, transition.reward)
             over = transition.terminated or transition.truncated
             outcome = ("success" if transition.success else "failed") if over else "executing"
             text = f"step {history.step}: {ACTIONS[action]}; {outcome}"

@@ -20,17 +20,17 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from experiments import animation, runtime
-from experiments.config import check_executed
+from experiments import animation
+from experiments.common import program, runtime
+from experiments.common.config import check_executed
 from leapjax import pretrained, rollouts
-from leapjax.batching import NotANumber
+from leapjax.babyai import levels, observations
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.levels import Level
+from leapjax.babyai.observations import Cell, Observation
 from leapjax.data import seeds
-from leapjax.envs import levels, observations
-from leapjax.envs.adapter import BabyAIAdapter, Transition
-from leapjax.envs.levels import Level
-from leapjax.envs.observations import Cell
+from leapjax.environments import Transition
 from leapjax.errors import UserError, first_line
-from leapjax.types import Observation
 
 FEW_CELLS = 6  # that an agent which goes in circles stays within
 COLUMNS = 4  # of the gallery
@@ -92,35 +92,33 @@ class Recorder(BabyAIAdapter):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plays, counts, draws; the exit code."""
-    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("experiments.failures", given, lambda: report(options))
+
+
+def report(options: Options) -> None:
+    """Plays validation levels, prints the tables, draws the gallery."""
     console = Console()
-    try:
-        played = seeds.validation_seeds(0, options.episodes)
-        level = only_level(options.runs, options.executed)
-        runtime.start()
-        recorders: list[Recorder] = []
-        successes: list[bool] = []
-        for run in track(options.runs, "playing", console=console):
-            found, good = play(run, level, played, options.executed)
-            recorders += found
-            successes += good
-        failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
-        console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
-        console.print(by_cause(failed))
-        if any(len(recorder.tasks) > 1 for recorder in recorders):
-            console.print(by_tasks(recorders, failed))
-        console.print(by_detour(recorders, failed))
-        if failed and options.drawn > 0:
-            path = options.gallery or options.runs[0] / "failures.png"
-            draw(failed[: options.drawn], path)
-            console.print(f"gallery: {path}", highlight=False)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except NotANumber as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    played = seeds.validation_seeds(0, options.episodes)
+    level = only_level(options.runs, options.executed)
+    runtime.start()
+    recorders: list[Recorder] = []
+    successes: list[bool] = []
+    for run in track(options.runs, "playing", console=console):
+        found, good = play(run, level, played, options.executed)
+        recorders += found
+        successes += good
+    failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
+    console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
+    console.print(by_cause(failed))
+    if any(len(recorder.tasks) > 1 for recorder in recorders):
+        console.print(by_tasks(recorders, failed))
+    console.print(by_detour(recorders, failed))
+    if failed and options.drawn > 0:
+        path = options.gallery or options.runs[0] / "failures.png"
+        draw(failed[: options.drawn], path)
+        console.print(f"gallery: {path}", highlight=False)
 
 
 def only_level(runs: Sequence[Path], executed: int | None) -> Level:
@@ -149,7 +147,7 @@ def play(
     waiting = iter(recorders)
     episodes = rollouts.evaluate(
         lambda: next(waiting), played, planner.plan, planner.params,
-        context=planner.specification.sizes.context, executed=executed,
+        context=planner.specification.context, executed=executed,
     )  # fmt: skip
     return recorders, episodes.successes.tolist()
 

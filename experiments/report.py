@@ -6,10 +6,10 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import plots, results
-from experiments.results import Row
+from experiments.common import plots, results
+from experiments.common.results import Row
 from leapjax import scores
-from leapjax.envs.levels import LEVELS
+from leapjax.babyai.levels import LEVELS
 from leapjax.files import write_text
 
 PAPER_DEMOS = 500
@@ -21,26 +21,28 @@ class Setting:
 
     title: str
     preset: str
-    masking: str
+    method: str = "leap"
+    masking: str | None = None  # None: a method that has no such option
     executed: int | None = None  # actions executed before replanning; None: the whole plan
+    demos: int = PAPER_DEMOS
 
     def has(self, row: Row) -> bool:
         """Whether a row is a result of this setting: all of it played on test levels."""
         return (
             not row["validation"]
-            and row["preset"] == self.preset
-            and row["configuration"]["training"]["masking"] == self.masking
+            and (row["method"], row["preset"]) == (self.method, self.preset)
+            and row["configuration"]["method_settings"].get("masking") == self.masking
             and row["executed"] == (self.executed or row["horizon"])
         )
 
 
-OURS = Setting("preset `leapjax`", "leapjax", "random")
+OURS = Setting("preset `leapjax`", "leapjax", masking="random")
 SETTINGS = (
-    Setting("preset `paper`", "paper", "one"),
-    Setting("`paper`, `--masking each`", "paper", "each"),
+    Setting("preset `paper`", "paper", masking="one"),
+    Setting("`paper`, `--masking each`", "paper", masking="each"),
     OURS,
     # Chosen on validation levels: docs/experiments.md.
-    Setting("`leapjax`, `--executed 3`", "leapjax", "random", executed=3),
+    Setting("`leapjax`, `--executed 3`", "leapjax", masking="random", executed=3),
 )
 TITLES = " | ".join(setting.title for setting in SETTINGS)
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experiments.md")
@@ -109,8 +111,11 @@ def steps(rows: Sequence[Row]) -> str:
 
 def _by_setting(rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> list[list[str]]:
     """For each level what `cell` makes of its rows, setting by setting."""
-    columns = [_by_level_and_demos(rows, setting) for setting in SETTINGS]
-    return [[cell(column.get((level, PAPER_DEMOS), [])) for column in columns] for level in LEVELS]
+    columns = [(setting, _by_level_and_demos(rows, setting)) for setting in SETTINGS]
+    return [
+        [cell(column.get((level, setting.demos), [])) for setting, column in columns]
+        for level in LEVELS
+    ]
 
 
 def _by_level_and_demos(rows: Sequence[Row], setting: Setting) -> dict[tuple[str, int], list[Row]]:

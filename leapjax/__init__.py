@@ -5,7 +5,16 @@ energy; `compile_planner` makes it plan for any number of contexts at once.
 """
 
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
-from leapjax.energy import classifier, compose, constrain, from_total, pseudo_likelihood, view
+from leapjax.domain import Domain
+from leapjax.energy import (
+    classifier,
+    compose,
+    constrain,
+    from_total,
+    pseudo_likelihood,
+    single_action,
+    view,
+)
 from leapjax.errors import UserError
 from leapjax.planners import (
     CrossEntropyConfig,
@@ -18,17 +27,18 @@ from leapjax.planners import (
 from leapjax.pretrained import Pretrained, load
 from leapjax.rollouts import Episodes, evaluate
 from leapjax.scores import wilson_interval
-from leapjax.types import Agent, Context, Energy, Observation, Plan, TrainState
+from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
 
 __all__ = [
     "Agent",
     "CompiledPlanner",
     "Context",
     "CrossEntropyConfig",
+    "Demonstration",
+    "Domain",
     "Energy",
     "Episodes",
     "GibbsConfig",
-    "Observation",
     "Plan",
     "Pretrained",
     "ShootingConfig",
@@ -46,6 +56,7 @@ __all__ = [
     "plan_keys",
     "pseudo_likelihood",
     "random_shooting",
+    "single_action",
     "view",
     "wilson_interval",
 ]

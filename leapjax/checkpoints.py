@@ -260,20 +260,30 @@ def _check_shapes(found: dict[str, tuple[int, ...]], like: PyTree, checkpoint: P
             )
 
 
-def from_json(kind: type[T], values: Any) -> T:
+def from_json(kind: type[T], values: Any, **types_of: type) -> T:
     """A frozen configuration dataclass from what `dataclasses.asdict` and JSON made of it.
 
+    A field that is missing has its default: a setting that was added later changes nothing
+    that was written before it.
+
+    Args:
+        kind: of dataclass.
+        values: a JSON object.
+        types_of: the type of a field, where the dataclass leaves it open.
+
     Raises:
-        UserError: a field that is missing, unknown or of another type.
+        UserError: a field that is unknown, of another type, or missing without a default.
     """
     if not isinstance(values, dict):
         raise UserError(f"a {kind.__name__} must be a JSON object, got {type(values).__name__}")
-    hints = typing.get_type_hints(kind)
-    names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if names != values.keys():
-        odd = sorted(names ^ values.keys())
+    hints = typing.get_type_hints(kind) | types_of
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    nothing = dataclasses.MISSING
+    needed = {n for n, f in fields.items() if f.default is f.default_factory is nothing}
+    odd = sorted((values.keys() - fields.keys()) | (needed - values.keys()))
+    if odd:
         raise UserError(f"{kind.__name__}: missing or unknown {', '.join(odd)}")
-    converted = {name: _convert(hints[name], values[name], name) for name in names}
+    converted = {name: _convert(hints[name], value, name) for name, value in values.items()}
     try:
         return kind(**converted)
     except ValueError as error:
@@ -281,6 +291,8 @@ def from_json(kind: type[T], values: Any) -> T:
 
 
 def _convert(hint: Any, value: Any, name: str) -> Any:
+    if hint is Any:
+        return value
     if dataclasses.is_dataclass(hint):
         return from_json(hint, value)  # type: ignore[arg-type]
     if typing.get_origin(hint) in (typing.Union, types.UnionType):

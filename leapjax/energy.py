@@ -85,6 +85,48 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     return Energy(encode, conditional, guarded_total, _checked(num_actions), accepts_mask=False)
 
 
+def single_action(
+    encode: EncodeFn, scores: Callable[[Params, PyTree], jax.Array], num_actions: int
+) -> Energy:
+    """The energy of a method that chooses one action at a time, over plans of one action.
+
+    The lowest energy is the best action, and a sample at temperature 1 is a sample of the
+    policy whose logits the scores are. The end action, the last one, is never chosen.
+
+    Args:
+        encode: (params, context) -> memory.
+        scores: (params, memory) -> `[A - 1]` logits or Q-values; -inf forbids an action.
+        num_actions: A, the end action included.
+    """
+
+    def energies(params: Params, memory: PyTree) -> jax.Array:
+        found = scores(params, memory)
+        chex.assert_shape(found, (num_actions - 1,))
+        return jnp.append(-found, jnp.inf)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        _check_query(actions, positions, num_actions)
+        _check_single(actions)
+        return _check_energies(energies(params, memory)[None], positions)
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        _check_single(actions)
+        energy = energies(params, memory)[jnp.minimum(actions[0], num_actions - 1)]
+        return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
+
+    return Energy(encode, conditional, total, _checked(num_actions))
+
+
+def _check_single(actions: jax.Array) -> None:
+    if actions.shape != (1,):
+        raise ValueError(
+            f"a plan of shape {actions.shape}: this method chooses one action at a time, so its "
+            "horizon is 1"
+        )
+
+
 def classifier(encode: EncodeFn, degree: TotalFn, num_actions: int) -> Energy:
     """The energy of a sequence classifier (paper, appendix, ablation).
 

@@ -6,17 +6,15 @@ They know only `Energy`. `leapjax.batching` makes one of them plan for any numbe
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from leapjax import schedules
 from leapjax.errors import check_at_least
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
-ORDERS = ("random", "sequential", "uncertain")
+ORDERS = ("random", "sequential")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +24,8 @@ class GibbsConfig:
     horizon: int = 5  # T, planned actions
     iterations: int = 10  # N, passes of the model; the first fills every position
     resampled: int = 1  # P, positions resampled together in every later iteration
-    order: str = "random"  # which positions: "random", "sequential" or "uncertain"
-    temperature: float = 0.0  # of the first iteration; 0 takes the most likely action
-    final_temperature: float | None = None  # of the last, linear between; None: the same
-    early_stop: bool = False  # stop once nothing can change; at temperature 0, P = 1 only
+    order: str = "random"  # which positions: "random", or "sequential" from left to right
+    temperature: float = 0.0  # 0 takes the most likely action
     restarts: int = 1  # R independent plans, of which the one of least energy is kept
     score: bool = False  # also return the energy of the plan (T more passes)
     score_trace: bool = False  # also return the energy after every iteration (N * T passes)
@@ -40,19 +36,10 @@ class GibbsConfig:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
-        schedules.check_temperatures(self.temperature, self.last_temperature)
-        if self.early_stop and (self.resampled > 1 or self.temperature or self.last_temperature):
-            raise ValueError(
-                "early_stop needs temperature 0 and resampled 1: otherwise something could "
-                "still change when every position was looked at"
-            )
+        if not 0 <= self.temperature < float("inf"):
+            raise ValueError(f"a temperature must be finite and at least 0, got {self.temperature}")
         if self.order not in ORDERS:
             raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
-
-    @property
-    def last_temperature(self) -> float:
-        """The temperature of the last iteration."""
-        return self.temperature if self.final_temperature is None else self.final_temperature
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,14 +83,6 @@ def gibbs(
     that does not accept MASK); iterations 2 to N mask P positions, read the energy of
     every action there, and draw actions with probability proportional to
     `exp(-energy / temperature)`.
-
-    Which positions, by `config.order`: "random"; "sequential", from left to right and around;
-    "uncertain", those whose action was least likely when last looked at, among the ones not
-    looked at since something changed (all, when none of these is left). That order depends on
-    the plan: it is a way to search, not an exact sampler. With `early_stop` the chain ends
-    when every position was looked at since the last change: at temperature 0 and P = 1
-    nothing could change any more, so the plan is the same and the rest of its trace repeats
-    it. A batch stops with its slowest plan.
     """
     memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
@@ -126,104 +105,49 @@ def gibbs(
     return plan
 
 
-class _Chain(NamedTuple):
-    """What a Gibbs chain carries from iteration to iteration."""
-
-    actions: jax.Array  # [T] int32
-    doubt: jax.Array  # [T] -log p of each action when it was last looked at
-    settled: jax.Array  # [T] bool: looked at since something changed
-    valid: jax.Array  # [] bool: no energy was NaN
-
-
 def _gibbs_chain(
     energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One chain: final actions `[T]`, the actions after every iteration `[N, T]`, `valid`."""
-    horizon, iterations = config.horizon, config.iterations
+    horizon, later = config.horizon, config.iterations - 1
     order_key, noise_key, start_key = jax.random.split(key, 3)
-    last = config.last_temperature
-    temperatures = schedules.linear_temperatures(config.temperature, last, iterations)
-    noisy = max(config.temperature, last) > 0
 
     # All randomness is drawn at once, before the loop: inside it costs more than the draws.
     def noise(k: jax.Array, *shape: int) -> jax.Array:
-        if noisy:
+        if config.temperature:
             return jax.random.gumbel(k, (*shape, energy.num_actions))
         return jnp.zeros((*shape, 1))
 
-    def draw(
-        tokens: jax.Array, where: jax.Array, gumbel: jax.Array, temperature: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Actions `[P]` at positions, -log p of them `[P]`, and whether no energy was NaN."""
+    def draw(tokens: jax.Array, where: jax.Array, gumbel: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Tokens `[T]` with new actions at positions `[P]`; whether no energy was NaN."""
         energies = energy.conditional(params, memory, tokens, where)
         chex.assert_shape(energies, (where.shape[0], energy.num_actions))
         # Gumbel-max. Noise times temperature, not energy over temperature: exact at 0, and
         # +inf stays +inf.
-        drawn = jnp.argmin(energies - temperature * gumbel, axis=-1).astype(jnp.int32)
+        drawn = jnp.argmin(energies - config.temperature * gumbel, axis=-1).astype(jnp.int32)
         # Where every action is forbidden another position has to change: leave this one
         # (and 0 for MASK, which is the number of actions).
         hopeless = jnp.all(jnp.isinf(energies), axis=-1)
         drawn = jnp.where(hopeless, tokens[where] % energy.num_actions, drawn)
-        chosen = jnp.take_along_axis(energies, drawn[:, None], axis=1)[:, 0]
-        doubt = jnp.where(hopeless, 0.0, chosen + jax.nn.logsumexp(-energies, axis=-1))
-        return drawn, doubt, ~jnp.any(jnp.isnan(energies))
+        return tokens.at[where].set(drawn), ~jnp.any(jnp.isnan(energies))
 
     if energy.accepts_mask:
-        everywhere = jnp.arange(horizon)
         blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
-        first = draw(blank, everywhere, noise(start_key, horizon), temperatures[0])
+        first, first_valid = draw(blank, jnp.arange(horizon), noise(start_key, horizon))
     else:
-        uniform = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
-        first = uniform, jnp.full(horizon, jnp.inf), jnp.bool_(True)
-    start = _Chain(first[0], first[1], jnp.zeros(horizon, bool), first[2])
+        first = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
+        first_valid = jnp.bool_(True)
 
     def iterate(
-        chain: _Chain, inputs: tuple[jax.Array, jax.Array, jax.Array]
-    ) -> tuple[_Chain, jax.Array]:
-        where, gumbel, temperature = inputs
-        settled = chain.settled & ~jnp.all(chain.settled)  # all looked at: begin again
-        if config.order == "uncertain":
-            doubt = jnp.where(settled, -1.0, chain.doubt)
-            where = jax.lax.top_k(doubt, config.resampled)[1]
-        drawn, doubt, valid = draw(chain.actions, where, gumbel, temperature)
-        changed = jnp.any(drawn != chain.actions[where])
-        settled = jnp.where(changed, False, settled).at[where].set(True)
-        actions = chain.actions.at[where].set(drawn)
-        doubts = chain.doubt.at[where].set(doubt)
-        return _Chain(actions, doubts, settled, chain.valid & valid), actions
+        actions: jax.Array, inputs: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        actions, valid = draw(actions, *inputs)
+        return actions, (actions, valid)
 
-    inputs = (
-        _scan_order(order_key, config),  # [N - 1, P]
-        noise(noise_key, iterations - 1, config.resampled),
-        temperatures[1:],
-    )
-    if config.early_stop and iterations > 1:
-        chain, later = _scan_until_settled(iterate, start, inputs)
-    else:
-        chain, later = jax.lax.scan(iterate, start, inputs)
-    return chain.actions, jnp.concatenate([start.actions[None], later]), chain.valid
-
-
-def _scan_until_settled(
-    iterate: Callable[..., tuple[_Chain, jax.Array]], start: _Chain, inputs: PyTree
-) -> tuple[_Chain, jax.Array]:
-    """`lax.scan` that ends early; what it did not come to in the trace is the final plan."""
-    length = inputs[0].shape[0]
-
-    def going(state: tuple[jax.Array, _Chain, jax.Array]) -> jax.Array:
-        index, chain, _ = state
-        return (index < length) & ~jnp.all(chain.settled)
-
-    def step(
-        state: tuple[jax.Array, _Chain, jax.Array],
-    ) -> tuple[jax.Array, _Chain, jax.Array]:
-        index, chain, trace = state
-        chain, actions = iterate(chain, jax.tree.map(lambda x: x[index], inputs))
-        return index + 1, chain, trace.at[index].set(actions)
-
-    trace = jnp.zeros((length, *start.actions.shape), start.actions.dtype)
-    done, chain, trace = jax.lax.while_loop(going, step, (jnp.int32(0), start, trace))
-    return chain, jnp.where(jnp.arange(length)[:, None] < done, trace, chain.actions)
+    positions = _scan_order(order_key, config)  # [N - 1, P]
+    gumbel = noise(noise_key, later, config.resampled)  # [N - 1, P, A]
+    last, (trace, valid) = jax.lax.scan(iterate, first, (positions, gumbel))
+    return last, jnp.concatenate([first[None], trace]), first_valid & valid.all()
 
 
 def _scan_order(key: jax.Array, config: GibbsConfig) -> jax.Array:

@@ -4,21 +4,21 @@ import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 from jax.sharding import Mesh
 
-from leapjax import checkpoints, planners
-from leapjax.agents import leap
-from leapjax.agents.leap import TrainingConfig
+from leapjax import checkpoints
+from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.batching import CompiledPlanner, compile_planner
-from leapjax.envs import levels, vocabulary
-from leapjax.envs.adapter import NUM_ACTIONS
-from leapjax.envs.levels import Level
+from leapjax.domain import Domain
+from leapjax.domains import find_domain
 from leapjax.errors import UserError
 from leapjax.files import write_text
-from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.planners import GibbsConfig
+from leapjax.methods import find_method
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import GibbsConfig, PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
@@ -26,16 +26,30 @@ CHECKPOINTS = "checkpoints"
 
 
 @dataclasses.dataclass(frozen=True)
+class Origin:
+    """What a planner was trained on, and by which preset: nothing that rebuilding it needs."""
+
+    preset: str
+    seed: int
+    demos: int
+    demonstrations: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
 class Specification:
     """All that is needed to rebuild a planner around its parameters."""
 
+    domain: str
     level: str
+    method: str
+    context: int  # K
     model: ModelConfig
-    sizes: Sizes
     training: TrainingConfig
-    planner: GibbsConfig
-    words: int  # L
-    vocabulary: tuple[str, ...]  # words by id, so that a later version cannot misread them
+    planner: GibbsConfig  # its horizon is the network's too
+    method_settings: Any
+    domain_settings: Any
+    signature: dict  # of the domain, when it was trained
+    origin: Origin
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,22 +66,23 @@ class Pretrained:
         return self.plan(self.params, keys, contexts)
 
 
-def sizes_for(level: Level, context: int, horizon: int) -> Sizes:
-    """What a model must know of a level; makes the level once to look at it."""
-    env = levels.make_environment(level)
-    side = max(env.width, env.height)
-    # The limit grows with the navigations that an instruction needs; 4 clauses of 2 at most.
-    navigations = 1 if level.words <= vocabulary.LONGEST_CLAUSE else 8
-    longest = navigations * env.room_size**2 * env.num_rows * env.num_cols
-    return Sizes(side, vocabulary.SIZE, NUM_ACTIONS, context, horizon, longest)
+def make_domain(specification: Specification) -> Domain:
+    """The level that a planner was trained for."""
+    kind = find_domain(specification.domain)
+    return kind.make(specification.level, specification.domain_settings)
 
 
-def make_agent(specification: Specification, mesh: Mesh | None = None) -> Agent:
-    """The agent of a specification; for `mesh` see `leapjax.agents.leap.make_agent`."""
-    return leap.make_agent(
-        specification.model, specification.training, specification.planner,
-        specification.sizes, specification.words, mesh,
+def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None = None) -> Agent:
+    """The agent of a specification; `mesh`: of devices to train on, None for one device.
+
+    Raises:
+        UserError: the method cannot be had with these settings.
+    """
+    setup = Setup(
+        domain, specification.context, specification.planner.horizon, specification.model,
+        specification.training, specification.method_settings,
     )  # fmt: skip
+    return find_method(specification.method).make_agent(setup, mesh)
 
 
 def save_specification(folder: Path, specification: Specification) -> None:
@@ -79,7 +94,7 @@ def read_specification(folder: Path) -> Specification:
     """The specification that a run left in its folder.
 
     Raises:
-        UserError: missing, damaged, or made with another vocabulary.
+        UserError: missing, damaged, or of an unknown method or domain.
     """
     path = folder / SPECIFICATION
     if not path.is_file():
@@ -88,29 +103,38 @@ def read_specification(folder: Path) -> Specification:
         )
     values = checkpoints.read_json(path)
     try:
-        specification = checkpoints.from_json(Specification, values)
+        if not isinstance(values, dict):
+            raise UserError(f"a Specification must be a JSON object, got {type(values).__name__}")
+        return checkpoints.from_json(
+            Specification, values,
+            method_settings=find_method(str(values.get("method"))).settings,
+            domain_settings=find_domain(str(values.get("domain"))).settings,
+        )  # fmt: skip
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
-    if specification.vocabulary != vocabulary.WORDS:
-        raise UserError(f"{path}: trained with another vocabulary; train it again")
-    return specification
 
 
-def load(path: str | os.PathLike[str], planner: planners.PlannerConfig | None = None) -> Pretrained:
+def load(path: str | os.PathLike[str], planner: PlannerConfig | None = None) -> Pretrained:
     """A trained planner from the folder of its run.
 
     Args:
         path: the folder that a run printed.
-        planner: search settings; None for those it was trained with.
+        planner: search settings, of the same horizon; None for those it was trained with.
 
     Raises:
-        UserError: no such run, or one that cannot be read.
+        UserError: no such run, one that cannot be read, or another horizon.
     """
     folder = Path(path)
     specification = read_specification(folder)
-    agent = make_agent(specification)
+    horizon = specification.planner.horizon
+    if planner is not None and planner.horizon != horizon:
+        raise UserError(f"{folder} plans {horizon} actions, not {planner.horizon}: its horizon")
+    domain = make_domain(specification)
+    for name, value in domain.signature.items():
+        if specification.signature.get(name) != value:
+            raise UserError(f"{folder}: trained with another {name}; train it again")
+    agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = checkpoints.restore_params(folder / CHECKPOINTS, like)
-    assert agent.energy is not None
     plan = compile_planner(agent.energy, planner or specification.planner)
     return Pretrained(specification, agent.energy, params, plan)

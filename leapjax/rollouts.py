@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
-from leapjax.envs.adapter import Adapter
+from leapjax.environments import Adapter
 from leapjax.types import Context, Params, PyTree, pad_token
 
 
@@ -18,6 +18,7 @@ class Episodes(NamedTuple):
     seeds: np.ndarray  # [E] level seeds
     successes: np.ndarray  # [E] bool
     lengths: np.ndarray  # [E] int: environment steps
+    returns: np.ndarray  # [E] float: sums of rewards
     plans: int  # plans made in all
     planning_seconds: float  # of the planner alone, compilation included
     seconds: float  # in all
@@ -29,6 +30,7 @@ def join(parts: Sequence[Episodes]) -> Episodes:
         np.concatenate([part.seeds for part in parts]),
         np.concatenate([part.successes for part in parts]),
         np.concatenate([part.lengths for part in parts]),
+        np.concatenate([part.returns for part in parts]),
         sum(part.plans for part in parts),
         max(part.planning_seconds for part in parts),
         max(part.seconds for part in parts),
@@ -36,36 +38,44 @@ def join(parts: Sequence[Episodes]) -> Episodes:
 
 
 class History:
-    """The last K states and actions of one episode, as a planner's context."""
+    """The last K states, actions and rewards of one episode, as a planner's context."""
 
     def __init__(self, observation: PyTree, length: int, num_actions: int) -> None:
         self.current = _copy(observation)
         self.step = 0
+        self.return_so_far = 0.0
         self._length = length
         self._past: list[PyTree] = []
         self._actions: list[int] = []
-        self._blank = jax.tree.map(np.zeros_like, observation)
+        self._rewards: list[float] = []
+        self._blank = jax.tree.map(np.zeros_like, self.current)
         self._pad = pad_token(num_actions)
 
-    def advance(self, action: int, observation: PyTree) -> None:
+    def advance(self, action: int, observation: PyTree, reward: float) -> None:
         """Records one step."""
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
+            self._rewards = [*self._rewards, reward][-self._length :]
         self.current = _copy(observation)
         self.step += 1
+        self.return_so_far += reward
 
     def context(self) -> Context:
         """As NumPy arrays, padded at the front where the episode is younger than K."""
         missing = self._length - len(self._past)
         past = [self._blank] * missing + self._past
-        actions = [self._pad] * missing + self._actions
         if past:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *past)
         else:
             stacked = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), self._blank)
         return Context(
-            self.current, stacked, np.array(actions, np.int32), np.array(self.step, np.int32)
+            observation=self.current,
+            past=stacked,
+            actions=np.array([self._pad] * missing + self._actions, np.int32),
+            rewards=np.array([0.0] * missing + self._rewards, np.float32),
+            step=np.array(self.step, np.int32),
+            return_so_far=np.array(self.return_so_far, np.float32),
         )
 
 
@@ -122,7 +132,6 @@ def evaluate(
         for adapter, s in zip(adapters, seeds, strict=True)
     ]
     successes = np.zeros(len(seeds), bool)
-    lengths = np.zeros(len(seeds), int)
     active = list(range(len(seeds)))
     planned, planning_seconds, replan = 0, 0.0, 0
     while active:
@@ -143,18 +152,22 @@ def evaluate(
                 if action == end:
                     break
                 transition = adapters[episode].step(int(action))
-                histories[episode].advance(int(action), transition.observation)
+                histories[episode].advance(int(action), transition.observation, transition.reward)
                 over = transition.terminated or transition.truncated
                 if over:
                     successes[episode] = transition.success
                     break
-            lengths[episode] = histories[episode].step
             if not over:
                 survivors.append(episode)
         active = survivors
         replan += 1
         progress(len(seeds) - len(active), int(successes.sum()))
     return Episodes(
-        np.asarray(seeds), successes, lengths, planned, planning_seconds,
+        np.asarray(seeds),
+        successes,
+        np.array([history.step for history in histories]),
+        np.array([history.return_so_far for history in histories]),
+        planned,
+        planning_seconds,
         time.perf_counter() - begun,
-    )  # fmt: skip
+    )

@@ -1,28 +1,9 @@
-"""Small pure schedules: the sampling temperature over iterations, which actions to mask."""
+"""Which actions of a window are masked in training: a small pure schedule."""
 
 import jax
 import jax.numpy as jnp
 
 MASKINGS = ("one", "each", "random")
-
-
-def linear_temperatures(first: float, last: float, iterations: int) -> jax.Array:
-    """Temperatures `[iterations]` going linearly from `first` to `last`.
-
-    Raises:
-        ValueError: a negative or non-finite temperature, or no iteration.
-    """
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}")
-    check_temperatures(first, last)
-    return jnp.linspace(first, last, iterations, dtype=jnp.float32)
-
-
-def check_temperatures(*temperatures: float) -> None:
-    """Refuses, with `ValueError`, what is negative or not finite."""
-    for value in temperatures:
-        if not 0 <= value < float("inf"):
-            raise ValueError(f"a temperature must be finite and at least 0, got {value}")
 
 
 def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:

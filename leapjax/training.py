@@ -32,7 +32,7 @@ def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, ja
 
 
 def make_train_step(
-    agent: Agent, make_batch: Callable[[jax.Array, PyTree], PyTree]
+    agent: Agent,
 ) -> Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]:
     """The jitted step `(state, data, key) -> (state, metrics)`; it consumes `state`.
 
@@ -42,7 +42,6 @@ def make_train_step(
     Args:
         agent: what is trained. If it was made with a mesh, the state and the key come from
             `make_begin` with that mesh, and the data from `sharding.replicate`.
-        make_batch: (key, data) -> batch; pure.
     """
 
     def step(
@@ -50,7 +49,7 @@ def make_train_step(
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         batch_key = jax.random.fold_in(jax.random.fold_in(key, BATCH_STREAM), state.step)
         update_key = jax.random.fold_in(jax.random.fold_in(key, UPDATE_STREAM), state.step)
-        return agent.update(state, make_batch(batch_key, data), update_key)
+        return agent.update(state, agent.batch(batch_key, data), update_key)
 
     return jax.jit(step, donate_argnums=0)
 

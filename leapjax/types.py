@@ -1,8 +1,8 @@
-"""The data that everything else passes around. Nothing here computes.
+"""The data that everything else passes around. Nothing here computes, or knows a domain.
 
 Shape letters, used throughout: B plans or windows in a batch, T planned actions (the
 horizon), K past steps in a context, N planning iterations, P positions resampled
-together, A actions (the end action included), S grid side, L instruction tokens.
+together, A actions (the end action included).
 """
 
 from collections.abc import Callable
@@ -16,23 +16,26 @@ Params = Any
 Array = Any  # a jax.Array inside a program, a NumPy array at its edges
 
 
-class Observation(NamedTuple):
-    """One state of a grid world, as numbers. Positions are `[x, y]`, `grid[x, y]`."""
-
-    grid: Array  # [S, S, 3] uint8: object, colour and state of every cell, agent included
-    pose: Array  # [3] int32: x, y, direction (0 right, 1 down, 2 left, 3 up)
-    carried: Array  # [2] int32: object and colour held; (0, 0) is nothing
-    goal: Array  # [2] int32: x, y of the target; (-1, -1) where it is not available
-    instruction: Array  # [L] int32: token ids; 0 pads on the right
-
-
 class Context(NamedTuple):
     """What a plan is conditioned on (paper, section 3: the trajectory context and s_n)."""
 
     observation: PyTree  # the current state s_n
     past: PyTree  # [K, ...] the K states before it, oldest first; zeros before the start
     actions: Array  # [K] int32: the action taken in each past state; PAD before the start
+    rewards: Array  # [K] float32: what each of them gave; 0 before the start
     step: Array  # [] int32: environment steps since the episode began
+    return_so_far: Array  # [] float32: the sum of all rewards since then
+
+
+class Demonstration(NamedTuple):
+    """One episode of `n` steps, played by somebody."""
+
+    observations: PyTree  # [n + 1, ...] the state before each action, and the last
+    actions: Array  # [n] int32
+    rewards: Array  # [n] float32
+    terminated: bool  # it came to an end of its own
+    truncated: bool  # it was cut off, by a limit of steps for instance
+    seed: int  # with which the environment was reset
 
 
 class Plan(NamedTuple):
@@ -87,6 +90,7 @@ class TrainState(NamedTuple):
     params: Params
     optimizer: PyTree
     step: jax.Array  # [] int32: updates done
+    extra: PyTree = ()  # what no gradient touches: target networks, running statistics
 
 
 class Agent(NamedTuple):
@@ -94,9 +98,9 @@ class Agent(NamedTuple):
 
     init: Callable[[jax.Array], TrainState]
     # (key) -> state
+    batch: Callable[[jax.Array, PyTree], PyTree]
+    # (key, steps) -> batch [B, ...]; pure; see leapjax.data.windows for the steps
     update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
     # (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself
-    energy: Energy | None
-    # the energy that `act` minimises, for composition; None for methods without one
-    act: Callable[[Params, jax.Array, PyTree], Plan]
-    # (params, key, context) -> plan; pure, one context
+    energy: Energy
+    # what is minimised to act; a method that chooses one action at a time has plans of one

@@ -8,61 +8,50 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax import planners
-from leapjax.agents import leap
-from leapjax.agents.gradients import make_update
-from leapjax.agents.leap import TrainingConfig
+from leapjax.agents import learning
+from leapjax.agents.learning import Setup
 from leapjax.data.windows import Window
+from leapjax.domain import blank_context
 from leapjax.energy import classifier
-from leapjax.models import trajectory
-from leapjax.models.trajectory import ModelConfig, SequenceClassifier, Sizes
-from leapjax.types import Agent, Context, Params, TrainState
+from leapjax.models.trajectory import SequenceClassifier
+from leapjax.types import Agent, Context, Params, PyTree, TrainState
 
+def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
+    """The classifier as an `Agent`; it has no use for the transformer's settings."""
+    sizes = setup.sizes
+    module = SequenceClassifier(setup.model, sizes, setup.encoder())
+    optimizer = learning.make_optimizer(setup.training)
 
-def make_agent(
-    model: ModelConfig,
-    training: TrainingConfig,
-    planner: planners.PlannerConfig,
-    sizes: Sizes,
-    words: int,
-    mesh: Mesh | None = None,
-) -> Agent:
-    """The classifier as an `Agent`; the arguments are those of `leapjax.agents.leap`.
-
-    Of `model` it has no use for the transformer's settings, nor for `training.masking`.
-    """
-    module = SequenceClassifier(model, sizes)
-    optimizer = leap.make_optimizer(training)
-
-    def encode(params: Params, context: Context) -> object:
+    def encode(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="encode")
 
-    def degree(params: Params, memory: object, actions: jax.Array) -> jax.Array:
+    def degree(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         result = module.apply(params, memory, actions, method="degree")
         assert isinstance(result, jax.Array)
         # As for every energy: the end action, the last one, is never the first of a plan.
         return jnp.where(actions[0] == sizes.num_actions - 1, jnp.inf, result)
 
-    energy = classifier(encode, degree, sizes.num_actions)
+    energy = classifier(learning.context_encoder(encode, setup), degree, sizes.num_actions)
 
     def init(key: jax.Array) -> TrainState:
-        context = trajectory.blank_context(sizes, words)
+        context = jax.tree.map(jnp.asarray, blank_context(setup.domain, sizes.context))
         actions = jnp.zeros(sizes.horizon, jnp.int32)
         params = module.init(key, context, actions, method=_encode_and_judge)
         return TrainState(params, optimizer.init(params), jnp.int32(0))
 
     def window_loss(
-        params: Params, window: Window, key: jax.Array
+        params: Params, extra: PyTree, window: Window, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Squared error of the degree of corruption of one corrupted window."""
+        del extra
         corrupted, target = corrupt(key, window.actions, sizes.num_actions)
         memory = module.apply(params, window.context, method="encode")
         found = module.apply(params, memory, corrupted, method="degree")
         assert isinstance(found, jax.Array)
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
-    update = make_update(window_loss, optimizer, mesh)
-    return Agent(init, update, energy, planners.bind(energy, planner))
+    update = learning.make_update(window_loss, optimizer, mesh)
+    return Agent(init, learning.window_batches(setup), update, energy)
 
 
 def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:

@@ -1,11 +1,14 @@
 """Demonstrations as Minari data sets: written once, atomically, and read by one path.
 
-A data set of the user's own, of the same observations, is read in the same way.
+A data set of the user's own, of the same observations, is read in the same way. Observations
+are a dictionary by field, or one array where they are an array.
 """
 
+import functools
 import json
 import math
 import os
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -13,61 +16,55 @@ from typing import Any
 
 import gymnasium as gym
 import h5py
+import jax
 import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
 from minari.storage.datasets_root_dir import get_dataset_path
 
-from leapjax.data.demonstrations import Collection, Demonstration
-from leapjax.envs import vocabulary
-from leapjax.envs.adapter import NUM_ACTIONS
-from leapjax.envs.levels import Level
+from leapjax.domain import Collection, Domain
 from leapjax.errors import UserError, first_line
-from leapjax.types import Observation
+from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
-FORMAT = 1  # raised whenever what a demonstration holds changes: old caches are then unused
+FORMAT = 2  # raised whenever what a demonstration holds changes: old caches are then unused
 
 
-def dataset_id(level: Level, count: int, seed: int) -> str:
+def dataset_id(domain: Domain, count: int, seed: int) -> str:
     """The id under which `count` demonstrations for a training seed are cached."""
-    return f"leapjax/{level.name}/bot-{count}-seed{seed}-v{FORMAT}"
+    return f"leapjax/{domain.level}/bot-{count}-seed{seed}-v{FORMAT}"
 
 
-def observation_space(side: int, words: int) -> gym.spaces.Dict:
-    """The Minari observation space of an `Observation`."""
-
-    def integers(length: int) -> gym.spaces.Box:
-        return gym.spaces.Box(-1, 255, (length,), np.int32)
-
-    return gym.spaces.Dict(
-        {
-            "grid": gym.spaces.Box(0, 255, (side, side, 3), np.uint8),
-            "pose": integers(3),
-            "carried": integers(2),
-            "goal": integers(2),
-            "instruction": integers(words),
-        }
-    )
+def observation_space(blank: PyTree) -> gym.Space:
+    """The Minari space of observations like `blank`: of their shapes and types."""
+    if isinstance(blank, np.ndarray):
+        whole = np.issubdtype(blank.dtype, np.integer)
+        limits = np.iinfo(blank.dtype) if whole else None
+        low, high = (limits.min, limits.max) if limits else (-np.inf, np.inf)
+        return gym.spaces.Box(low, high, blank.shape, blank.dtype.type)
+    return gym.spaces.Dict({name: observation_space(x) for name, x in _fields(blank).items()})
 
 
-def save(name: str, collection: Collection, description: str) -> None:
+def _fields(observations: PyTree) -> dict[str, Any]:
+    """The parts of observations that are not one array, by name."""
+    return observations._asdict() if hasattr(observations, "_asdict") else dict(observations)
+
+
+def save(name: str, collection: Collection, domain: Domain, description: str) -> None:
     """Writes a Minari data set; a killed program leaves either all of it or nothing."""
-    demonstrations = collection.demonstrations
-    first = demonstrations[0].observations
     buffers = [
         EpisodeBuffer(
             id=index,
             seed=demonstration.seed,
-            observations=demonstration.observations._asdict(),
+            observations=_stored(demonstration.observations),
             actions=list(demonstration.actions),
-            rewards=[0.0] * (len(demonstration.actions) - 1) + [1.0],
-            terminations=[False] * (len(demonstration.actions) - 1) + [True],
-            truncations=[False] * len(demonstration.actions),
+            rewards=demonstration.rewards.tolist(),
+            terminations=_only_at_end(demonstration, demonstration.terminated),
+            truncations=_only_at_end(demonstration, demonstration.truncated),
             infos={},
         )
-        for index, demonstration in enumerate(demonstrations)
+        for index, demonstration in enumerate(collection.demonstrations)
     ]
     final = get_dataset_path(name)
     final.parent.mkdir(parents=True, exist_ok=True)
@@ -80,11 +77,11 @@ def save(name: str, collection: Collection, description: str) -> None:
         minari.create_dataset_from_buffers(
             dataset_id=scratch,
             buffer=buffers,
-            action_space=gym.spaces.Discrete(NUM_ACTIONS - 1),
-            observation_space=observation_space(first.grid.shape[1], first.instruction.shape[1]),
-            algorithm_name="BabyAI bot",
+            action_space=gym.spaces.Discrete(domain.num_actions - 1),
+            observation_space=observation_space(domain.blank),
+            algorithm_name="a demonstrator",
             author="leapjax",
-            code_permalink="https://github.com/Farama-Foundation/Minigrid",
+            code_permalink="https://github.com/Farama-Foundation/Minari",
             description=description,
             jpeg_encoding=False,  # grids are symbols, not pictures
         )
@@ -95,16 +92,32 @@ def save(name: str, collection: Collection, description: str) -> None:
     path.rename(final)
 
 
-def load(name: str, level: Level, side: int) -> list[Demonstration]:
-    """The demonstrations of a Minari data set, checked against a level.
+def _stored(observations: PyTree) -> Any:
+    if isinstance(observations, np.ndarray):
+        return observations
+    return {name: _stored(part) for name, part in _fields(observations).items()}
+
+
+def _only_at_end(demonstration: Demonstration, value: bool) -> list[bool]:
+    return [False] * (len(demonstration.actions) - 1) + [bool(value)]
+
+
+def load(name: str, domain: Domain) -> list[Demonstration]:
+    """The demonstrations of a Minari data set, checked against a domain.
 
     Raises:
-        UserError: missing, damaged, empty, or not of this level's observations.
+        UserError: missing, damaged, empty, or not of this domain's observations.
     """
     if not get_dataset_path(name).exists():
         raise UserError(
             f"no Minari data set {name!r} in {get_dataset_path()}: "
             "check the id with `minari list local`"
+        )
+    version = re.fullmatch(r"leapjax/.*/bot-.*-v(\d+)", name)
+    if version and int(version[1]) < FORMAT:
+        raise UserError(
+            f"the data set {name!r} is of an earlier version, which kept no rewards: without "
+            "--demonstrations it is made anew"
         )
     try:
         _inspect(get_dataset_path(name) / "data")
@@ -121,13 +134,21 @@ def load(name: str, level: Level, side: int) -> list[Demonstration]:
     demonstrations = []
     for episode, details in zip(episodes, metadata, strict=True):
         where = f"episode {episode.id} of the Minari data set {name!r}"
-        states = _observation(episode.observations, where)
-        actions = _integers(episode.actions, f"{where}: actions")
-        _check_episode(states, actions, where, level, side)
-        states = Observation(*(field.astype(np.int32) for field in states))
-        states = states._replace(grid=states.grid.astype(np.uint8))
-        seed = int(details.get("seed", UNKNOWN_SEED))
-        demonstrations.append(Demonstration(states, actions.astype(np.int32), seed))
+        actions = _actions(episode.actions, where, domain.num_actions - 2)
+        observations = _like(domain.blank, episode.observations, where)
+        _check_shapes(observations, domain, len(actions) + 1, where)
+        domain.check(observations, where)
+        narrow = functools.partial(_narrowed, where=where)
+        demonstrations.append(
+            Demonstration(
+                jax.tree.map(narrow, domain.blank, observations),
+                actions.astype(np.int32),
+                _rewards(episode.rewards, where, len(actions)),
+                bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),
+                bool(np.asarray(episode.truncations).reshape(-1)[-1:].any()),
+                int(details.get("seed", UNKNOWN_SEED)),
+            )
+        )
     return demonstrations
 
 
@@ -188,63 +209,73 @@ def _check_group(group: h5py.Group) -> None:
             raise ValueError(f"{name} claims {item.nbytes} bytes, which are not there")
 
 
-def _observation(fields: object, where: str) -> Observation:
-    missing = [f for f in Observation._fields if not isinstance(fields, dict) or f not in fields]
+def _actions(values: Any, where: str, last: int) -> np.ndarray:
+    actions = _numbers(np.zeros((), np.int64), values, f"{where}: actions")
+    if actions.ndim != 1:
+        raise UserError(f"{where}: actions have shape {actions.shape}, expected one per step")
+    if len(actions) == 0:
+        raise UserError(f"{where} has no actions")
+    if actions.min() < 0 or actions.max() > last:
+        raise UserError(
+            f"{where}: actions run from {actions.min()} to {actions.max()}, expected 0 to {last}"
+        )
+    return actions
+
+
+def _rewards(values: Any, where: str, steps: int) -> np.ndarray:
+    rewards = _numbers(np.zeros((), np.float32), values, f"{where}: rewards")
+    if rewards.shape != (steps,):
+        raise UserError(f"{where}: rewards have shape {rewards.shape}, expected ({steps},)")
+    if not np.isfinite(rewards).all():
+        raise UserError(f"{where}: rewards that are not finite numbers")
+    return rewards.astype(np.float32)
+
+
+def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") -> PyTree:
+    """What was stored, in the structure of `blank`, in types wide enough for every check."""
+    if isinstance(blank, np.ndarray):
+        return _numbers(blank, stored, f"{where}: {name}")
+    parts = _fields(blank)
+    missing = [part for part in parts if not isinstance(stored, dict) or part not in stored]
     if missing:
         raise UserError(
             f"{where} has no observation {missing[0]!r}: "
-            f"expected a dictionary of {', '.join(Observation._fields)}"
+            f"expected a dictionary of {', '.join(parts)}"
         )
-    assert isinstance(fields, dict)
-    return Observation(**{f: _integers(fields[f], f"{where}: {f}") for f in Observation._fields})
+    values = {part: _like(x, stored[part], where, part) for part, x in parts.items()}
+    return type(blank)(**values)
 
 
-def _integers(values: object, what: str) -> np.ndarray:
+def _numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
     array = np.asarray(values)
-    if not np.issubdtype(array.dtype, np.integer):
-        raise UserError(f"{what} must be integers, got {array.dtype}")
-    return array.astype(np.int64)  # wide enough for what the range check must still see
+    if np.issubdtype(blank.dtype, np.integer):
+        if not np.issubdtype(array.dtype, np.integer):
+            raise UserError(f"{what} must be integers, got {array.dtype}")
+        return array.astype(np.int64)  # wide enough for what the range check must still see
+    if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
+        raise UserError(f"{what} must be numbers, got {array.dtype}")
+    return array.astype(np.float64)
 
 
-def _check_episode(
-    states: Observation, actions: np.ndarray, where: str, level: Level, side: int
-) -> None:
-    if actions.ndim != 1:
-        raise UserError(f"{where}: actions have shape {actions.shape}, expected one per step")
-    steps = len(actions)
-    expected = {
-        "grid": (steps + 1, side, side, 3),
-        "pose": (steps + 1, 3),
-        "carried": (steps + 1, 2),
-        "goal": (steps + 1, 2),
-        "instruction": (steps + 1, level.words),
-    }
-    if steps == 0:
-        raise UserError(f"{where} has no actions")
-    for field, shape in expected.items():
-        actual = getattr(states, field).shape
-        if actual != shape:
+def _check_shapes(observations: PyTree, domain: Domain, states: int, where: str) -> None:
+    found = jax.tree.leaves(observations)
+    for (path, blank), array in zip(jax.tree.leaves_with_path(domain.blank), found, strict=True):
+        name = jax.tree_util.keystr(path, simple=True) or "observations"
+        if array.shape != (states, *blank.shape):
             raise UserError(
-                f"{where}: {field} has shape {actual}, level {level.name} needs {shape}"
+                f"{where}: {name} has shape {array.shape}, level {domain.level} needs "
+                f"{(states, *blank.shape)}"
             )
-    ranges = {
-        "grid objects": (states.grid[..., 0], 0, 10),
-        "grid colours": (states.grid[..., 1], 0, 5),
-        "grid states": (states.grid[..., 2], 0, 3),
-        "positions": (states.pose[:, :2], 0, side - 1),
-        "directions": (states.pose[:, 2], 0, 3),
-        "goals": (states.goal, -1, side - 1),
-        "instruction": (states.instruction, 0, vocabulary.SIZE - 1),
-        "carried objects": (states.carried[:, 0], 0, 10),
-        "carried colours": (states.carried[:, 1], 0, 5),
-        "actions": (actions, 0, NUM_ACTIONS - 2),
-    }
-    for field, (values, low, high) in ranges.items():
-        if values.min() < low or values.max() > high:
-            raise UserError(
-                f"{where}: {field} run from {values.min()} to {values.max()}, "
-                f"expected {low} to {high}"
-            )
+
+
+def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
+    """An array in the type of `blank`, if it fits."""
+    with np.errstate(over="ignore"):
+        narrow = array.astype(blank.dtype)
+    whole = np.issubdtype(blank.dtype, np.integer)
+    if not (np.array_equal(narrow, array) if whole else np.isfinite(narrow).all()):
+        raise UserError(f"{where}: observations that do not fit {blank.dtype}, or are not finite")
+    return narrow
 
 
 def _rename_id(path: Path, old: str, new: str) -> None:

@@ -2,33 +2,35 @@
 
 A window starts at one step of one demonstration. It holds the K steps before it, the
 state there, and the T actions from there on; past the end of the demonstration the action
-is `end`, predicted like any other. States after the start never enter (paper, eq. 4); the
-cells that they need free are kept for augmentation, and no model sees them.
+is `end`, predicted like any other. States after the start never enter (paper, eq. 4).
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.data import symmetries
-from leapjax.data.demonstrations import Demonstration
-from leapjax.types import Array, Context, Observation, pad_token
+from leapjax.types import Array, Context, Demonstration, PyTree, pad_token
 
 
 class Steps(NamedTuple):
     """All steps of all demonstrations, one after the other: M steps of E episodes."""
 
-    observations: Observation  # [M, ...] the state before each action
+    observations: PyTree  # [M + E, ...] the states of each episode, its last one included
+    state: Array  # [M] int32: where in them the state before each action is; after it: + 1
     actions: Array  # [M] int32
+    rewards: Array  # [M] float32
+    return_so_far: Array  # [M] float32: the sum of the episode's rewards before this step
+    terminated: Array  # [M] bool: the episode came to its end with this step
+    truncated: Array  # [M] bool: it was cut off after this step
     step: Array  # [M] int32: steps since the episode began
     remaining: Array  # [M] int32: actions of the episode from here on, this one included
     starts: Array  # [E] int32: the index of each episode's first step
     lengths: Array  # [E] int32: its number of actions
-    way: Array  # [M, S, S] bool: cells that the episode needs free from here on
+    extras: PyTree  # [M, ...] what the domain's augmentation must know; no model sees it
 
 
 class Window(NamedTuple):
@@ -36,10 +38,10 @@ class Window(NamedTuple):
 
     context: Context
     actions: Array  # [T] int32: what to predict
-    way: Array  # [S, S] bool: cells that the rest of the demonstration needs free
+    extras: PyTree  # what the domain's augmentation must know
 
 
-def fingerprint(steps: Steps) -> str:
+def fingerprint(steps: PyTree) -> str:
     """A name for exactly this data: sixteen hexadecimal digits."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(steps):
@@ -49,32 +51,41 @@ def fingerprint(steps: Steps) -> str:
     return digest.hexdigest()[:16]
 
 
-def concatenate(demonstrations: Sequence[Demonstration]) -> Steps:
-    """Lays demonstrations out for `window`."""
+def concatenate(
+    demonstrations: Sequence[Demonstration],
+    extras: Callable[[Demonstration], PyTree] = lambda demonstration: (),
+) -> Steps:
+    """Lays demonstrations out for `window`.
+
+    Args:
+        demonstrations: at least one.
+        extras: of a demonstration, `[n, ...]` (`Domain.extras`).
+    """
     lengths = np.array([len(d.actions) for d in demonstrations], np.int32)
+    episode = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
     step = np.concatenate([np.arange(n, dtype=np.int32) for n in lengths])
-    fields = zip(*(d.observations for d in demonstrations), strict=True)
+    last = step == lengths[episode] - 1
+
+    def join(parts: Sequence[PyTree]) -> PyTree:
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    rewards = [np.asarray(d.rewards, np.float32) for d in demonstrations]
     return Steps(
-        Observation(*(np.concatenate([part[:-1] for part in parts]) for parts in fields)),
-        np.concatenate([d.actions for d in demonstrations]),
-        step,
-        np.repeat(lengths, lengths) - step,
-        np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
-        lengths,
-        np.concatenate([_way(d) for d in demonstrations]),
+        observations=join([d.observations for d in demonstrations]),
+        state=np.arange(len(step), dtype=np.int32) + episode,
+        actions=np.concatenate([d.actions for d in demonstrations]).astype(np.int32),
+        rewards=np.concatenate(rewards),
+        return_so_far=np.concatenate([np.cumsum(np.append(0, r))[:-1] for r in rewards]).astype(
+            np.float32
+        ),
+        terminated=last & np.array([d.terminated for d in demonstrations])[episode],
+        truncated=last & np.array([d.truncated for d in demonstrations])[episode],
+        step=step,
+        remaining=lengths[episode] - step,
+        starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
+        lengths=lengths,
+        extras=join([extras(d) for d in demonstrations]),
     )
-
-
-def _way(demonstration: Demonstration) -> np.ndarray:
-    """`[n, S, S]` bool: where the agent stands, or puts something down, from each step on."""
-    poses, actions = demonstration.observations.pose, demonstration.actions
-    needed = np.zeros((len(poses), *demonstration.observations.grid.shape[1:3]), bool)
-    needed[np.arange(len(poses)), poses[:, 0], poses[:, 1]] = True
-    drops = np.flatnonzero(actions == symmetries.DROP)
-    front = poses[drops, :2] + symmetries.DIRECTION_VECTORS[poses[drops, 2]]
-    front = front.clip(0, needed.shape[1] - 1)  # a user's data may face out of the grid
-    needed[drops, front[:, 0], front[:, 1]] = True
-    return np.logical_or.accumulate(needed[::-1])[::-1][:-1]
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
@@ -95,19 +106,22 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
     known = -back <= steps.step[index]
     earlier = jnp.where(known, index + back, 0)
 
-    def take_past(leaf: jax.Array) -> jax.Array:
+    def take_past(leaf: jax.Array, rows: jax.Array) -> jax.Array:
         shape = (context,) + (1,) * (leaf.ndim - 1)
-        return jnp.where(known.reshape(shape), leaf[earlier], 0)
+        return jnp.where(known.reshape(shape), leaf[rows], 0)
 
+    states = steps.state[earlier]
     return Window(
         Context(
-            jax.tree.map(lambda leaf: leaf[index], steps.observations),
-            jax.tree.map(take_past, steps.observations),
-            jnp.where(known, steps.actions[earlier], pad_token(end + 1)),
-            steps.step[index],
+            observation=jax.tree.map(lambda leaf: leaf[steps.state[index]], steps.observations),
+            past=jax.tree.map(lambda leaf: take_past(leaf, states), steps.observations),
+            actions=jnp.where(known, steps.actions[earlier], pad_token(end + 1)),
+            rewards=take_past(steps.rewards, earlier),
+            step=steps.step[index],
+            return_so_far=steps.return_so_far[index],
         ),
         actions,
-        steps.way[index],
+        jax.tree.map(lambda leaf: leaf[index], steps.extras),
     )
 
 

@@ -35,6 +35,20 @@ def dense(
     return nn.Dense(features, use_bias, dtype=dtype, kernel_init=init, name=name)
 
 
+def embed(count: int, width: int, name: str | None = None) -> nn.Embed:
+    """A table of embeddings with the initialisation of this transformer."""
+    return nn.Embed(count, width, embedding_init=_small, name=name)
+
+
+def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> jax.Array:
+    return nn.initializers.normal(WEIGHT_SCALE)(key, shape, dtype)
+
+
+def causal_mask(tokens: int, prefix: int = 0) -> jax.Array:
+    """`[tokens, prefix + tokens]`: each token sees the prefix, itself and those before it."""
+    return jnp.tril(jnp.ones((tokens, prefix + tokens), bool), prefix)
+
+
 class Block(nn.Module):
     """One layer: attention, then a two-layer perceptron, each on a normalised residual.
 
@@ -107,7 +121,7 @@ class Transformer(nn.Module):
     ) -> list[KeysValues]:
         """Keys and values, per layer, of prefix tokens `[M, D]` that see only each other.
 
-        `mask [M]` is False at prefix tokens that nobody may attend to.
+        `mask [M, M]` is False where a token (row) may not attend to another (column).
         """
         memory = []
         for block in self.blocks[:-1]:
@@ -120,17 +134,14 @@ class Transformer(nn.Module):
         x: jax.Array,
         queried: jax.Array,
         prefix: list[KeysValues] | None = None,
-        prefix_mask: jax.Array | None = None,
+        mask: jax.Array | None = None,
         deterministic: bool = True,
     ) -> jax.Array:
         """Outputs `[Q, D]` at token indices `queried [Q]` of tokens `x [tokens, D]`.
 
-        Attention is bidirectional over the tokens, and over the prefix where it is given
-        and `prefix_mask [M]` is not False.
+        Every token attends to the prefix, where it is given, and to all tokens; or only where
+        `mask [tokens, prefix + tokens]` is True (see `causal_mask`).
         """
-        mask = None
-        if prefix_mask is not None:
-            mask = jnp.concatenate([prefix_mask, jnp.ones(x.shape[0], bool)])
         for index, block in enumerate(self.blocks):
             memory = block.keys_values(x)
             if prefix is not None:
@@ -139,5 +150,6 @@ class Transformer(nn.Module):
                 )
             if index == self.layers - 1:
                 x = x[queried]
+                mask = None if mask is None else mask[queried]
             x = block(x, memory, mask, deterministic)
         return self.norm(x)

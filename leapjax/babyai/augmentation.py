@@ -1,14 +1,22 @@
-"""More windows from the same demonstrations: symmetries of the world, and clutter in it."""
+"""More windows from the same demonstrations: symmetries of the world, and clutter in it.
+
+The extras of a window are its way: `[S, S]` bool, the cells that the demonstration needs free
+from here on.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from leapjax.data import symmetries
+from leapjax.babyai import symmetries, vocabulary
+from leapjax.babyai.observations import Observation
+from leapjax.babyai.settings import Settings
 from leapjax.data.windows import Window
-from leapjax.types import Array, Observation
+from leapjax.domain import Augmentation
+from leapjax.types import Array, Demonstration
 
 
 class GridWords(NamedTuple):
@@ -19,6 +27,39 @@ class GridWords(NamedTuple):
     mirrored: Array  # [vocabulary] int32: the word that each word becomes in a mirror
     then: Array  # [2] int32: ", then"
     after: Array  # [2] int32: "after you"
+
+
+def grid_words() -> GridWords:
+    """The words of BabyAI's vocabulary that name what."""
+    return GridWords(
+        vocabulary.colour_words(),
+        vocabulary.object_words(symmetries.INTERCHANGEABLE),
+        vocabulary.mirrored_words(),
+        *vocabulary.joining_words(),
+    )
+
+
+def chosen(settings: Settings) -> list[Augmentation]:
+    """The augmentations that are asked for, the one that comes last first."""
+    found: list[Augmentation] = []
+    if settings.augment:
+        words = jax.tree.map(jnp.asarray, grid_words())
+        found.append(lambda key, w: augment(key, w, words, settings.exchange_objects))
+    if settings.clutter:
+        found.append(lambda key, w: clutter(key, w, settings.clutter))
+    return found
+
+
+def way(demonstration: Demonstration) -> np.ndarray:
+    """`[n, S, S]` bool: where the agent stands, or puts something down, from each step on."""
+    poses, actions = demonstration.observations.pose, demonstration.actions
+    needed = np.zeros((len(poses), *demonstration.observations.grid.shape[1:3]), bool)
+    needed[np.arange(len(poses)), poses[:, 0], poses[:, 1]] = True
+    drops = np.flatnonzero(actions == symmetries.DROP)
+    front = poses[drops, :2] + symmetries.DIRECTION_VECTORS[poses[drops, 2]]
+    front = front.clip(0, needed.shape[1] - 1)  # a user's data may face out of the grid
+    needed[drops, front[:, 0], front[:, 1]] = True
+    return np.logical_or.accumulate(needed[::-1])[::-1][:-1]
 
 
 def clutter(key: jax.Array, window: Window, share: float) -> Window:
@@ -45,7 +86,7 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
     free = (grid[..., 0] == symmetries.EMPTY) & (past[..., 0] <= symmetries.EMPTY).all(axis=0)
     probability = share * jax.random.uniform(share_key, minval=-1.0)  # negative: none
     filled = jax.random.uniform(where_key, cells) < probability
-    filled &= free & ~window.way & (goal[0] >= 0)
+    filled &= free & ~window.extras & (goal[0] >= 0)
     target = grid[goal[0], goal[1]].astype(jnp.int32)
     kinds = jnp.array(symmetries.INTERCHANGEABLE)
     # Not the target's: a shift by at least one, around a circle.
@@ -136,5 +177,5 @@ def reflect(window: Window, mirrored_words: jax.Array) -> Window:
             actions=symmetries.reflect_actions(context.actions),
         ),
         actions=symmetries.reflect_actions(window.actions),
-        way=window.way[:, ::-1],
+        extras=window.extras[:, ::-1],
     )

@@ -1,7 +1,7 @@
-"""One run: a level and a training seed, from demonstrations to measured episodes.
+"""The steps of one run: demonstrations, training, evaluation, pictures.
 
-The steps that experiments on grid worlds share. With several processes all of them go
-through all steps; the first one writes.
+All experiments share them, whatever the domain and the method. With several processes all of
+them go through all steps; the first one writes.
 """
 
 import contextlib
@@ -19,24 +19,19 @@ import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
 
-from experiments import animation, plots
-from experiments.config import CONFIGURATION, Config, read_origin, resolved
-from experiments.interruption import Interruption
-from experiments.progress import Meter
+from experiments.common import plots
+from experiments.common.config import Config
+from experiments.common.interruption import Interruption
+from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
-from leapjax.agents import leap
 from leapjax.batching import compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
-from leapjax.data import demonstrations, storage, windows
-from leapjax.data.demonstrations import Demonstration
-from leapjax.envs import vocabulary
-from leapjax.envs.adapter import BabyAIAdapter
-from leapjax.envs.levels import Level
+from leapjax.data import storage, windows
+from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError, first_line
-from leapjax.models.trajectory import Sizes
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
-from leapjax.types import TrainState
+from leapjax.types import Demonstration, TrainState
 
 Metrics = list[dict[str, float]]
 
@@ -45,10 +40,9 @@ Metrics = list[dict[str, float]]
 class Run:
     """What every step of a run needs."""
 
-    config: Config
-    level: Level
-    seed: int
-    sizes: Sizes
+    config: Config[Any, Any]
+    domain: Domain
+    specification: Specification
     folder: Path
     console: Console
     interruption: Interruption
@@ -57,16 +51,23 @@ class Run:
         default_factory=lambda: {"demos": 0.0, "compile": 0.0, "train": 0.0, "eval": 0.0}
     )
 
+    @property
+    def seed(self) -> int:
+        """The training seed."""
+        return self.specification.origin.seed
+
 
 def gather(run: Run) -> list[Demonstration]:
     """The demonstrations to train on: the user's, the cached ones, or new ones."""
-    config, level, side = run.config, run.level, run.sizes.side
+    config, domain = run.config, run.domain
+    if not config.demos:
+        return []
     begun = time.perf_counter()
-    name = config.demonstrations or storage.dataset_id(level, config.demos, run.seed)
+    name = config.demonstrations or storage.dataset_id(domain, config.demos, run.seed)
     if config.demonstrations is None:
         processes.first_does(lambda: None if storage.exists(name) else _collect(run, name))
     # Each process reads for itself: the data need not be on one shared disk.
-    data = processes.together(lambda: storage.load(name, level, side))
+    data = processes.together(lambda: storage.load(name, domain))
     if len(data) < config.demos:
         raise UserError(f"{name} has {len(data)} episodes, fewer than --demos {config.demos}")
     run.seconds["demos"] = time.perf_counter() - begun
@@ -76,32 +77,23 @@ def gather(run: Run) -> list[Demonstration]:
 def _collect(run: Run, name: str) -> None:
     count = run.config.demos
     with Meter(run.console, "demonstrations", count) as meter:
-        collection = demonstrations.collect(run.level, count, run.seed, meter.update)
-    dropped = (
-        f"dropped: {collection.failed} failed, "
-        f"{collection.other_goal} ended at another match than the nearest"
+        collection = run.domain.collect(count, run.seed, meter.update)
+    reasons = ", ".join(f"{number} {reason}" for reason, number in collection.dropped.items())
+    summary = f"{count} demonstrations of {run.domain.level}" + f"; dropped: {reasons}" * bool(
+        reasons
     )
-    run.console.print(f"{count} demonstrations, {dropped}")
-    storage.save(name, collection, f"{count} demonstrations of {run.level.name}; {dropped}")
+    run.console.print(summary)
+    storage.save(name, collection, run.domain, summary)
 
 
 def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained, Metrics]:
     """Trains, or continues; what was learned and how it went."""
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
-    specification = Specification(
-        config.level, config.model, run.sizes, config.training, config.planner, run.level.words,
-        vocabulary.WORDS,
-    )  # fmt: skip
-    examples = windows.concatenate(data)
+    examples = windows.concatenate(data, run.domain.extras) if data else ()
     check_data(folder, windows.fingerprint(examples))
-
-    def describe() -> None:
-        pretrained.save_specification(folder, specification)
-        files.write_text(folder / CONFIGURATION, json.dumps(resolved(config, run.seed), indent=1))
-
-    processes.first_does(describe)
+    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
     begun = time.perf_counter()
-    agent = pretrained.make_agent(specification, mesh)
+    agent = pretrained.make_agent(run.specification, run.domain, mesh)
     state, key = training.make_begin(agent, mesh)(run.seed)
     steps = sharding.replicate(examples, mesh)
     saved = Checkpoints(folder / pretrained.CHECKPOINTS)
@@ -111,10 +103,11 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
         state = restored
         metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
         console.print(f"continuing at step {int(state.step)} of {total}")
-    step = training.make_train_step(
-        agent, lambda k, d: leap.make_batch(k, d, config.training, run.sizes)
-    )
-    compiled = step.lower(state, steps, key).compile()  # type: ignore[attr-defined]
+    step = training.make_train_step(agent)
+    if total:
+        step = step.lower(state, steps, key).compile()  # type: ignore[attr-defined]
+    elif restored is None:
+        saved.save(state)  # there is nothing to learn: what a method begins with is all of it
     run.seconds["compile"] = time.perf_counter() - begun
 
     before = metrics[-1]["seconds"] if metrics else 0.0
@@ -129,7 +122,7 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
             nonlocal last_saved
             elapsed = time.perf_counter() - begun
             metrics.append({"step": done, "seconds": before + elapsed, **means})
-            meter.update(done, f"loss {means['loss']:.3f} accuracy {means['accuracy']:.1%}")
+            meter.update(done, " ".join(f"{name} {mean:.3g}" for name, mean in means.items()))
             due = time.perf_counter() - last_saved > config.checkpoint_seconds
             # Processes have their own clocks and signals, and must agree on what to do.
             signals, dues = zip(*processes.gather([run.interruption.requested, due]), strict=True)
@@ -141,16 +134,15 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
                 last_saved = time.perf_counter()
             return any(signals)
 
-        state = training.train(compiled, state, steps, key, total, report)
+        state = training.train(step, state, steps, key, total, report)
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
-    assert agent.energy is not None
     plan = compile_planner(agent.energy, config.planner)
     # Planning is each process's own business, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
-    return Pretrained(specification, agent.energy, params, plan), metrics
+    return Pretrained(run.specification, agent.energy, params, plan), metrics
 
 
-def training_mesh(config: Config) -> Mesh:
+def training_mesh(config: Config[Any, Any]) -> Mesh:
     """The devices that a run trains on, those of all processes included.
 
     Raises:
@@ -190,38 +182,40 @@ def check_data(folder: Path, fingerprint: str) -> None:
     processes.first_does(check)
 
 
-def reuse(run: Run) -> Pretrained:
-    """The planner of `--checkpoint`, refused where it belongs to something else."""
-    config, level, sizes = run.config, run.level, run.sizes
-    assert config.checkpoint is not None
-    specification = pretrained.read_specification(config.checkpoint)
-    origin = read_origin(config.checkpoint)
-    wanted = {
-        "seed": run.seed,
-        "demos": config.demos,
-        "demonstrations": config.demonstrations,
-        "level": config.level,
-        "side": sizes.side,
-        "context": config.context,
-        "horizon": config.planner.horizon,
-        "words": level.words,
-        "model": config.model,
+def reuse(run: Run, checkpoint: Path) -> Pretrained:
+    """The planner of an earlier run, refused where something else is asked for.
+
+    Raises:
+        UserError: says what the run has, and what it was asked for.
+    """
+    trained = pretrained.read_specification(checkpoint)
+    wanted, found = (_training_settings(s) for s in (run.specification, trained))
+    for name in wanted:
+        if wanted[name] != found.get(name):
+            label = name.rsplit(".", 1)[-1]
+            raise UserError(
+                f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
+                f"not {wanted[name]}"
+            )
+    return pretrained.load(checkpoint, run.config.planner)
+
+
+def _training_settings(specification: Specification) -> dict[str, Any]:
+    """What a trained planner cannot be asked to change: all but how it searches."""
+
+    def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, value in values.items():
+            nested = isinstance(value, dict)
+            found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+        return found
+
+    settings = flat(dataclasses.asdict(specification), "")
+    return {
+        name: value
+        for name, value in settings.items()
+        if name == "planner.horizon" or name.split(".")[0] not in ("planner", "signature")
     }
-    found = {
-        "seed": origin.seed,
-        "demos": origin.demos,
-        "demonstrations": origin.demonstrations,
-        "level": specification.level,
-        "side": specification.sizes.side,
-        "context": specification.sizes.context,
-        "horizon": specification.sizes.horizon,
-        "words": specification.words,
-        "model": specification.model,
-    }
-    differing = [f"{k} is {found[k]}, not {wanted[k]}" for k in wanted if found[k] != wanted[k]]
-    if differing:
-        raise UserError(f"{config.checkpoint} does not fit: {'; '.join(differing)}")
-    return pretrained.load(config.checkpoint, config.planner)
 
 
 def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
@@ -232,7 +226,7 @@ def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
     bounds = [len(episode_seeds) * n // count for n in range(count + 1)]
     mine = episode_seeds[bounds[index] : bounds[index + 1]]
     begun = time.perf_counter()
-    warm_up(planner, run.level, len(mine))
+    warm_up(planner, run.domain, len(mine))
     run.seconds["compile"] += time.perf_counter() - begun
     with Meter(run.console, "evaluation", len(mine)) as meter:
 
@@ -241,10 +235,12 @@ def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
             meter.update(over, f"success {good}/{over}")
 
         part = play(mine, progress=progress)
-    parts = processes.gather([*(array.tolist() for array in part[:3]), *part[3:]])
-    episodes = rollouts.join(
-        [Episodes(np.array(a), np.array(b), np.array(c), *counts) for a, b, c, *counts in parts]
-    )
+    arrays = [x.tolist() for x in part[:4]]
+    parts = [
+        Episodes(*(np.array(x) for x in lists), *counts)  # type: ignore[arg-type]
+        for lists, counts in processes.gather([arrays, part[4:]])
+    ]
+    episodes = rollouts.join(parts)
     run.seconds["eval"] = episodes.seconds
     return episodes
 
@@ -254,30 +250,27 @@ def player(planner: Pretrained, run: Run) -> Callable[..., Episodes]:
 
     def play(episode_seeds: Sequence[int], **options: Any) -> Episodes:
         return rollouts.evaluate(
-            lambda: BabyAIAdapter(run.level), episode_seeds, planner.plan, planner.params,
+            run.domain.make_adapter, episode_seeds, planner.plan, planner.params,
             context=run.config.context, seed=run.seed, executed=run.config.executed, **options,
         )  # fmt: skip
 
     return play
 
 
-def warm_up(planner: Pretrained, level: Level, batch: int) -> None:
+def warm_up(planner: Pretrained, domain: Domain, batch: int) -> None:
     """Compiles every chunk size that a batch of that many and fewer plans can need."""
-    adapter = BabyAIAdapter(level)
-    history = rollouts.History(
-        adapter.reset(0), planner.specification.sizes.context, adapter.num_actions
-    )
+    context = blank_context(domain, planner.specification.context)
     for size in planner.plan.sizes_up_to(batch):
-        contexts = rollouts.stack_contexts([history] * size)
+        contexts = jax.tree.map(lambda x, n=size: np.stack([x] * n), context)
         jax.block_until_ready(planner(jax.random.split(jax.random.key(0), size), contexts))
 
 
 def draw(planner: Pretrained, run: Run, episode_seeds: range, metrics: Metrics) -> None:
-    """Loss, success against iterations, and a plan refined and executed."""
+    """The training curve, and success against iterations."""
     config, folder = run.config, run.folder
     folder.mkdir(parents=True, exist_ok=True)
     if metrics:
-        plots.loss(metrics, folder / "loss.png")
+        plots.training_curve(metrics, folder / "loss.png")
     play = player(planner, run)
     some = episode_seeds[:100]
     iterations = sorted({1, 2, 3, 5, *np.linspace(1, config.planner.iterations, 5).astype(int)})
@@ -285,10 +278,8 @@ def draw(planner: Pretrained, run: Run, episode_seeds: range, metrics: Metrics) 
     outcomes = [play(some, iteration=n) for n in iterations]
     plots.success_by_iteration(
         iterations, [(int(o.successes.sum()), len(some)) for o in outcomes],
-        f"{config.level}, preset {config.preset}", folder / "iterations.png",
+        f"{config.level}, {config.method}, preset {config.preset}", folder / "iterations.png",
     )  # fmt: skip
-    animation.animate(planner, run.level, episode_seeds[:3], run.seed, folder / "plan.gif")
-    run.console.print(f"pictures: {folder}/*.png, {folder}/plan.gif", highlight=False)
 
 
 def write_metrics(folder: Path, metrics: Metrics) -> None:

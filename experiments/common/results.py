@@ -18,7 +18,7 @@ from leapjax.files import only_process_in, read_text, write_text
 Row = dict[str, Any]
 # What tables are made from; a float may be written as an integer.
 FIELDS = {
-    "experiment": str, "level": str, "method": str, "preset": str, "hash": str,
+    "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
     "seed": int, "episodes": int, "successes": int, "mean_length": float,
     "demos_seconds": float, "compile_seconds": float, "train_seconds": float,
     "eval_seconds": float, "plans_per_second": float,
@@ -83,7 +83,7 @@ def versions() -> dict[str, str]:
     """What a result was made with."""
     names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
-    found["leapjax"] += code_version(Path(__file__).parent.parent)
+    found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
     return {**found, "python": platform.python_version(), "machine": platform.machine()}
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Observation
+from leapjax.babyai.observations import Observation
 
 DIRECTION_VECTORS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], np.int32)  # [4, 2]
 LEFT, RIGHT, DROP = 0, 1, 4  # MiniGrid's actions that tell left from right, or need a free cell

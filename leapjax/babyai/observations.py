@@ -1,9 +1,11 @@
 """What an agent sees of a BabyAI level: `observe`, and the goal fixed at reset.
 
-Everything here reads MiniGrid's state and changes nothing.
+Everything here reads MiniGrid's state and changes nothing. Shape letters beside those of
+`leapjax.types`: S the side of the grid, L the tokens of an instruction.
 """
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from minigrid.core.constants import COLOR_TO_IDX, DIR_TO_VEC, OBJECT_TO_IDX
@@ -12,10 +14,31 @@ from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.envs.babyai.core.verifier import GoToInstr, OpenInstr, PickupInstr
 
 from leapjax.errors import UserError
-from leapjax.types import Observation
+from leapjax.types import Array
 
 NO_GOAL = (-1, -1)
 Cell = tuple[int, int]
+
+
+class Observation(NamedTuple):
+    """One state of a grid world, as numbers. Positions are `[x, y]`, `grid[x, y]`."""
+
+    grid: Array  # [S, S, 3] uint8: object, colour and state of every cell, agent included
+    pose: Array  # [3] int32: x, y, direction (0 right, 1 down, 2 left, 3 up)
+    carried: Array  # [2] int32: object and colour held; (0, 0) is nothing
+    goal: Array  # [2] int32: x, y of the target; (-1, -1) where it is not available
+    instruction: Array  # [L] int32: token ids; 0 pads on the right
+
+
+def blank(side: int, words: int) -> Observation:
+    """An observation of the right shapes and types, all zeros."""
+    return Observation(
+        np.zeros((side, side, 3), np.uint8),
+        np.zeros(3, np.int32),
+        np.zeros(2, np.int32),
+        np.zeros(2, np.int32),
+        np.zeros(words, np.int32),
+    )
 
 
 def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) -> Observation:

@@ -1,37 +1,24 @@
 """Demonstrations of BabyAI levels from MiniGrid's bot."""
 
-import dataclasses
+from collections import Counter
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from minigrid.core.world_object import Door
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.utils.baby_ai_bot import BabyAIBot
 
+from leapjax.babyai import observations
+from leapjax.babyai.adapter import END, BabyAIAdapter
+from leapjax.babyai.levels import Level
+from leapjax.babyai.observations import Observation
 from leapjax.data import seeds
-from leapjax.envs import levels, observations, vocabulary
-from leapjax.envs.adapter import END
-from leapjax.envs.levels import Level
+from leapjax.domain import Collection
 from leapjax.errors import UserError
-from leapjax.types import Observation
+from leapjax.types import Demonstration
 
-
-class Demonstration(NamedTuple):
-    """One successful episode of `n` steps."""
-
-    observations: Observation  # [n + 1, ...] the state before each action, and the last
-    actions: np.ndarray  # [n] int32
-    seed: int  # of the level
-
-
-@dataclasses.dataclass
-class Collection:
-    """Demonstrations, and what was dropped on the way to them."""
-
-    demonstrations: list[Demonstration]
-    failed: int = 0  # the bot gave up, crashed or ran out of time
-    other_goal: int = 0  # it ended at another match than the nearest
+FAILED = "failed"  # the bot gave up, crashed or ran out of time
+OTHER_GOAL = "ended at another match than the nearest"
 
 
 class FullViewBot(BabyAIBot):
@@ -103,52 +90,53 @@ def collect(
     """
     if count < 1:
         raise UserError(f"at least one demonstration is needed, got {count}")
-    env = levels.make_environment(level)
-    side = max(env.width, env.height)
-    result = Collection([])
+    adapter = BabyAIAdapter(level)
+    found: list[Demonstration] = []
+    dropped = Counter({FAILED: 0, OTHER_GOAL: 0})
     level_seeds = seeds.training_seeds(seed)
-    while len(result.demonstrations) < count:
-        dropped = result.failed + result.other_goal
-        if dropped > 100 + 10 * count:
+    while len(found) < count:
+        if dropped.total() > 100 + 10 * count:
             raise UserError(
-                f"{dropped} of {dropped + len(result.demonstrations)} demonstrations of "
+                f"{dropped.total()} of {dropped.total() + len(found)} demonstrations of "
                 f"{level.name} were dropped: the bot cannot solve this level"
             )
-        demonstration = demonstrate(env, level, side, next(level_seeds), result)
+        demonstration = demonstrate(adapter, next(level_seeds), dropped)
         if demonstration is not None:
-            result.demonstrations.append(demonstration)
-            progress(len(result.demonstrations))
-    return result
+            found.append(demonstration)
+            progress(len(found))
+    return Collection(found, dropped)
 
 
-def demonstrate(
-    env: RoomGridLevel, level: Level, side: int, seed: int, tally: Collection
-) -> Demonstration | None:
-    """One episode of the bot; None, counted in `tally`, where it has to be dropped."""
-    with levels.silenced():
-        env.reset(seed=seed)
-    goal = observations.nearest_goal(env)
-    instruction = vocabulary.encode(env.mission, level.words)
-    states = [observations.observe(env, side, goal, instruction)]
-    actions: list[int] = []
-    bot = make_bot(env)
-    action, reward, over = None, 0.0, False
+def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Demonstration | None:
+    """One episode of the bot; None, counted in `dropped`, where it is no use."""
+    states, actions, rewards = [adapter.reset(seed)], [], []
+    bot = make_bot(adapter.env)
+    action, success, terminated, truncated = None, False, False, False
     try:
-        while not over:
+        while not (terminated or truncated):
             action = int(bot.replan(action))
             if action == END:  # `done`: the bot believes the mission over, and it is not
                 break
-            _, reward, terminated, truncated, _ = env.step(action)
-            over = terminated or truncated
+            observation, reward, terminated, truncated, success = adapter.step(action)
+            states.append(observation)
             actions.append(action)
-            states.append(observations.observe(env, side, goal, instruction))
+            rewards.append(reward)
     except Exception:  # noqa: BLE001  (the bot asserts, and raises, on levels it cannot solve)
-        reward = 0.0
-    if float(reward) <= 0:
-        tally.failed += 1
+        success = False
+    if not success:
+        dropped[FAILED] += 1
         return None
-    if goal != observations.NO_GOAL and observations.front_cell(env) != goal:
-        tally.other_goal += 1
+    if (
+        adapter.goal != observations.NO_GOAL
+        and observations.front_cell(adapter.env) != adapter.goal
+    ):
+        dropped[OTHER_GOAL] += 1
         return None
-    stacked = Observation(*(np.stack(parts) for parts in zip(*states, strict=True)))
-    return Demonstration(stacked, np.array(actions, np.int32), seed)
+    return Demonstration(
+        Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
+        np.array(actions, np.int32),
+        np.array(rewards, np.float32),
+        terminated,
+        truncated,
+        seed,
+    )

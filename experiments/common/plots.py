@@ -10,19 +10,23 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.results import Row
+from experiments.common.results import Row
 from leapjax import scores
 
 
-def loss(metrics: Sequence[dict[str, float]], path: Path) -> None:
-    """Training loss and accuracy against steps."""
+def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
+    """What the method reports, each against steps: the loss first."""
     steps = [entry["step"] for entry in metrics]
-    figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    axis.plot(steps, [entry["loss"] for entry in metrics], color="C0")
-    axis.set(xlabel="step", ylabel="masked cross-entropy (nats)", yscale="log")
-    right = axis.twinx()
-    right.plot(steps, [100 * entry["accuracy"] for entry in metrics], color="C1")
-    right.set_ylabel("accuracy of masked actions (%)", color="C1")
+    names = [name for name in metrics[0] if name not in ("step", "seconds")]
+    figure, axes = plt.subplots(
+        len(names), 1, figsize=(6, 2.2 * len(names)), sharex=True, layout="constrained",
+        squeeze=False,
+    )  # fmt: skip
+    for axis, name in zip(axes[:, 0], names, strict=True):
+        values = [entry[name] for entry in metrics]
+        axis.plot(steps, values)
+        axis.set(ylabel=name.replace("_", " "), yscale="log" if min(values) > 0 else "linear")
+    axes[-1, 0].set_xlabel("step")
     _save(figure, path)
 
 

@@ -1,4 +1,6 @@
-"""Encoders of grids, poses and instructions, for one state.
+"""Encoders of grids, poses and instructions: a context to tokens, for both architectures.
+
+`StateTokens` is the paper's, a token for each state of the context; `ContextTokens` is ours.
 
 Which convolution is fastest on a CPU depends on the map (docs/performance.md): on whole
 grids of few channels XLA's own is, on the small and deep maps of the paper's encoder one
@@ -13,8 +15,12 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
-from leapjax.data import symmetries
-from leapjax.types import Observation
+from leapjax.babyai import symmetries, vocabulary
+from leapjax.babyai.adapter import NUM_ACTIONS
+from leapjax.babyai.observations import Observation
+from leapjax.babyai.settings import Settings
+from leapjax.models.transformer import dense, embed
+from leapjax.types import Context, pad_token
 
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
 OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
@@ -172,6 +178,26 @@ class PaperStateEncoder(nn.Module):
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, state)
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
+
+
+class StateTokens(nn.Module):
+    """The appendix's: `[K + 1, D]`, a token for each state of the context, oldest first."""
+
+    side: int
+    width: int
+    dtype: Dtype = jnp.float32
+
+    def setup(self) -> None:  # noqa: D102
+        self.instruction = InstructionEncoder(vocabulary.SIZE, self.width)
+        self.state = PaperStateEncoder(self.side, self.width, self.dtype)
+
+    def __call__(self, context: Context) -> jax.Array:
+        """`[K + 1, D]`: the past states and the current one."""
+        instruction = self.instruction(context.observation.instruction).whole
+        states = jax.tree.map(
+            lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
+        )
+        return jax.vmap(self.state, in_axes=(0, None))(states, instruction)
 
 
 def _convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:
@@ -338,3 +364,74 @@ def neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Arr
 def feature_at(image: jax.Array, position: jax.Array) -> jax.Array:
     """The features `[C]` of a cell, zero where the position is -1 (not available)."""
     return jnp.einsum("xyc,xy->c", image, one_cell(position, image.shape[0]))
+
+
+class ContextTokens(nn.Module):
+    """Ours: what a plan must know of its context, in a few tokens.
+
+    The grid is turned so that the agent faces right; learned distances spread over it; it is
+    read at the agent, at the goal and as a whole.
+    """
+
+    settings: Settings
+    width: int
+    dtype: Dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, context: Context) -> jax.Array:
+        """Tokens `[4, D]`: the agent, the goal, the whole grid, the instruction."""
+        c, side = self.settings, context.observation.grid.shape[0]
+        direction = context.observation.pose[2]
+        observation = symmetries.rotate(context.observation, direction)
+        words = InstructionEncoder(vocabulary.SIZE, self.width, name="instruction")
+        instruction = words(observation.instruction)
+        cells = CellEmbedding(c.channels, name="cells")(observation)
+        if context.actions.shape[0]:
+            faced = self._faced(context, observation.grid)
+            cells += nn.Dense(c.channels, use_bias=False, name="faced")(faced)
+        scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction.whole), 2)
+        modulated = cells * (1 + scale) + shift
+        if c.word_heads:
+            modulated += WordAttention(c.word_heads, name="words")(cells, instruction)
+        encoder = GridEncoder(c.channels, c.fields, c.sweeps, c.rounds, self.dtype, name="grid")
+        grid, distances = encoder(modulated, observation.pose[:2], observation.goal)
+
+        def read(features: jax.Array, name: str) -> jax.Array:
+            return dense(self.width, scale=0.1, name=name)(features)
+
+        # The agent's neighbourhood holds what the first steps depend on.
+        around = neighbourhood(grid, observation.pose[:2], c.radius)
+        kind, colour = observation.carried
+        agent = read(around, "read_agent") + read(distances, "read_distances")
+        agent += embed(OBJECTS, self.width, "carried")(kind)
+        agent += embed(COLOURS, self.width, "carried_colour")(colour)
+        goal = read(feature_at(grid, observation.goal), "read_goal")
+        whole = read(grid.reshape(side * side, -1).max(axis=0), "read_all")
+        return jnp.stack([agent, goal, whole, instruction.whole])
+
+    def _faced(self, context: Context, turned: jax.Array) -> jax.Array:
+        """Which objects and doors the agent has faced in the context, and when: `[S, S, 2]`.
+
+        1 where it has, and how recently, in (0, 1]: 1 is now. That is what says which part of
+        an instruction is done. The past actions, and where the agent went besides, are left
+        out: by them a network can recognise a demonstration (docs/experiments.md).
+
+        Args:
+            context: what is known.
+            turned: `[S, S, 3]` the current grid, turned so that the agent faces right.
+        """
+        side, past = turned.shape[0], context.actions.shape[0]
+        direction = context.observation.pose[2]
+        poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
+        known = jnp.append(context.actions != pad_token(NUM_ACTIONS), True)
+        recency = known * jnp.arange(1, past + 2) / (past + 1)
+
+        def mark(pose: jax.Array) -> jax.Array:
+            pose = symmetries.rotate_pose(pose, direction, side)
+            front = pose[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[pose[2]]
+            return one_cell(front, side)
+
+        kinds = turned[..., 0]
+        named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
+        latest = (jax.vmap(mark)(poses) * recency[:, None, None]).max(axis=0) * named
+        return jnp.stack([latest > 0, latest], axis=-1)

@@ -1,0 +1,273 @@
+"""The configuration of a run: presets, the command line, the hash that names it."""
+
+import argparse
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Generic, TypeVar
+
+import tyro
+
+from experiments.common.runtime import Cluster
+from leapjax import pretrained
+from leapjax.agents.learning import TrainingConfig
+from leapjax.data import seeds
+from leapjax.domain import Domain
+from leapjax.domains import find_domain
+from leapjax.errors import UserError
+from leapjax.methods import find_method
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import GibbsConfig
+from leapjax.pretrained import Origin, Specification
+
+M = TypeVar("M")
+D = TypeVar("D")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(Generic[M, D]):
+    """Train a method on demonstrations of a level, then measure its success."""
+
+    method_settings: Annotated[M, tyro.conf.arg(name="")]
+    domain_settings: Annotated[D, tyro.conf.arg(name="")]
+    domain: Annotated[str, tyro.conf.Suppress] = "babyai"
+    level: str = "GoToLocalS7N5"
+    """A level of the domain by its name or id, or "all" for those of the paper."""
+    method: str = "leap"
+    """How to learn and to act: a line of the table in leapjax/methods.py."""
+    preset: str = "leapjax"
+    """"leapjax": ours; "paper": the paper's appendix. Sets the defaults of all the rest."""
+    seeds: tuple[int, ...] = (0,)
+    """Training seeds; each draws its own demonstrations."""
+    demos: int = 500
+    """Demonstrations to train on."""
+    demonstrations: str | None = None
+    """Id of a Minari data set to train on instead of those that the domain makes."""
+    episodes: int = 200
+    """Held-out episodes to measure success on."""
+    test_seed: int = 0
+    """Level seed of the first of them."""
+    validation: bool = False
+    """Measure on validation levels instead: for choosing settings."""
+    context: int = 0
+    """K, past steps that the planner sees."""
+    executed: int | None = None
+    """Actions to execute before replanning; None: the whole plan, as in the paper."""
+    checkpoint: Path | None = None
+    """Folder of an earlier run to evaluate instead of training; brings its settings along."""
+    record: bool = False
+    """Append the row to results/, which is committed, and skip what is recorded already."""
+    force: bool = False
+    """With --record: run again what is recorded, and replace its row."""
+    runs: Path = Path("runs")
+    """Where checkpoints, metrics, plots and unrecorded rows go."""
+    pictures: bool = True
+    """Draw the plots and the animation."""
+    checkpoint_seconds: float = 30.0
+    """Save the training state this often: what a killed run can lose at most."""
+    model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
+    training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
+    planner: Annotated[GibbsConfig, tyro.conf.arg(name="")] = GibbsConfig()
+    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+
+
+GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")
+# What a result does not depend on, or what its row holds on its own.
+_NOT_HASHED = (
+    "seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds", "cluster",
+)  # fmt: skip
+
+
+def blank(domain: str, method: str) -> Config[Any, Any]:
+    """The defaults of every option, before any preset.
+
+    Raises:
+        UserError: an unknown domain or method.
+    """
+    return Config(
+        find_method(method).settings(), find_domain(domain).settings(), domain, method=method
+    )
+
+
+def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any]:
+    """The defaults of a preset: the level's, then the method's, then the level's for the method.
+
+    Raises:
+        UserError: an unknown domain, level, method or preset.
+    """
+    config = dataclasses.replace(blank(domain, method), level=level, preset=name)
+    kind, presets = find_domain(domain), find_method(method).presets
+    if name not in presets:
+        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
+    options = {**kind.preset(level, name), **presets[name], **kind.tuned(level, method, name)}
+    return with_options(config, options)
+
+
+def with_options(config: Config[Any, Any], options: Mapping[str, Any]) -> Config[Any, Any]:
+    """A configuration with some options changed, by the names that the command line has."""
+    changed: dict[str, Any] = {}
+    for group in GROUPS:
+        part = getattr(config, group)
+        names = {field.name for field in dataclasses.fields(part)}
+        mine = {name: value for name, value in options.items() if name in names}
+        changed[group] = dataclasses.replace(part, **mine)
+        options = {name: value for name, value in options.items() if name not in names}
+    return dataclasses.replace(config, **changed, **options)
+
+
+def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
+    """One configuration per level from a command line; exits with 2 and a reason if it is bad.
+
+    Raises:
+        UserError: an unknown level, method or preset, or options that cannot be.
+    """
+    # These come first: they decide the defaults of all the rest, and of --help.
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("--level", "--method", "--preset", "--checkpoint"):
+        first.add_argument(name)
+    chosen, _ = first.parse_known_args(list(arguments))
+    trained = None
+    if chosen.checkpoint is not None:
+        trained = pretrained.read_specification(Path(chosen.checkpoint))
+    level = chosen.level or (trained.level if trained else Config.level)
+    method = chosen.method or (trained.method if trained else Config.method)
+    name = chosen.preset or (trained.origin.preset if trained else Config.preset)
+    configs = []
+    for each in find_domain(domain).levels if level == "all" else [level]:
+        default = preset(domain, each, method, name)
+        if trained and trained.method == method and trained.domain == domain:
+            default = dataclasses.replace(
+                default,
+                **{group: getattr(trained, group) for group in GROUPS},
+                context=trained.context,
+                seeds=(trained.origin.seed,),
+                demos=trained.origin.demos,
+                demonstrations=trained.origin.demonstrations,
+            )
+        config = dataclasses.replace(_parse(arguments, default), level=each)
+        check(config)
+        configs.append(config)
+    return configs
+
+
+def _parse(arguments: Sequence[str], default: Config[Any, Any]) -> Config[Any, Any]:
+    # Which options there are depends on the method and the domain.
+    settings = type(default.method_settings), type(default.domain_settings)
+    generic: Any = Config
+    kind = generic[settings]
+    try:
+        return tyro.cli(kind, args=list(arguments), default=default)
+    except ValueError as error:  # the dataclasses refuse values that cannot be
+        raise UserError(str(error)) from None
+
+
+def check(config: Config[Any, Any]) -> None:
+    """Refuses what cannot work before any long work starts.
+
+    Raises:
+        UserError: says what.
+    """
+    check_counts(config, "episodes")
+    if config.training.steps:  # where nothing is learned, nothing is needed to learn from
+        check_counts(config, "demos")
+    if not config.seeds:
+        raise UserError("--seeds needs at least one seed")
+    for seed in config.seeds:
+        seeds.training_seeds(seed)
+    episode_seeds(config)
+    if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
+        raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
+    if not config.checkpoint_seconds >= 0:
+        raise UserError(f"--checkpoint-seconds must be at least 0, got {config.checkpoint_seconds}")
+    if config.context < 0:
+        raise UserError(f"--context must be at least 0, got {config.context}")
+    check_executed(config.executed, config.planner.horizon)
+    domain = make_domain(config)
+    limit = domain.shortest_limit
+    if limit is not None and config.planner.horizon > limit:
+        raise UserError(
+            f"--horizon {config.planner.horizon} is longer than an episode of {config.level} "
+            f"may last: its step limit is {limit}"
+        )
+    # An agent costs nothing to make, and says what its method cannot do.
+    pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
+
+
+def make_domain(config: Config[Any, Any]) -> Domain:
+    """The level of a configuration."""
+    return find_domain(config.domain).make(config.level, config.domain_settings)
+
+
+def specify(config: Config[Any, Any], seed: int, domain: Domain) -> Specification:
+    """What a run leaves beside its parameters."""
+    return Specification(
+        config.domain, config.level, config.method, config.context,
+        **{group: getattr(config, group) for group in GROUPS},
+        signature=dict(domain.signature),
+        origin=Origin(config.preset, seed, config.demos, config.demonstrations),
+    )  # fmt: skip
+
+
+def check_counts(options: object, *names: str) -> None:
+    """Refuses options that count something and are not positive.
+
+    Raises:
+        UserError: says which.
+    """
+    for name in names:
+        if getattr(options, name) < 1:
+            raise UserError(f"--{name} must be at least 1, got {getattr(options, name)}")
+
+
+def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
+    """Refuses to execute more of a plan than there is.
+
+    Raises:
+        UserError: says how much there is.
+    """
+    if executed is not None and not 1 <= executed <= horizon:
+        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
+
+
+def episode_seeds(config: Config[Any, Any]) -> range:
+    """The level seeds of the episodes that success is measured on.
+
+    Raises:
+        UserError: they leave their range.
+    """
+    first = seeds.validation_seeds if config.validation else seeds.test_seeds
+    return first(config.test_seed, config.episodes)
+
+
+def resolved(config: Config[Any, Any], seed: int) -> dict[str, Any]:
+    """All settings that one seed's result depends on, as JSON values."""
+    values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
+    return json.loads(json.dumps({**values, "seed": seed}))
+
+
+def configuration_hash(config: Config[Any, Any], seed: int) -> str:
+    """Twelve hexadecimal digits that name a configuration.
+
+    They are those of domain, method, seed and what differs from the defaults alone, so that a
+    setting that is added later, with what was done before as its default, changes no name.
+    """
+    settings = _differences(
+        resolved(config, seed), resolved(blank(config.domain, config.method), -1)
+    )
+    named = {"domain": config.domain, "method": config.method, **settings}
+    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """What is not the default, part by part."""
+    found = {}
+    for name, value in values.items():
+        default = defaults[name]
+        if isinstance(value, dict):
+            value = _differences(value, default)
+            default = {}
+        if value != default:
+            found[name] = value
+    return found

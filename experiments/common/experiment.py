@@ -1,0 +1,150 @@
+"""An experiment: levels of a domain, trained on and played, each a row beside the paper's."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from rich.console import Console
+
+from experiments.common import program, results, run, runtime
+from experiments.common.config import (
+    Config,
+    configuration_hash,
+    episode_seeds,
+    make_domain,
+    parse,
+    resolved,
+    specify,
+)
+from experiments.common.interruption import Interruption, interruptible
+from experiments.common.run import Run
+from leapjax import files, processes
+from leapjax.data import seeds
+from leapjax.errors import UserError
+from leapjax.pretrained import Pretrained
+from leapjax.rollouts import Episodes
+
+
+class Experiment(NamedTuple):
+    """What one experiment adds to the steps that all of them share."""
+
+    name: str  # of its module, and of its file of rows
+    domain: str
+    animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
+    # (planner, run, level seeds, path): draws plans being refined and executed
+
+
+def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
+    """Runs every level and seed asked for; the exit code."""
+    arguments = program.arguments_of(arguments)
+
+    def work() -> None:
+        configs = parse(experiment.domain, arguments)
+        versions = results.versions()  # of the code that runs, whatever is committed meanwhile
+        runtime.start(configs[0].cluster)
+        console = Console(quiet=not processes.is_first())
+        with interruptible() as interruption:
+            rows = [
+                run_one(experiment, config, seed, versions, console, interruption)
+                for config in configs
+                for seed in config.seeds
+            ]
+        console.print(results.success_table(rows), results.time_table(rows))
+
+    return program.guarded(f"experiments.{experiment.name}", arguments, work)
+
+
+def run_one(
+    experiment: Experiment,
+    config: Config[Any, Any],
+    seed: int,
+    versions: dict[str, str],
+    console: Console,
+    interruption: Interruption,
+) -> results.Row:
+    """One level and one seed, from demonstrations to a row."""
+    name = configuration_hash(config, seed)
+    recorded = Path("results") / f"{experiment.name}.jsonl"
+    if config.record and not config.force:
+        known = processes.first_does(lambda: results.find(recorded, name))
+        if known is not None:
+            console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
+            return known
+    played = episode_seeds(config)
+    label = f"{experiment.name}-{config.level}-{config.method}-{config.preset}-seed{seed}-{name}"
+    folder = config.runs / ("evaluations" if config.checkpoint else "") / label
+    domain = make_domain(config)
+    this = Run(config, domain, specify(config, seed, domain), folder, console, interruption)
+    console.print(
+        f"[bold]{config.level}[/bold], {config.method}, preset {config.preset}, seed {seed}: "
+        f"{config.checkpoint or folder}"
+    )
+    # What can be refused is refused before the run has a folder.
+    if config.episodes < jax.process_count():
+        raise UserError(
+            f"--episodes {config.episodes}: fewer than the {jax.process_count()} processes"
+        )
+    metrics: run.Metrics = []
+    with contextlib.ExitStack() as stack:
+        if config.checkpoint is not None:
+            planner = run.reuse(this, config.checkpoint)
+        else:
+            mesh = run.training_mesh(config)
+            data = run.gather(this)
+            seeds.check_disjoint([d.seed for d in data], played)
+            processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
+            planner, metrics = run.fit(this, data, mesh)
+        episodes = run.measure(planner, this, played)
+        row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
+
+        def write() -> None:
+            results.record(recorded if config.record else config.runs / recorded.name, row)
+            if config.pictures:
+                run.draw(planner, this, played, metrics)
+                if experiment.animate is not None:
+                    experiment.animate(planner, this, played[:3], folder / "plan.gif")
+                console.print(f"pictures: {folder}", highlight=False)
+
+        processes.first_does(write)
+    paper = f", paper {domain.paper_score}%" if domain.paper_score is not None else ""
+    console.print(f"success {results.percent(row)}, mean length {row['mean_length']:.1f}{paper}")
+    return row
+
+
+def make_row(
+    experiment: Experiment, this: Run, name: str, planner: Pretrained, episodes: Episodes
+) -> results.Row:
+    """The JSON row of a finished run."""
+    config, lengths = this.config, episodes.lengths
+    return {
+        "experiment": experiment.name,
+        "domain": config.domain,
+        "level": config.level,
+        "method": config.method,
+        "preset": config.preset,
+        "seed": this.seed,
+        "demos": config.demos,
+        "episodes": len(episodes.seeds),
+        "first_episode_seed": int(episodes.seeds[0]),
+        "validation": config.validation,
+        "successes": int(episodes.successes.sum()),
+        "mean_return": float(episodes.returns.mean()),
+        "mean_length": float(lengths.mean()),
+        "mean_success_length": float(lengths[episodes.successes].mean())
+        if episodes.successes.any()
+        else None,
+        "horizon": config.planner.horizon,
+        "iterations": config.planner.iterations,
+        "executed": config.executed or config.planner.horizon,
+        "train_steps": 0 if config.checkpoint else config.training.steps,
+        **{f"{part}_seconds": round(value, 3) for part, value in this.seconds.items()},
+        "plans": episodes.plans,
+        "plans_per_second": episodes.plans / episodes.planning_seconds,
+        "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
+        "paper_success": this.domain.paper_score,
+        "date": results.today(),
+        "hash": name,
+        "configuration": resolved(config, this.seed),
+    }

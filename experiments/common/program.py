@@ -1,0 +1,54 @@
+"""Where a program begins and ends: a user's mistake is one line and exit code 2."""
+
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+
+import jax
+
+from experiments.common import runtime
+from experiments.common.interruption import Interrupted
+from leapjax.batching import NotANumber
+from leapjax.errors import UserError, first_line
+from leapjax.training import NonFiniteLoss
+
+
+def arguments_of(arguments: Sequence[str] | None) -> list[str]:
+    """The command line of a program: what was given, or the real one."""
+    return list(sys.argv[1:] if arguments is None else arguments)
+
+
+def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
+    """Does the work of a program; the exit code.
+
+    Args:
+        module: what `python -m` started.
+        arguments: what it was given: an interrupted program says how to continue.
+        work: all that it does.
+    """
+    try:
+        work()
+    except Interrupted as stopped:
+        command = shlex.join(["python", "-m", module, *arguments])
+        return _end(f"stopped by {stopped}; continue with: {command}", stopped.exit_code)
+    except UserError as error:
+        return _end(f"error: {error}", 2)
+    except NotANumber as error:
+        return _end(f"error: {error}", 1)
+    except NonFiniteLoss as error:
+        return _end(f"error: {error}; the last checkpoint is from before it", 1)
+    except jax.errors.JaxRuntimeError as error:
+        if not jax.distributed.is_initialized():
+            raise
+        reason = first_line(error)
+        return _end(
+            f"error: the processes of this run have lost each other ({reason}): start all of them "
+            "again, and they continue from the last checkpoint",
+            1,
+        )
+    return 0
+
+
+def _end(message: str, code: int) -> int:
+    print(message, file=sys.stderr)
+    return runtime.leave(code)

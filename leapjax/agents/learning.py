@@ -1,0 +1,212 @@
+"""What agents share: the setup they are made from, optimisation, one gradient step."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from leapjax import sharding
+from leapjax.data import windows
+from leapjax.data.windows import Steps, Window
+from leapjax.domain import Domain, check_context
+from leapjax.errors import UserError, check_at_least
+from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.types import Agent, Context, Params, PyTree, TrainState
+
+Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
+UNDECAYED = ("bias", "scale", "embedding")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig:
+    """How a network is trained. The defaults are the paper's (appendix, table 5)."""
+
+    steps: int = 1600  # 200 epochs of one window per demonstration, 500 demonstrations
+    batch: int = 64
+    learning_rate: float = 6e-4
+    warmup: int = 100  # steps of linear warm-up, then cosine decay
+    final_fraction: float = 0.1  # of the learning rate that is left at the end
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 0.1  # not on embeddings, norms and biases
+    clip: float = 1.0  # global norm of the gradient
+    windows: str = "episode"  # drawn by "episode" or by "step"
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 0, "steps")
+        check_at_least(self, 1, "batch")
+        ranges = {
+            "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
+            "warmup": (0, math.inf), "clip": (0, math.inf),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:  # false for NaN too
+                raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ValueError(f"betas must be in [0, 1), got {self.betas}")
+        if self.windows not in ("episode", "step"):
+            raise ValueError(f"unknown windows {self.windows!r}: expected episode or step")
+
+
+class Setup(NamedTuple):
+    """What every method is made from."""
+
+    domain: Domain
+    context: int  # K
+    horizon: int  # T
+    model: ModelConfig
+    training: TrainingConfig
+    settings: Any  # of the method: an instance of `Method.settings`
+
+    @property
+    def sizes(self) -> Sizes:
+        """What the model must know."""
+        domain = self.domain
+        return Sizes(domain.num_actions, self.context, self.horizon, domain.max_steps)
+
+    def encoder(self) -> nn.Module:
+        """The domain's encoder for the model's architecture.
+
+        Raises:
+            UserError: the domain has none.
+        """
+        name = self.model.architecture
+        if name not in self.domain.encoders:
+            raise UserError(
+                f"{self.domain.level} has no encoder for architecture {name!r}: "
+                f"expected one of {', '.join(self.domain.encoders)}"
+            )
+        return self.domain.encoders[name](self.model, self.context)
+
+
+class Method(NamedTuple):
+    """A way to learn and to act, as the table of methods has it."""
+
+    settings: type  # a frozen dataclass: the options that only this method has
+    make_agent: Callable[[Setup, Mesh | None], Agent]
+    # mesh: of devices to train on (see leapjax.sharding); None for one device
+    presets: Presets  # whatever the level; what that asks for is in its domain's presets
+
+
+ExampleLoss = Callable[[Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
+# (params, extra, example, key) -> loss [] and metrics
+Update = Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
+
+
+def make_update(
+    example_loss: ExampleLoss,
+    optimizer: optax.GradientTransformation,
+    mesh: Mesh | None = None,
+    next_extra: Callable[[PyTree, Params], PyTree] = lambda extra, params: extra,
+) -> Update:
+    """An agent's `update`: the loss and the metrics are means over the batch.
+
+    Args:
+        example_loss: of one example; its gradient is taken by the parameters alone.
+        optimizer: turns gradients into updates.
+        mesh: splits every batch, and the state as `sharding.parameter_specs` says; None for
+            one device.
+        next_extra: (extra, new parameters) -> the state's `extra` after the step.
+    """
+
+    def batch_loss(
+        params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        # Keys by place in the whole batch: however it is split, an example meets its own.
+        places = first + jnp.arange(jax.tree.leaves(batch)[0].shape[0])
+        keys = jax.vmap(lambda place: jax.random.fold_in(key, place))(places)
+        each = jax.vmap(example_loss, in_axes=(None, None, 0, 0))
+        losses, metrics = each(params, extra, batch, keys)
+        return losses.mean(), jax.tree.map(jnp.mean, metrics)
+
+    differentiate = jax.value_and_grad(batch_loss, has_aux=True)
+
+    def mean_gradient(params: Params, extra: PyTree, batch: PyTree, key: jax.Array) -> PyTree:
+        """((loss, metrics), gradients) of a batch."""
+        if mesh is None:
+            return differentiate(params, extra, batch, key, 0)
+        specs = sharding.parameter_specs(params, mesh)
+        extra_specs = sharding.parameter_specs(extra, mesh)
+
+        def on_each_device(parts: Params, extra: PyTree, rows: PyTree, key: jax.Array) -> PyTree:
+            first = jax.lax.axis_index(sharding.AXES) * jax.tree.leaves(rows)[0].shape[0]
+            whole = sharding.gather(parts, specs), sharding.gather(extra, extra_specs)
+            means, gradients = differentiate(*whole, rows, key, first)
+            return jax.lax.pmean(means, sharding.AXES), sharding.scatter_mean(gradients, specs)
+
+        return jax.shard_map(
+            on_each_device, mesh=mesh, check_vma=False,
+            in_specs=(specs, extra_specs, sharding.SPLIT, sharding.REPLICATED),
+            out_specs=(sharding.REPLICATED, specs),
+        )(params, extra, batch, key)  # fmt: skip
+
+    def update(
+        state: TrainState, batch: PyTree, key: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        (loss, metrics), gradients = mean_gradient(state.params, state.extra, batch, key)
+        updates, opt_state = optimizer.update(gradients, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, updates)
+        norm = optax.global_norm(gradients)
+        extra = next_extra(state.extra, params)
+        state = TrainState(params, opt_state, state.step + 1, extra)
+        if mesh is not None:  # where it was: the next step is then the same program
+            places = sharding.parameter_shardings(state, mesh)
+            state = jax.lax.with_sharding_constraint(state, places)
+        return state, {"loss": loss, **metrics, "gradient_norm": norm}
+
+    return update
+
+
+def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says."""
+    domain, training = setup.domain, setup.training
+
+    def batch(key: jax.Array, steps: Steps) -> Window:
+        window_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+        drawn = windows.sample_windows(
+            window_key, steps, training.batch, setup.context, setup.horizon,
+            domain.num_actions - 1, training.windows,
+        )  # fmt: skip
+        for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+            drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
+        return drawn
+
+    return batch
+
+
+def context_encoder(
+    encode: Callable[[Params, Context], PyTree], setup: Setup
+) -> Callable[[Params, Context], PyTree]:
+    """An energy's `encode`, which refuses contexts of other shapes while it is traced."""
+
+    def checked(params: Params, context: Context) -> PyTree:
+        check_context(context, setup.domain, setup.context)
+        return encode(params, context)
+
+    return checked
+
+
+def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
+    """AdamW with clipping, linear warm-up and cosine decay (paper, appendix, table 5)."""
+    warmup = min(config.warmup, config.steps // 10)
+    rate = optax.warmup_cosine_decay_schedule(
+        config.learning_rate / max(warmup, 1) if warmup else config.learning_rate,
+        config.learning_rate,
+        warmup,
+        max(config.steps, warmup + 1),
+        config.learning_rate * config.final_fraction,
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip),
+        optax.adamw(rate, *config.betas, weight_decay=config.weight_decay, mask=decayed_parameters),
+    )
+
+
+def decayed_parameters(params: Params) -> Params:
+    """True where weight decay applies: not on embeddings, norms and biases."""
+    return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key not in UNDECAYED, params)

@@ -1,0 +1,108 @@
+"""What a run needs of a domain: the only seam between methods and the worlds they act in.
+
+A domain is a family of levels: BabyAI's, the games of Atari, one environment of your own. A
+`Domain` describes one level of it, a `DomainType` makes them. To add a domain is to write one
+of each, in a folder of its own, and a line in `leapjax.domains`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import numpy as np
+
+from leapjax.data.windows import Window
+from leapjax.environments import Adapter
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from leapjax.types import Context, Demonstration, PyTree
+
+Augmentation = Callable[[jax.Array, Window], Window]
+# (key, window) -> window: one training example as it could have been
+
+
+class Collection(NamedTuple):
+    """Demonstrations, and what was dropped on the way to them."""
+
+    demonstrations: list[Demonstration]
+    dropped: Mapping[str, int]  # how many, by the reason
+
+
+def _nothing_to_check(observations: PyTree, where: str) -> None:
+    del observations, where
+
+
+def _no_extras(demonstration: Demonstration) -> PyTree:
+    del demonstration
+    return ()
+
+
+class Domain(NamedTuple):
+    """One level of a domain. Functions are pure, but for the first two."""
+
+    level: str  # its name
+    make_adapter: Callable[[], Adapter]
+    collect: Callable[[int, int, Callable[[int], None]], Collection]
+    # (count, training seed, progress) -> so many demonstrations; UserError if there are none
+    actions: tuple[str, ...]  # names; the last is the end action
+    max_steps: int  # of the longest episode
+    blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
+    encoders: Mapping[str, Callable[[ModelConfig, int], nn.Module]]
+    # by architecture, (model, K) -> module; see leapjax.models.trajectory
+    augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
+    extras: Callable[[Demonstration], PyTree] = _no_extras
+    # what augmentations must know of each step, [n, ...]; no model sees it
+    check: Callable[[PyTree, str], None] = _nothing_to_check
+    # (observations [n + 1, ...], where) -> UserError if a value is out of range
+    shortest_limit: int | None = None  # steps that every episode may last, if that is known
+    signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
+    paper_score: float | None = None  # the paper's result, in percent
+
+    @property
+    def num_actions(self) -> int:
+        """A, the end action included."""
+        return len(self.actions)
+
+
+class DomainType(NamedTuple):
+    """A family of levels."""
+
+    settings: type  # a frozen dataclass: options of encoder and augmentation
+    make: Callable[[str, Any], Domain]
+    # (level, settings) -> domain; UserError for an unknown level
+    levels: tuple[str, ...]  # the paper's
+    preset: Callable[[str, str], Mapping[str, Any]]
+    # (level, preset) -> options by name, whatever the method; the method's own come after
+    tuned: Callable[[str, str, str], Mapping[str, Any]] = lambda level, method, preset: {}
+    # (level, method, preset) -> options that a level changes of the method's own
+
+
+def blank_context(domain: Domain, length: int) -> Context:
+    """A context with K = `length` of the right shapes, all zeros."""
+    past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), domain.blank)
+    return Context(
+        domain.blank,
+        past,
+        np.zeros(length, np.int32),
+        np.zeros(length, np.float32),
+        np.zeros((), np.int32),
+        np.zeros((), np.float32),
+    )
+
+
+def check_context(context: Context, domain: Domain, length: int) -> None:
+    """Refuses what another network would be needed for, while a program is being traced.
+
+    Raises:
+        UserError: says what has which shape.
+    """
+    expected = jax.tree.leaves_with_path(blank_context(domain, length))
+    found = jax.tree.leaves(context)
+    for (path, leaf), given in zip(expected, found, strict=True):
+        if np.shape(given) != leaf.shape:
+            raise UserError(
+                f"the context{jax.tree_util.keystr(path)} has shape {np.shape(given)}, but this "
+                f"network was made for {leaf.shape}: use the level and the context length that "
+                "it was trained with"
+            )

@@ -1,0 +1,55 @@
+"""Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
+
+from typing import NamedTuple, Protocol
+
+import gymnasium as gym
+
+from leapjax.types import PyTree
+
+
+class Transition(NamedTuple):
+    """What one environment step gave."""
+
+    observation: PyTree
+    reward: float
+    terminated: bool
+    truncated: bool
+    success: bool  # by the environment's own measure
+
+
+class Adapter(Protocol):
+    """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
+
+    An observation is any pytree of NumPy arrays whose shapes never change.
+    """
+
+    num_actions: int  # A, the end action included
+
+    def reset(self, seed: int) -> PyTree:
+        """Starts the episode of a seed and returns its first observation."""
+        ...
+
+    def step(self, action: int) -> Transition:
+        """Takes one action."""
+        ...
+
+
+class GymnasiumAdapter:
+    """Any Gymnasium environment with discrete actions; success is a positive reward."""
+
+    def __init__(self, env: gym.Env) -> None:
+        if not isinstance(env.action_space, gym.spaces.Discrete):
+            raise ValueError(f"a Discrete action space is needed, got {env.action_space}")
+        self.env = env
+        self.num_actions = int(env.action_space.n) + 1
+        self._first_action = int(env.action_space.start)
+
+    def reset(self, seed: int) -> PyTree:
+        """Starts the episode of a seed."""
+        return self.env.reset(seed=seed)[0]
+
+    def step(self, action: int) -> Transition:
+        """Takes one action."""
+        observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
+        success = bool(terminated and float(reward) > 0)
+        return Transition(observation, float(reward), terminated, truncated, success)

@@ -1,0 +1,18 @@
+"""The table of methods: what `leapjax.load` and the experiments find by name."""
+
+from leapjax.agents.leap import LEAP
+from leapjax.agents.learning import Method
+from leapjax.errors import UserError
+
+METHODS: dict[str, Method] = {"leap": LEAP}
+
+
+def find_method(name: str) -> Method:
+    """The method of that name.
+
+    Raises:
+        UserError: there is none; names those that there are.
+    """
+    if name not in METHODS:
+        raise UserError(f"unknown method {name!r}: expected one of {', '.join(METHODS)}")
+    return METHODS[name]
