@@ -1,10 +1,11 @@
 """The table of methods: what `leapjax.load` and the experiments find by name."""
 
+from leapjax.agents.classifier import CLASSIFIER
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
 from leapjax.errors import UserError
 
-METHODS: dict[str, Method] = {"leap": LEAP}
+METHODS: dict[str, Method] = {"leap": LEAP, "classifier": CLASSIFIER}
 
 
 def find_method(name: str) -> Method:

@@ -4,17 +4,30 @@ Trained on plans some of whose actions were replaced; a plan without a replaced 
 the least energy. Planning with it works worse than with the masked language model.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import learning
-from leapjax.agents.learning import Setup
+from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.data.windows import Window
 from leapjax.domain import blank_context
 from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
 from leapjax.types import Agent, Context, Params, PyTree, TrainState
+
+PRESETS: Presets = {
+    "paper": {"architecture": "paper", "windows": "episode"},
+    "leapjax": {"architecture": "leapjax", "windows": "step", "learning_rate": 1.5e-3},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The classifier has no options of its own."""
+
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """The classifier as an `Agent`; it has no use for the transformer's settings."""
@@ -75,3 +88,6 @@ def _encode_and_judge(
 ) -> jax.Array:
     """Touches every parameter, to initialise them."""
     return module.degree(module.encode(context), actions)
+
+
+CLASSIFIER = Method(Settings, make_agent, PRESETS)
