@@ -38,6 +38,7 @@ class Setting:
 
 OURS = Setting("preset `leapjax`", "leapjax", masking="random")
 SETTINGS = (
+    Setting("random", "leapjax", "random", demos=0),
     Setting("preset `paper`", "paper", masking="one"),
     Setting("`paper`, `--masking each`", "paper", masking="each"),
     OURS,

@@ -3,9 +3,10 @@
 from leapjax.agents.classifier import CLASSIFIER
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
+from leapjax.agents.random import RANDOM
 from leapjax.errors import UserError
 
-METHODS: dict[str, Method] = {"leap": LEAP, "classifier": CLASSIFIER}
+METHODS: dict[str, Method] = {"leap": LEAP, "classifier": CLASSIFIER, "random": RANDOM}
 
 
 def find_method(name: str) -> Method:
