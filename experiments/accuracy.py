@@ -23,11 +23,11 @@ from experiments.common import program, runtime
 from experiments.common.config import check_counts
 from leapjax import pretrained
 from leapjax.data import seeds, storage, windows
-from leapjax.data.windows import Steps, Window
+from leapjax.data.windows import Steps
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.pretrained import Origin, Pretrained
-from leapjax.types import Demonstration, Energy, Params, mask_token
+from leapjax.types import Demonstration, Energy, Params, Window, mask_token
 
 TOGETHER = 64  # windows scored in one go
 

@@ -12,11 +12,10 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from leapjax.data.windows import Window
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
-from leapjax.types import Context, Demonstration, PyTree
+from leapjax.types import Context, Demonstration, PyTree, Window
 
 Augmentation = Callable[[jax.Array, Window], Window]
 # (key, window) -> window: one training example as it could have been

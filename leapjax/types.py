@@ -38,6 +38,14 @@ class Demonstration(NamedTuple):
     seed: int  # with which the environment was reset
 
 
+class Window(NamedTuple):
+    """One training example: what was done from one step of a demonstration on."""
+
+    context: Context
+    actions: Array  # [T] int32: what to predict
+    extras: PyTree  # what the domain's augmentation must know of this step; no model sees it
+
+
 class Plan(NamedTuple):
     """What a planner returns, for one context."""
 

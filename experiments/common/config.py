@@ -32,8 +32,8 @@ class Config(Generic[M, D]):
 
     method_settings: Annotated[M, tyro.conf.arg(name="")]
     domain_settings: Annotated[D, tyro.conf.arg(name="")]
-    domain: Annotated[str, tyro.conf.Suppress] = "babyai"
-    level: str = "GoToLocalS7N5"
+    domain: Annotated[str, tyro.conf.Suppress]
+    level: str
     """A level of the domain by its name or id, or "all" for those of the paper."""
     method: str = "leap"
     """How to learn and to act: a line of the table in leapjax/methods.py."""
@@ -80,15 +80,14 @@ _NOT_HASHED = (
 )  # fmt: skip
 
 
-def blank(domain: str, method: str) -> Config[Any, Any]:
+def blank(domain: str, level: str, method: str) -> Config[Any, Any]:
     """The defaults of every option, before any preset.
 
     Raises:
         UserError: an unknown domain or method.
     """
-    return Config(
-        find_method(method).settings(), find_domain(domain).settings(), domain, method=method
-    )
+    settings = find_method(method).settings(), find_domain(domain).settings()
+    return Config(*settings, domain, level, method)
 
 
 def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any]:
@@ -97,7 +96,7 @@ def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any]:
     Raises:
         UserError: an unknown domain, level, method or preset.
     """
-    config = dataclasses.replace(blank(domain, method), level=level, preset=name)
+    config = dataclasses.replace(blank(domain, level, method), preset=name)
     kind, presets = find_domain(domain), find_method(method).presets
     if name not in presets:
         raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
@@ -131,11 +130,12 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
     trained = None
     if chosen.checkpoint is not None:
         trained = pretrained.read_specification(Path(chosen.checkpoint))
-    level = chosen.level or (trained.level if trained else Config.level)
+    levels = find_domain(domain).levels
+    level = chosen.level or (trained.level if trained else levels[0])
     method = chosen.method or (trained.method if trained else Config.method)
     name = chosen.preset or (trained.origin.preset if trained else Config.preset)
     configs = []
-    for each in find_domain(domain).levels if level == "all" else [level]:
+    for each in levels if level == "all" else [level]:
         default = preset(domain, each, method, name)
         if trained and trained.method == method and trained.domain == domain:
             default = dataclasses.replace(
@@ -250,14 +250,14 @@ def resolved(config: Config[Any, Any], seed: int) -> dict[str, Any]:
 def configuration_hash(config: Config[Any, Any], seed: int) -> str:
     """Twelve hexadecimal digits that name a configuration.
 
-    They are those of domain, method, seed and what differs from the defaults alone, so that a
+    They are those of domain, level, method and what differs from the defaults alone, so that a
     setting that is added later, with what was done before as its default, changes no name.
     """
-    settings = _differences(
-        resolved(config, seed), resolved(blank(config.domain, config.method), -1)
-    )
-    named = {"domain": config.domain, "method": config.method, **settings}
-    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
+    names = {"domain": config.domain, "level": config.level, "method": config.method}
+    defaults = resolved(blank(**names), seed=-1)
+    settings = _differences(resolved(config, seed), defaults)
+    text = json.dumps({**names, **settings}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:

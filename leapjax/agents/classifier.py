@@ -12,11 +12,10 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning
 from leapjax.agents.learning import Method, Presets, Setup
-from leapjax.data.windows import Window
 from leapjax.domain import blank_context
 from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
-from leapjax.types import Agent, Context, Params, PyTree, TrainState
+from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window
 
 PRESETS: Presets = {
     "paper": {"architecture": "paper", "windows": "episode"},

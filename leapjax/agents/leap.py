@@ -9,12 +9,11 @@ from jax.sharding import Mesh
 from leapjax import schedules
 from leapjax.agents import learning
 from leapjax.agents.learning import Method, Presets, Setup
-from leapjax.data.windows import Window
 from leapjax.domain import blank_context
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
 from leapjax.models.trajectory import Model
-from leapjax.types import Agent, Context, Params, PyTree, TrainState, mask_token
+from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window, mask_token
 
 PRESETS: Presets = {
     # The appendix: one masked action per window, one window per demonstration and epoch.

@@ -13,11 +13,11 @@ from jax.sharding import Mesh
 
 from leapjax import sharding
 from leapjax.data import windows
-from leapjax.data.windows import Steps, Window
+from leapjax.data.windows import Steps
 from leapjax.domain import Domain, check_context
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.types import Agent, Context, Params, PyTree, TrainState
+from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
 UNDECAYED = ("bias", "scale", "embedding")

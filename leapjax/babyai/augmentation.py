@@ -14,9 +14,8 @@ import numpy as np
 from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
-from leapjax.data.windows import Window
 from leapjax.domain import Augmentation
-from leapjax.types import Array, Demonstration
+from leapjax.types import Array, Demonstration, Window
 
 
 class GridWords(NamedTuple):

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Array, Context, Demonstration, PyTree, pad_token
+from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
 
 
 class Steps(NamedTuple):
@@ -31,14 +31,6 @@ class Steps(NamedTuple):
     starts: Array  # [E] int32: the index of each episode's first step
     lengths: Array  # [E] int32: its number of actions
     extras: PyTree  # [M, ...] what the domain's augmentation must know; no model sees it
-
-
-class Window(NamedTuple):
-    """One training example."""
-
-    context: Context
-    actions: Array  # [T] int32: what to predict
-    extras: PyTree  # what the domain's augmentation must know
 
 
 def fingerprint(steps: PyTree) -> str:

@@ -1,0 +1,85 @@
+"""A domain that is no grid world of ours: Gymnasium's FrozenLake, in a few lines."""
+
+import dataclasses
+from collections import deque
+
+import flax.linen as nn
+import gymnasium as gym
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax.data import seeds
+from leapjax.domain import Collection, Domain, DomainType
+from leapjax.environments import GymnasiumAdapter
+from leapjax.types import Demonstration
+
+LEVEL = "FrozenLake-v1"
+CELLS, GOAL = 16, 15
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """FrozenLake has no options."""
+
+
+class Cell(nn.Module):
+    """The cell that the agent is in, as one token."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, context):
+        past = jnp.append(context.past, context.observation)
+        return nn.Embed(CELLS, self.width)(past)
+
+
+def shortest_way(transitions) -> list[int]:
+    """Actions from the first cell to the goal; `transitions` is FrozenLake's own table."""
+    ways, queue = {0: []}, deque([0])
+    while queue:
+        cell = queue.popleft()
+        for action, [(_, after, _, over)] in transitions[cell].items():
+            if after not in ways and (after == GOAL or not over):
+                ways[after] = [*ways[cell], action]
+                queue.append(after)
+    return ways[GOAL]
+
+
+def make_environment():
+    return gym.make(LEVEL, is_slippery=False)
+
+
+def collect(count, seed, progress):
+    adapter, found = GymnasiumAdapter(make_environment()), []
+    level_seeds = seeds.training_seeds(seed)
+    for done in range(count):
+        level_seed = next(level_seeds)
+        states, actions = [adapter.reset(level_seed)], shortest_way(adapter.env.unwrapped.P)
+        played = [adapter.step(action) for action in actions]
+        states += [step.observation for step in played]
+        found.append(
+            Demonstration(
+                np.array(states, np.int64), np.array(actions, np.int32),
+                np.array([step.reward for step in played], np.float32),
+                played[-1].terminated, played[-1].truncated, level_seed,
+            )
+        )  # fmt: skip
+        progress(done + 1)
+    return Collection(found, {})
+
+
+def make(level: str, settings: Settings) -> Domain:
+    return Domain(
+        level=level,
+        make_adapter=lambda: GymnasiumAdapter(make_environment()),
+        collect=collect,
+        actions=("left", "down", "right", "up", "end"),
+        max_steps=100,
+        blank=np.zeros((), np.int64),
+        encoders=dict.fromkeys(("paper", "leapjax"), lambda model, context: Cell(model.width)),
+    )
+
+
+FROZEN_LAKE = DomainType(
+    Settings, make, (LEVEL,), lambda level, preset: {"context": 1, "horizon": 4, "iterations": 4}
+)

@@ -1,0 +1,68 @@
+"""A domain of one's own goes through the same pipeline as BabyAI."""
+
+import jax
+import numpy as np
+import pytest
+
+import leapjax as leap
+from experiments.common import experiment, results
+from experiments.common.experiment import Experiment
+from leapjax import domains, methods, rollouts
+from leapjax.domain import blank_context
+from leapjax.errors import UserError
+from tests import frozen_lake
+
+LAKE = Experiment("lake", "frozen_lake")
+TOY = (
+    "--steps 600 --temperature 0 --batch 16 --demos 3 --episodes 5 --layers 1 --width 32 "
+    "--heads 2 --learning-rate 0.01 --warmup 5 --no-pictures"
+).split()
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+    monkeypatch.setitem(domains.DOMAINS, "frozen_lake", frozen_lake.FROZEN_LAKE)
+    return tmp_path
+
+
+def test_leap_learns_a_domain_of_ones_own(workplace):
+    assert experiment.main(LAKE, TOY) == 0
+    (row,) = results.read(workplace / "runs" / "lake.jsonl")
+    assert (row["domain"], row["level"]) == ("frozen_lake", frozen_lake.LEVEL)
+    assert row["successes"] == row["episodes"] == 5
+    assert row["mean_return"] == 1.0 and row["mean_length"] == 6.0  # a shortest way
+    assert row["paper_success"] is None
+    (folder,) = (path for path in (workplace / "runs").iterdir() if path.is_dir())
+    planner = leap.load(folder)
+    adapter = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings()).make_adapter()
+    history = rollouts.History(adapter.reset(0), 1, adapter.num_actions)
+    plan = planner(leap.plan_keys(0, np.zeros(1), np.zeros(1)), rollouts.stack_contexts([history]))
+    way = frozen_lake.shortest_way(adapter.env.unwrapped.P)
+    for action in plan.actions[0]:
+        assert not adapter.step(int(action)).terminated
+    assert len(way) == 6
+
+
+def test_the_floor_of_every_table(workplace):
+    arguments = "--method random --episodes 3 --no-pictures".split()
+    assert experiment.main(LAKE, arguments) == 0
+    (row,) = results.read(workplace / "runs" / "lake.jsonl")
+    assert (row["method"], row["demos"], row["train_steps"], row["params"]) == ("random", 0, 0, 0)
+
+
+def test_contexts_of_another_domain_are_refused():
+    lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
+    blank = blank_context(lake, 3)
+    assert blank.past.shape == blank.actions.shape == blank.rewards.shape == (3,)
+    with pytest.raises(UserError, match=r"context\.past has shape \(3,\), but .* \(1,\)"):
+        leap.domain.check_context(blank, lake, 1)
+    leap.domain.check_context(jax.tree.map(np.asarray, blank), lake, 3)
+
+
+def test_unknown_names_are_one_line():
+    with pytest.raises(UserError, match="unknown domain 'mars': expected one of babyai"):
+        domains.find_domain("mars")
+    with pytest.raises(UserError, match="unknown method 'bc2': expected one of leap, classifier"):
+        methods.find_method("bc2")
