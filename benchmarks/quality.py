@@ -19,12 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
-from experiments.common import runtime
+from experiments.common import program, runtime
 from leapjax import pretrained, rollouts
 from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
-from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.scores import wilson_interval
 
@@ -55,21 +54,22 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.quality", given, lambda: run(options))
+
+
+def run(options: Options) -> None:
+    """Measures every setting."""
     runtime.start()
-    try:
-        specification = pretrained.read_specification(options.run)
-        paper = levels.find_level(specification.level).iterations
-        configs = variants(specification.planner, paper)
-        rows = [measure(options, name, config) for name, config in configs.items()]
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    specification = pretrained.read_specification(options.run)
+    paper = levels.find_level(specification.level).iterations
+    configs = variants(specification.planner, paper)
+    rows = [measure(options, name, config) for name, config in configs.items()]
     Console().print(table(rows))
     write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
-    return 0
 
 
 def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:

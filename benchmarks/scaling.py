@@ -24,7 +24,7 @@ from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
 from benchmarks.training import Stepper
-from experiments.common import runtime
+from experiments.common import program, runtime
 from experiments.common.config import preset
 from experiments.common.runtime import Cluster
 from leapjax import processes, sharding
@@ -53,23 +53,23 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    options = tyro.cli(Options, args=arguments)
-    try:
-        preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
-        if options.worker:
-            runtime.connect(options.cluster)
-            row = measure(options)
-            if processes.is_first():
-                print(json.dumps(row), flush=True)
-            return 0
-        rows = [launch(arguments, *setting) for setting in SETTINGS]
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.scaling", given, lambda: run(options, given))
+
+
+def run(options: Options, arguments: list[str]) -> None:
+    """Measures every setting, or the one of this process."""
+    preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
+    if options.worker:
+        runtime.connect(options.cluster)
+        row = measure(options)
+        if processes.is_first():
+            print(json.dumps(row), flush=True)
+        return
+    rows = [launch(arguments, *setting) for setting in SETTINGS]
     Console().print(table(rows))
     write_rows(options.json, rows)
-    return 0
 
 
 def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:

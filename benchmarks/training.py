@@ -23,12 +23,11 @@ from rich.table import Table
 
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
-from experiments.common import runtime
+from experiments.common import program, runtime
 from experiments.common.config import Config, make_domain, preset, specify
 from leapjax import pretrained, sharding, training
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
-from leapjax.errors import UserError
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
@@ -51,21 +50,22 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.training", given, lambda: run(options))
+
+
+def run(options: Options) -> None:
+    """Measures every level and preset."""
     runtime.use_every_core()  # and no compilation cache: compile times are real
-    try:
-        configs = [
-            preset("babyai", level, "leap", name)
-            for level in options.levels
-            for name in options.presets
-        ]
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    configs = [
+        preset("babyai", level, "leap", name)
+        for level in options.levels
+        for name in options.presets
+    ]
     rows = [measure(config, options.seconds) for config in configs]
     Console().print(table(rows))
     write_rows(options.json, rows)
-    return 0
 
 
 class Stepper:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments.common import plots, results
+from experiments.common import plots, program, results
 from experiments.common.results import Row
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS
@@ -51,11 +51,15 @@ DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experi
 
 def main() -> int:
     """Rewrites every table, and draws what the rows say, here."""
+    return program.guarded("experiments.report", (), rewrite)
+
+
+def rewrite() -> None:
+    """Rewrites every table, and draws what the rows say, here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
     rows = results.read(Path("results") / "babyai.jsonl")
     plots.data_efficiency(efficiency_by_level(rows), Path("docs") / "data-efficiency.png")
-    return 0
 
 
 def documents(root: Path) -> dict[Path, str]:

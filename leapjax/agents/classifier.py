@@ -12,10 +12,9 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning
 from leapjax.agents.learning import Method, Presets, Setup
-from leapjax.domain import blank_context
 from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
-from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window
+from leapjax.types import Agent, Context, Params, PyTree, Window
 
 PRESETS: Presets = {
     "paper": {"architecture": "paper", "windows": "episode"},
@@ -45,12 +44,6 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
     energy = classifier(learning.context_encoder(encode, setup), degree, sizes.num_actions)
 
-    def init(key: jax.Array) -> TrainState:
-        context = jax.tree.map(jnp.asarray, blank_context(setup.domain, sizes.context))
-        actions = jnp.zeros(sizes.horizon, jnp.int32)
-        params = module.init(key, context, actions, method=_encode_and_judge)
-        return TrainState(params, optimizer.init(params), jnp.int32(0))
-
     def window_loss(
         params: Params, extra: PyTree, window: Window, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -63,6 +56,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
     update = learning.make_update(window_loss, optimizer, mesh)
+    init = learning.make_init(setup, module, _encode_and_judge, optimizer)
     return Agent(init, learning.window_batches(setup), update, energy)
 
 

@@ -9,11 +9,10 @@ from jax.sharding import Mesh
 from leapjax import schedules
 from leapjax.agents import learning
 from leapjax.agents.learning import Method, Presets, Setup
-from leapjax.domain import blank_context
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
 from leapjax.models.trajectory import Model
-from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window, mask_token
+from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token
 
 PRESETS: Presets = {
     # The appendix: one masked action per window, one window per demonstration and epoch.
@@ -66,12 +65,6 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 
-    def init(key: jax.Array) -> TrainState:
-        context = jax.tree.map(jnp.asarray, blank_context(setup.domain, sizes.context))
-        actions = jnp.full(sizes.horizon, mask, jnp.int32)
-        params = module.init(key, context, actions, method=_encode_and_score)
-        return TrainState(params, optimizer.init(params), jnp.int32(0))
-
     def window_loss(
         params: Params, extra: PyTree, window: Window, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -104,6 +97,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return -jnp.where(masks, chosen, 0).sum() / count, {"accuracy": accuracy}
 
     update = learning.make_update(window_loss, optimizer, mesh)
+    init = learning.make_init(setup, module, _encode_and_score, optimizer)
     return Agent(init, learning.window_batches(setup), update, energy)
 
 

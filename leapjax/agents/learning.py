@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from leapjax import sharding
 from leapjax.data import windows
 from leapjax.data.windows import Steps
-from leapjax.domain import Domain, check_context
+from leapjax.domain import Domain, blank_context, check_context
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window
@@ -160,6 +160,30 @@ def make_update(
         return state, {"loss": loss, **metrics, "gradient_norm": norm}
 
     return update
+
+
+def make_init(
+    setup: Setup,
+    module: nn.Module,
+    touch: Callable[..., jax.Array],
+    optimizer: optax.GradientTransformation,
+) -> Callable[[jax.Array], TrainState]:
+    """An agent's `init`: the parameters that a network has before it has seen anything.
+
+    Args:
+        setup: what the agent is made from.
+        module: the network.
+        touch: (module, context, actions `[T]`) -> anything that uses every parameter.
+        optimizer: that will train them.
+    """
+
+    def init(key: jax.Array) -> TrainState:
+        context = jax.tree.map(jnp.asarray, blank_context(setup.domain, setup.context))
+        actions = jnp.zeros(setup.horizon, jnp.int32)
+        params = module.init(key, context, actions, method=touch)
+        return TrainState(params, optimizer.init(params), jnp.int32(0))
+
+    return init
 
 
 def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
