@@ -8,7 +8,7 @@ import shutil
 import types
 import typing
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,10 +34,14 @@ class Checkpoints:
     checkpoint and never more. A checkpoint holds whole arrays, so that a run can go on with
     another number of devices or processes. Of several processes the first one reads and
     writes; all of them call every method but `close`.
+
+    A checkpoint belongs to a configuration: it holds the `identity` with which it was saved,
+    and is refused where that is another.
     """
 
-    def __init__(self, folder: Path, keep: int = 2) -> None:
+    def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
         self._folder = folder.absolute()
+        self._identity = identity
         self._keep = keep
         if processes.is_first():
             self._manager = self._open()
@@ -68,7 +72,7 @@ class Checkpoints:
 
         def write() -> None:
             with self._writing():
-                arguments = ocp.args.StandardSave(_with_digests(values._asdict()))
+                arguments = ocp.args.StandardSave(_sealed(values._asdict(), self._identity))
                 self._manager.save(int(values.step), args=arguments)
 
         processes.first_does(write)
@@ -106,10 +110,11 @@ class Checkpoints:
         while (latest := self._manager.latest_step()) is not None:
             path = self._folder / str(latest)
             try:
-                target = _with_digests(like._asdict())
+                target = _sealed(like._asdict(), self._identity)
                 _check_shapes(_saved_shapes(path), target, path)
                 arguments = ocp.args.StandardRestore(target)
-                return [TrainState(**_checked(self._manager.restore(latest, args=arguments)))]
+                restored = self._manager.restore(latest, args=arguments)
+                return [TrainState(**_opened(restored, self._identity, path))]
             except UserError:
                 raise
             except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
@@ -148,13 +153,14 @@ class Checkpoints:
             ) from None
 
 
-def restore_params(folder: Path, like: PyTree) -> PyTree:
+def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
     """The parameters of the newest readable checkpoint, with the structure of `like`.
 
     Warns of each damaged one that it skips.
 
     Raises:
-        UserError: there is none, none can be read, or its arrays have other shapes.
+        UserError: there is none, none can be read, its arrays have other shapes, or it was
+            saved with another identity.
     """
     steps = []
     if folder.is_dir():
@@ -165,8 +171,11 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
     for step in steps:
         path = folder.absolute() / str(step)
         try:
-            target = _with_digests({"params": _blank(like)})
-            found = {k: v for k, v in _saved_shapes(path).items() if "params" in k.split("/")[:2]}
+            target = _sealed({"params": _blank(like)}, identity)
+            wanted = ("params", "identity")
+            found = {
+                k: v for k, v in _saved_shapes(path).items() if set(wanted) & set(k.split("/")[:2])
+            }
             _check_shapes(found, target, path)
             arguments = ocp.checkpoint_utils.construct_restore_args(target)
             with ocp.PyTreeCheckpointer() as checkpointer:
@@ -176,7 +185,7 @@ def restore_params(folder: Path, like: PyTree) -> PyTree:
                         target, restore_args=arguments, partial_restore=True
                     ),
                 )
-            params = _checked(restored)["params"]
+            params = _opened(restored, identity, path)["params"]
         except UserError:
             raise
         except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
@@ -193,20 +202,36 @@ def _blank(like: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), like)
 
 
-def _with_digests(parts: dict[str, PyTree]) -> dict[str, PyTree]:
-    """The parts of a state, each with the SHA-256 of its arrays beside it.
+def _sealed(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
+    """The parts of a state, the SHA-256 of the arrays of each, and whose they are.
 
     The format underneath notices damage to its own structure, not to the numbers.
     """
-    return {**parts, "digests": {name: _digest(part) for name, part in parts.items()}}
+    whose = np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
+    return {
+        **parts,
+        "digests": {name: _digest(part) for name, part in parts.items()},
+        "identity": whose,
+    }
 
 
-def _checked(saved: dict[str, PyTree]) -> dict[str, PyTree]:
-    """The parts alone, if their arrays are those that were saved."""
-    parts = {name: part for name, part in saved.items() if name != "digests"}
+def _opened(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, PyTree]:
+    """The parts alone, if their arrays are those that were saved, with this identity.
+
+    Raises:
+        ValueError: they are damaged.
+        UserError: they are whole, but of another configuration.
+    """
+    parts = {name: part for name, part in saved.items() if name not in ("digests", "identity")}
     for name, part in parts.items():
         if not np.array_equal(_digest(part), saved["digests"][name]):
             raise ValueError(f"the numbers of {name} are not those that were saved")
+    if not np.array_equal(saved["identity"], _sealed({}, identity)["identity"]):
+        raise UserError(
+            f"the checkpoint {path} is of another configuration than the one beside it: it was "
+            "copied here from another run, or the specification was changed; put back what was "
+            "there, or train again in another --runs folder"
+        )
     return parts
 
 
@@ -322,3 +347,19 @@ def read_json(path: Path) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
+
+
+def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """What is not the default, part by part.
+
+    Names made from it do not change when a setting is added later, with what was done before
+    as its default.
+    """
+    found = {}
+    for name, value in values.items():
+        default = defaults.get(name)
+        if isinstance(value, dict) and isinstance(default, dict):
+            value, default = differences(value, default), {}
+        if value != default:
+            found[name] = value
+    return found

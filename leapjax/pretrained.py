@@ -23,6 +23,7 @@ from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
 CHECKPOINTS = "checkpoints"
+GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")  # of settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +86,15 @@ def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None =
     return find_method(specification.method).make_agent(setup, mesh)
 
 
+def identity(specification: Specification) -> str:
+    """What checkpoints of a run are sealed with: all of its specification but the defaults."""
+    defaults = {name: type(getattr(specification, name))() for name in GROUPS}
+    plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
+    values = dataclasses.asdict(specification)
+    changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
+    return json.dumps(values | changed, sort_keys=True)
+
+
 def save_specification(folder: Path, specification: Specification) -> None:
     """Writes the specification of a run, atomically."""
     write_text(folder / SPECIFICATION, json.dumps(dataclasses.asdict(specification), indent=1))
@@ -135,6 +145,6 @@ def load(path: str | os.PathLike[str], planner: PlannerConfig | None = None) -> 
             raise UserError(f"{folder}: trained with another {name}; train it again")
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
-    params = checkpoints.restore_params(folder / CHECKPOINTS, like)
+    params = checkpoints.restore_params(folder / CHECKPOINTS, like, identity(specification))
     plan = compile_planner(agent.energy, planner or specification.planner)
     return Pretrained(specification, agent.energy, params, plan)

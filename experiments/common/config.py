@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import tyro
 
 from experiments.common.runtime import Cluster
-from leapjax import pretrained
+from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.data import seeds
 from leapjax.domain import Domain
@@ -20,7 +20,7 @@ from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
-from leapjax.pretrained import Origin, Specification
+from leapjax.pretrained import GROUPS, Origin, Specification
 
 M = TypeVar("M")
 D = TypeVar("D")
@@ -73,7 +73,6 @@ class Config(Generic[M, D]):
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
 
 
-GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")
 # What a result does not depend on, or what its row holds on its own.
 _NOT_HASHED = (
     "seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds", "cluster",
@@ -251,23 +250,12 @@ def configuration_hash(config: Config[Any, Any], seed: int) -> str:
     """Twelve hexadecimal digits that name a configuration.
 
     They are those of domain, level, method and what differs from the defaults alone, so that a
-    setting that is added later, with what was done before as its default, changes no name.
+    setting that is added later, with what was done before as its default, changes no name. To
+    train and to play a checkpoint again are two things.
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
     defaults = resolved(blank(**names), seed=-1)
-    settings = _differences(resolved(config, seed), defaults)
-    text = json.dumps({**names, **settings}, sort_keys=True)
+    settings = checkpoints.differences(resolved(config, seed), defaults)
+    again = {"evaluation": True} if config.checkpoint is not None else {}
+    text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """What is not the default, part by part."""
-    found = {}
-    for name, value in values.items():
-        default = defaults[name]
-        if isinstance(value, dict):
-            value = _differences(value, default)
-            default = {}
-        if value != default:
-            found[name] = value
-    return found

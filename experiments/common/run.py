@@ -96,7 +96,7 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
     agent = pretrained.make_agent(run.specification, run.domain, mesh)
     state, key = training.make_begin(agent, mesh)(run.seed)
     steps = sharding.replicate(examples, mesh)
-    saved = Checkpoints(folder / pretrained.CHECKPOINTS)
+    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
     metrics: Metrics = []
     if restored is not None:

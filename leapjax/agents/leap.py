@@ -19,7 +19,7 @@ PRESETS: Presets = {
     "paper": {
         "architecture": "paper", "dropout": 0.1, "masking": "one", "windows": "episode",
     },
-    # Ours, chosen on validation levels (docs/experiments.md). A little noise leads out of plans
+    # Ours, chosen on validation levels (docs/tried.md). A little noise leads out of plans
     # that lead nowhere.
     "leapjax": {
         "architecture": "leapjax", "dropout": 0.0, "masking": "random", "windows": "step",

@@ -32,7 +32,7 @@ class Settings:
 def preset(name: str, preset: str) -> Mapping[str, Any]:
     """What a preset sets for a level, whatever the method: options by name.
 
-    Chosen on validation levels (docs/experiments.md).
+    Chosen on validation levels (docs/tried.md).
 
     Raises:
         UserError: an unknown level.
