@@ -18,8 +18,11 @@ class NotANumber(ValueError):
     """An energy that was minimised is NaN somewhere; `plan` is what came of it all the same."""
 
     def __init__(self, message: str, plan: Plan) -> None:
-        super().__init__(message)
+        super().__init__(message, plan)
         self.plan = plan  # of NumPy arrays; `plan.valid` says which rows can be trusted
+
+    def __str__(self) -> str:
+        return self.args[0]
 
 
 class CompiledPlanner:
@@ -39,6 +42,7 @@ class CompiledPlanner:
         if not self.chunk_sizes or self.chunk_sizes[0] < 1:
             raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
         planner = bind(energy, config)
+        self.num_actions = energy.num_actions
 
         def plan_rows(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
             keys = jax.random.wrap_key_data(key_data, impl=kind)
@@ -67,6 +71,12 @@ class CompiledPlanner:
             ValueError: no contexts, or not as many as keys.
             NotANumber: the energy of some action was NaN.
         """
+        typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
+        if keys.ndim != (1 if typed else 2):
+            raise ValueError(
+                f"keys of shape {keys.shape}: expected one for each context, as "
+                "jax.random.split(key, B) makes them"
+            )
         batch = keys.shape[0]
         if batch == 0:
             raise ValueError("no contexts to plan for")
@@ -76,9 +86,14 @@ class CompiledPlanner:
                     f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
                     f"dimension must be the number of keys, {batch}"
                 )
+            if not isinstance(leaf, jax.Array) and np.asarray(leaf).dtype.kind not in "biuf":
+                raise ValueError(
+                    f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
+                    "numbers: encode it first"
+                )
         # Cut with NumPy: each slice of a device array would be a program of its own.
         kind = str(jax.config.jax_default_prng_impl)  # type: ignore[attr-defined]
-        if jnp.issubdtype(keys.dtype, jax.dtypes.prng_key):
+        if typed:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
         inputs = jax.tree.map(np.asarray, (keys, contexts))
         chunks = split_batch(batch, self.chunk_sizes)
@@ -97,9 +112,9 @@ class CompiledPlanner:
         plan = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
         if not plan.valid.all():
             raise NotANumber(
-                f"the energy is NaN for {np.sum(~plan.valid)} of {batch} contexts (the first is "
-                f"context {np.argmin(plan.valid)}): look at the parameters, and at logits that "
-                "are +inf or all -inf",
+                f"the energy is NaN or -inf for {np.sum(~plan.valid)} of {batch} contexts (the "
+                f"first is context {np.argmin(plan.valid)}): look at the parameters, and at logits "
+                "that are +inf or all -inf",
                 plan,
             )
         return plan

@@ -23,6 +23,7 @@ from leapjax.errors import UserError, first_line
 from leapjax.files import read_text
 from leapjax.types import PyTree, TrainState
 
+UNUSABLE = ("[", "*", "?", ":/")  # in a path: Orbax takes them for patterns and for addresses
 ITEM = "default"  # Orbax's name for the only thing that a checkpoint of ours holds
 T = TypeVar("T")
 
@@ -40,6 +41,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
+        check_path(folder)
         self._folder = folder.absolute()
         self._identity = identity
         self._keep = keep
@@ -153,6 +155,20 @@ class Checkpoints:
             ) from None
 
 
+def check_path(folder: Path) -> None:
+    """Refuses a folder in which checkpoints would not be found again.
+
+    Raises:
+        UserError: says why.
+    """
+    found = [text for text in UNUSABLE if text in str(folder.absolute())]
+    if found:
+        raise UserError(
+            f"{folder.absolute()} cannot hold checkpoints, because of {found[0]!r} in its name: "
+            "choose another folder"
+        )
+
+
 def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
     """The parameters of the newest readable checkpoint, with the structure of `like`.
 
@@ -162,6 +178,7 @@ def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
         UserError: there is none, none can be read, its arrays have other shapes, or it was
             saved with another identity.
     """
+    check_path(folder)
     steps = []
     if folder.is_dir():
         steps = sorted((int(p.name) for p in folder.iterdir() if p.name.isdecimal()), reverse=True)

@@ -40,13 +40,15 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
-        _check_query(actions, positions, num_actions)
+        actions, positions = _check_query(actions, positions, num_actions)
         tokens = actions.at[positions].set(mask)
         scores = logits(params, memory, tokens, positions)
         chex.assert_shape(scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = jnp.asarray(actions)
+
         def term(position: jax.Array) -> jax.Array:
             energies = conditional(params, memory, actions, position[None])[0]
             return energies[jnp.minimum(actions[position], num_actions - 1)]
@@ -70,13 +72,15 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """
 
     def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-        energy = _check_total(total(params, memory, actions))
-        return _infinite_if_incomplete(energy, actions, num_actions)
+        energy = jnp.asarray(total(params, memory, actions), jnp.float32)
+        if energy.shape:
+            raise ValueError(f"a total must be one number, got shape {energy.shape}")
+        return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
-        _check_query(actions, positions, num_actions)
+        actions, positions = _check_query(actions, positions, num_actions)
         energies = _try_every_action(
             lambda plan: guarded_total(params, memory, plan), actions, positions, num_actions
         )
@@ -107,7 +111,7 @@ def single_action(
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
-        _check_query(actions, positions, num_actions)
+        actions, positions = _check_query(actions, positions, num_actions)
         _check_single(actions)
         return _check_energies(energies(params, memory)[None], positions)
 
@@ -204,8 +208,8 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
 
     Args:
         energy: the energy to constrain.
-        penalty: (context, actions `[T]`) -> `[]`: 0 where the plan is allowed, positive
-            (+inf for never) where it is not.
+        penalty: (context, actions `[T]`) -> `[]`: 0 or less where the plan is allowed,
+            positive (+inf for never) where it is not.
     """
 
     def encode(params: Params, context: PyTree) -> PyTree:
@@ -237,7 +241,9 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
-        return energy.violation(params, inner, actions) + penalty(context, actions)
+        # What one penalty allows, even rewards, makes no other violation good.
+        mine = jnp.maximum(penalty(context, actions), 0.0)
+        return energy.violation(params, inner, actions) + mine
 
     return energy._replace(encode=encode, conditional=conditional, total=total, violation=violation)
 
@@ -263,7 +269,11 @@ def _try_every_action(
     return jax.vmap(over_actions, in_axes=(0, None))(positions, choices)
 
 
-def _check_query(actions: jax.Array, positions: jax.Array, num_actions: int) -> None:
+def _check_query(
+    actions: jax.Array, positions: jax.Array, num_actions: int
+) -> tuple[jax.Array, jax.Array]:
+    """Both as JAX's arrays."""
+    actions, positions = jnp.asarray(actions), jnp.asarray(positions)
     chex.assert_rank([actions, positions], 1)
     for name, values, end in (
         ("positions", positions, actions.shape[0]),
@@ -276,6 +286,7 @@ def _check_query(actions: jax.Array, positions: jax.Array, num_actions: int) -> 
             what = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
             expected = what if name == "actions" else f"0 .. {end - 1}, the horizon is {end}"
             raise ValueError(f"{name} {np.asarray(values)} are not all in {expected}")
+    return actions, positions
 
 
 def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:

@@ -46,7 +46,13 @@ class GymnasiumAdapter:
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed."""
-        return self.env.reset(seed=seed)[0]
+        found = self.env.reset(seed=seed)
+        if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], dict)):
+            raise TypeError(
+                f"reset of {self.env} returned {type(found).__name__}, not (observation, info): "
+                "it is of Gym's old interface; wrap it for Gymnasium"
+            )
+        return found[0]
 
     def step(self, action: int) -> Transition:
         """Takes one action."""

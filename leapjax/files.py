@@ -26,7 +26,7 @@ def read_text(path: Path) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file so that a reader sees all of it or the one before.
+    """Writes a file so that a reader sees all of it or the one before, after a power loss too.
 
     Raises:
         UserError: it cannot be written, for example because the disk is full.
@@ -34,12 +34,27 @@ def write_text(path: Path, text: str) -> None:
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        scratch.write_text(text, encoding="utf-8")
+        with scratch.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         scratch.replace(path)
+        flush_folder(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             scratch.unlink(missing_ok=True)
         raise UserError(f"cannot write {path}: {first_line(error)}") from None
+
+
+def flush_folder(folder: Path) -> None:
+    """Makes renames in a folder outlive a power loss, where the system has a way to."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from leapjax.errors import check_at_least
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
+HOTTEST = 1e30  # so that noise times temperature is a number
 ORDERS = ("random", "sequential")
 
 
@@ -36,8 +37,8 @@ class GibbsConfig:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
-        if not 0 <= self.temperature < float("inf"):
-            raise ValueError(f"a temperature must be finite and at least 0, got {self.temperature}")
+        if not 0 <= self.temperature <= HOTTEST:  # false for NaN too
+            raise ValueError(f"a temperature must be in 0 .. {HOTTEST}, got {self.temperature}")
         if self.order not in ORDERS:
             raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
 
@@ -71,6 +72,11 @@ class CrossEntropyConfig:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
 
 
+def undefined(energies: jax.Array) -> jax.Array:
+    """Where an energy means nothing: NaN, or -inf, against which nothing can be weighed."""
+    return jnp.isnan(energies) | jnp.isneginf(energies)
+
+
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig
 
 
@@ -94,14 +100,14 @@ def gibbs(
         energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
         best = jnp.argmin(energies)
         actions, trace, least = plans[best], traces[best], energies[best]
-        valid = jnp.all(valids) & ~jnp.any(jnp.isnan(energies))
+        valid = jnp.all(valids) & ~jnp.any(undefined(energies))
     plan = Plan(actions, trace, energy.violation(params, memory, actions) <= 0, valid)
     if config.score:
         least = energy.total(params, memory, actions) if least is None else least
-        plan = plan._replace(energy=least, valid=plan.valid & ~jnp.isnan(least))
+        plan = plan._replace(energy=least, valid=plan.valid & ~undefined(least))
     if config.score_trace:
         scores = jax.vmap(lambda a: energy.total(params, memory, a))(trace)
-        plan = plan._replace(trace_energies=scores, valid=plan.valid & ~jnp.any(jnp.isnan(scores)))
+        plan = plan._replace(trace_energies=scores, valid=plan.valid & ~jnp.any(undefined(scores)))
     return plan
 
 
@@ -129,7 +135,7 @@ def _gibbs_chain(
         # (and 0 for MASK, which is the number of actions).
         hopeless = jnp.all(jnp.isinf(energies), axis=-1)
         drawn = jnp.where(hopeless, tokens[where] % energy.num_actions, drawn)
-        return tokens.at[where].set(drawn), ~jnp.any(jnp.isnan(energies))
+        return tokens.at[where].set(drawn), ~jnp.any(undefined(energies))
 
     if energy.accepts_mask:
         blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
@@ -173,7 +179,7 @@ def random_shooting(
         plans[best],
         plans[best][None],
         energy.violation(params, memory, plans[best]) <= 0,
-        ~jnp.any(jnp.isnan(energies)),
+        ~jnp.any(undefined(energies)),
     )
     return plan._replace(energy=energies[best]) if config.score else plan
 
@@ -208,12 +214,12 @@ def cross_entropy_method(
         if config.keep_elites:
             children = children.at[: config.elites].set(parents)
         energies = score(children)
-        return (children, energies), (children[jnp.argmin(energies)], jnp.isnan(energies).any())
+        return (children, energies), (children[jnp.argmin(energies)], undefined(energies).any())
 
     first_key, loop_key = jax.random.split(key)
     plans = jax.random.randint(first_key, (count, horizon), 0, energy.num_actions)
     energies = score(plans)
-    first, first_invalid = plans[jnp.argmin(energies)], jnp.isnan(energies).any()
+    first, first_invalid = plans[jnp.argmin(energies)], undefined(energies).any()
     keys = jax.random.split(loop_key, config.iterations)[1:]
     (plans, energies), (later, invalid) = jax.lax.scan(breed, (plans, energies), keys)
     best = jnp.argmin(energies)

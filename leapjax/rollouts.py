@@ -57,7 +57,12 @@ class History:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
             self._rewards = [*self._rewards, reward][-self._length :]
-        self.current = _copy(observation)
+        before, self.current = self.current, _copy(observation)
+        if jax.tree.map(np.shape, before) != jax.tree.map(np.shape, self.current):
+            raise ValueError(
+                f"an observation of other shapes than the one before: "
+                f"{jax.tree.map(np.shape, self.current)}, not {jax.tree.map(np.shape, before)}"
+            )
         self.step += 1
         self.return_so_far += reward
 
@@ -77,6 +82,20 @@ class History:
             step=np.array(self.step, np.int32),
             return_so_far=np.array(self.return_so_far, np.float32),
         )
+
+
+def _check_adapters(adapters: Sequence[Adapter], plan: CompiledPlanner) -> None:
+    """Refuses, once, what would give wrong episodes without a word."""
+    if not adapters:
+        raise ValueError("no seeds: there is no episode to play")
+    if len({id(adapter) for adapter in adapters}) < len(adapters):
+        raise ValueError("make_adapter returned the same environment twice: make a new one")
+    for adapter in adapters:
+        if adapter.num_actions != plan.num_actions:
+            raise ValueError(
+                f"the planner has {plan.num_actions} actions and the environment "
+                f"{adapter.num_actions}, the end action included in both"
+            )
 
 
 def _copy(observation: PyTree) -> PyTree:
@@ -100,6 +119,7 @@ def evaluate(
     seed: int = 0,
     executed: int | None = None,
     iteration: int | None = None,
+    max_steps: int | None = None,
     progress: Callable[[int, int], None] = lambda over, succeeded: None,
 ) -> Episodes:
     """Plays one episode per level seed, all in lockstep, replanning when a plan is used up.
@@ -117,16 +137,21 @@ def evaluate(
         seed: of the planner's randomness.
         executed: actions to execute before replanning; None for all T.
         iteration: execute the plan as it stood after this many iterations; None: the last.
+        max_steps: cut an episode off after so many; None: only the environment ends it.
         progress: called with (episodes over, successes) after every round.
 
     Raises:
-        ValueError: nothing to execute, or an iteration that there is not.
+        ValueError: nothing to play or to execute, an iteration that there is not, environments
+            that are one and the same, or that have other actions than the planner, or
+            observations that are not all of one shape.
     """
-    if executed is not None and executed < 1:
-        raise ValueError(f"executed must be at least 1, got {executed}")
+    for name, value in {"executed": executed, "max_steps": max_steps}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
     begun = time.perf_counter()
     adapters = [make_adapter() for _ in seeds]
-    end = adapters[0].num_actions - 1
+    _check_adapters(adapters, plan)
+    end = plan.num_actions - 1
     histories = [
         History(adapter.reset(int(s)), context, end + 1)
         for adapter, s in zip(adapters, seeds, strict=True)
@@ -153,7 +178,8 @@ def evaluate(
                     break
                 transition = adapters[episode].step(int(action))
                 histories[episode].advance(int(action), transition.observation, transition.reward)
-                over = transition.terminated or transition.truncated
+                too_long = max_steps is not None and histories[episode].step >= max_steps
+                over = transition.terminated or transition.truncated or too_long
                 if over:
                     successes[episode] = transition.success
                     break

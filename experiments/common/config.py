@@ -183,6 +183,7 @@ def check(config: Config[Any, Any]) -> None:
     if config.context < 0:
         raise UserError(f"--context must be at least 0, got {config.context}")
     check_executed(config.executed, config.planner.horizon)
+    checkpoints.check_path(config.runs)
     domain = make_domain(config)
     limit = domain.shortest_limit
     if limit is not None and config.planner.horizon > limit:

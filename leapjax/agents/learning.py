@@ -210,7 +210,7 @@ def context_encoder(
 
     def checked(params: Params, context: Context) -> PyTree:
         check_context(context, setup.domain, setup.context)
-        return encode(params, context)
+        return encode(params, jax.tree.map(jnp.asarray, context))
 
     return checked
 

@@ -17,8 +17,25 @@ from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
+MOST_LOOKS = 200  # at its subgoals, before a bot that has not chosen an action never will
 FAILED = "failed"  # the bot gave up, crashed or ran out of time
 OTHER_GOAL = "ended at another match than the nearest"
+
+
+class Undecided(Exception):
+    """The bot goes from subgoal to subgoal without an action."""
+
+
+class _Subgoals(list):
+    """A bot's stack of subgoals. MiniGrid's bot looks at its top until one gives an action."""
+
+    looks = 0
+
+    def __getitem__(self, index):  # noqa: ANN001, ANN204
+        self.looks += 1
+        if self.looks > MOST_LOOKS:
+            raise Undecided
+        return super().__getitem__(index)
 
 
 class FullViewBot(BabyAIBot):
@@ -95,7 +112,7 @@ def collect(
     dropped = Counter({FAILED: 0, OTHER_GOAL: 0})
     level_seeds = seeds.training_seeds(seed)
     while len(found) < count:
-        if dropped.total() > 100 + 10 * count:
+        if dropped.total() > 100 + 10 * len(found):
             raise UserError(
                 f"{dropped.total()} of {dropped.total() + len(found)} demonstrations of "
                 f"{level.name} were dropped: the bot cannot solve this level"
@@ -111,9 +128,11 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
     """One episode of the bot; None, counted in `dropped`, where it is no use."""
     states, actions, rewards = [adapter.reset(seed)], [], []
     bot = make_bot(adapter.env)
+    bot.stack = _Subgoals(bot.stack)
     action, success, terminated, truncated = None, False, False, False
     try:
         while not (terminated or truncated):
+            bot.stack.looks = 0
             action = int(bot.replan(action))
             if action == END:  # `done`: the bot believes the mission over, and it is not
                 break
