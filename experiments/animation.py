@@ -9,7 +9,7 @@ from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from PIL import Image, ImageDraw
 
 from experiments.common.run import Run
-from leapjax import rollouts
+from leapjax import files, rollouts
 from leapjax.babyai import levels
 from leapjax.babyai.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.babyai.levels import Level
@@ -33,9 +33,11 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
         for frame, duration in episode_frames(planner, level, level_seed, run.seed):
             frames.append(frame)
             durations.append(duration)
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True
-    )
+    with files.whole(path) as scratch:
+        frames[0].save(
+            scratch, save_all=True, append_images=frames[1:], duration=durations, loop=0,
+            optimize=True,
+        )  # fmt: skip
 
 
 def episode_frames(

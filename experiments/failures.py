@@ -23,14 +23,14 @@ from rich.table import Table
 from experiments import animation
 from experiments.common import program, runtime
 from experiments.common.config import check_executed
-from leapjax import pretrained, rollouts
+from leapjax import files, pretrained, rollouts
 from leapjax.babyai import levels, observations
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.levels import Level
 from leapjax.babyai.observations import Cell, Observation
 from leapjax.data import seeds
 from leapjax.environments import Transition
-from leapjax.errors import UserError, first_line
+from leapjax.errors import UserError
 
 FEW_CELLS = 6  # that an agent which goes in circles stays within
 COLUMNS = 4  # of the gallery
@@ -239,10 +239,8 @@ def draw(failed: Sequence[Recorder], path: Path) -> None:
     sheet = Image.new("RGB", (width * columns, height * -(-len(pictures) // columns)), "white")
     for index, picture in enumerate(pictures):
         sheet.paste(picture, (width * (index % columns), height * (index // columns)))
-    try:
-        sheet.save(path)
-    except (OSError, ValueError) as error:  # ValueError: a suffix that names no format
-        raise UserError(f"cannot draw {path}: {first_line(error)}") from None
+    with files.whole(path) as scratch:
+        sheet.save(scratch)
 
 
 if __name__ == "__main__":

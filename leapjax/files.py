@@ -26,31 +26,44 @@ def read_text(path: Path) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file so that a reader sees all of it or the one before, after a power loss too.
+    """Writes a file so that a reader sees all of it or the one before.
 
     Raises:
         UserError: it cannot be written, for example because the disk is full.
     """
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    with whole(path) as scratch:
+        scratch.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Gives a path to write to; what was written is at `path` afterwards, or nothing is.
+
+    It is on the disk then, whatever happens to the power.
+
+    Raises:
+        UserError: it cannot be written, for example because the disk is full.
+    """
+    # The same suffix: what writes pictures goes by it.
+    scratch = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with scratch.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        yield scratch
+        flush(scratch)
         scratch.replace(path)
-        flush_folder(path.parent)
-    except OSError as error:
+        flush(path.parent)
+    except (OSError, ValueError) as error:  # ValueError: a suffix that names no kind of picture
+        raise UserError(f"cannot write {path}: {first_line(error)}") from None
+    finally:
         with contextlib.suppress(OSError):
             scratch.unlink(missing_ok=True)
-        raise UserError(f"cannot write {path}: {first_line(error)}") from None
 
 
-def flush_folder(folder: Path) -> None:
-    """Makes renames in a folder outlive a power loss, where the system has a way to."""
-    if not hasattr(os, "O_DIRECTORY"):  # Windows
+def flush(path: Path) -> None:
+    """Waits until a file, or what a folder says of its files, is on the disk."""
+    if path.is_dir() and not hasattr(os, "O_DIRECTORY"):  # Windows has no way to
         return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -1,23 +1,30 @@
 import json
 import shutil
+import warnings
+from concurrent import futures
+from pathlib import Path
 
 import gymnasium as gym
 import h5py
+import jax
 import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_storage import MinariStorage
 
+from leapjax.babyai import levels, observations
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.observations import Observation
+from leapjax.babyai.settings import Settings
 from leapjax.data import storage
-from leapjax.data.demonstrations import Collection, Demonstration
-from leapjax.envs import levels
+from leapjax.domain import Collection, Domain
 from leapjax.errors import UserError
-from leapjax.types import Observation
-from tests.oracles import assert_same_observation
+from leapjax.types import Demonstration
 
-LEVEL = levels.find_level("GoToLocalS7N5")
-SIDE = 7
+LEVEL = BABYAI.make("GoToLocalS7N5", Settings())
+SIDE, WORDS = 7, 5
 NAME = "leapjax/GoToLocalS7N5/test-v1"
 
 
@@ -25,10 +32,14 @@ def file_of(folder, name: str = NAME):
     return folder / name / "data" / "main_data.hdf5"
 
 
-def refused(name: str = NAME, level=LEVEL, side: int = SIDE) -> str:
+def save(demonstrations: list[Demonstration], name: str = NAME, domain: Domain = LEVEL) -> None:
+    storage.save(name, Collection(demonstrations, {}), domain, "for a test")
+
+
+def refused(name: str = NAME, domain: Domain = LEVEL) -> str:
     """The one line with which a data set is refused."""
     with pytest.raises(UserError) as raised:
-        storage.load(name, level, side)
+        storage.load(name, domain)
     message = str(raised.value)
     assert message and "\n" not in message
     assert name in message
@@ -38,21 +49,35 @@ def refused(name: str = NAME, level=LEVEL, side: int = SIDE) -> str:
 def assert_same(loaded: list[Demonstration], expected: list[Demonstration]) -> None:
     assert len(loaded) == len(expected)
     for a, b in zip(loaded, expected, strict=True):
-        assert_same_observation(a.observations, b.observations)
-        np.testing.assert_array_equal(a.actions, b.actions)
-        assert a.seed == b.seed
-        types = [x.dtype for x in (*a.observations, a.actions)]
-        assert types == [x.dtype for x in (*b.observations, b.actions)]
+        assert jax.tree.structure(a) == jax.tree.structure(b)
+        jax.tree.map(np.testing.assert_array_equal, a, b)
+        arrays = [jax.tree.leaves((d.observations, d.actions, d.rewards)) for d in (a, b)]
+        assert [x.dtype for x in arrays[0]] == [x.dtype for x in arrays[1]]
 
 
 @pytest.fixture
 def saved(local_demonstrations) -> list[Demonstration]:
-    storage.save(NAME, Collection(local_demonstrations), "for a test")
+    save(local_demonstrations)
     return local_demonstrations
 
 
 def test_what_is_saved_is_loaded(saved):
-    assert_same(storage.load(NAME, LEVEL, SIDE), saved)
+    assert_same(storage.load(NAME, LEVEL), saved)
+
+
+def test_rewards_and_how_an_episode_ended_are_what_they_were(local_demonstrations):
+    rng = np.random.default_rng(0)
+    endings = [(True, False), (False, True), (True, True), (False, False)]
+    changed = [
+        d._replace(
+            rewards=rng.normal(size=len(d.actions)).astype(np.float32),
+            terminated=terminated,
+            truncated=truncated,
+        )
+        for d, (terminated, truncated) in zip(local_demonstrations, endings, strict=False)
+    ]
+    save(changed)
+    assert_same(storage.load(NAME, LEVEL), changed)
 
 
 def test_minari_itself_can_read_it(saved):
@@ -61,7 +86,8 @@ def test_minari_itself_can_read_it(saved):
     assert dataset.total_episodes == len(saved)
     assert dataset.total_steps == sum(len(d.actions) for d in saved)
     for episode, demonstration in zip(dataset.iterate_episodes(), saved, strict=True):
-        assert episode.rewards.sum() == episode.rewards[-1] == 1.0
+        np.testing.assert_array_equal(episode.rewards, demonstration.rewards)
+        assert 0 < episode.rewards[-1] <= 1 and not episode.rewards[:-1].any()
         assert episode.terminations[-1] and not episode.terminations[:-1].any()
         np.testing.assert_array_equal(episode.actions, demonstration.actions)
         assert dataset.observation_space.contains(
@@ -80,64 +106,162 @@ def test_grids_of_any_size_are_stored_without_loss():
             np.zeros((steps + 1, 3), np.int32),
             np.zeros((steps + 1, 2), np.int32),
             np.full((steps + 1, 2), -1, np.int32),
-            np.ones((steps + 1, LEVEL.words), np.int32),
+            np.ones((steps + 1, WORDS), np.int32),
         ),
         np.zeros(steps, np.int32),
+        np.zeros(steps, np.float32),
+        terminated=False,
+        truncated=True,
         seed=7,
     )
-    storage.save(NAME, Collection([demonstration]), "large")
-    assert_same(storage.load(NAME, LEVEL, side), [demonstration])
+    large = LEVEL._replace(blank=observations.blank(side, WORDS))
+    save([demonstration], domain=large)
+    assert_same(storage.load(NAME, large), [demonstration])
+
+
+def domain_of(blank) -> Domain:
+    """A world of one's own, whose observations look like `blank`."""
+
+    def nothing(*arguments):
+        raise NotImplementedError
+
+    return Domain("Own", nothing, nothing, ("left", "right", "end"), 9, blank, {})
+
+
+ARRAY = np.zeros(4, np.float32)
+FIELDS = {"place": np.zeros((2, 3), np.float32), "lamps": np.zeros(2, np.uint8)}
+NESTED = {"own": {"count": np.zeros((), np.int32)}, "picture": np.zeros((40, 40, 3), np.uint8)}
+
+
+def own_demonstration(blank) -> Demonstration:
+    rng = np.random.default_rng(0)
+    states = jax.tree.map(lambda x: (100 * rng.random((4, *x.shape))).astype(x.dtype), blank)
+    rewards = rng.normal(size=3).astype(np.float32)
+    return Demonstration(states, np.array([0, 1, 1], np.int32), rewards, True, False, seed=3)
+
+
+@pytest.mark.parametrize("blank", [ARRAY, FIELDS, NESTED], ids=["array", "fields", "nested"])
+def test_observations_of_any_world(blank):
+    demonstrations = [own_demonstration(blank)] * 2
+    save(demonstrations, domain=domain_of(blank))
+    assert_same(storage.load(NAME, domain_of(blank)), demonstrations)
+
+
+def test_observations_of_another_world_are_refused(minari_folder):
+    save([own_demonstration(ARRAY)], domain=domain_of(ARRAY))
+    assert "no observation 'place'" in refused(domain=domain_of(FIELDS))
+    assert "observations has shape (4, 4)" in refused(domain=domain_of(np.zeros(5, np.float32)))
+    assert "must be integers" in refused(domain=domain_of(np.zeros(4, np.int32)))
+    replace(file_of(minari_folder), "episode_0", "observations", np.full((4, 4), np.nan))
+    assert "not finite" in refused(domain=domain_of(ARRAY))
+    save([own_demonstration(FIELDS)], domain=domain_of(FIELDS))
+    assert "must be numbers" in refused(domain=domain_of(ARRAY))
+    replace(file_of(minari_folder), "episode_0", "observations/lamps", np.full((4, 2), 256))
+    assert "do not fit uint8" in refused(domain=domain_of(FIELDS))
+
+
+def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
+    name = "leapjax/GoToLocalS7N5/bot-5-seed0-v1"
+    assert storage.dataset_id(LEVEL, 5, 0) == name.replace("v1", "v2")
+    save(saved, name)
+    assert "earlier version" in refused(name)
+    save(saved, name.replace("v1", "v2"))
+    assert_same(storage.load(name.replace("v1", "v2"), LEVEL), saved)
 
 
 def test_saving_again_replaces(saved):
-    storage.save(NAME, Collection(saved[3:]), "fewer")
-    assert_same(storage.load(NAME, LEVEL, SIDE), saved[3:])
+    save(saved[3:])
+    assert_same(storage.load(NAME, LEVEL), saved[3:])
 
 
 def test_data_sets_live_side_by_side(saved):
-    storage.save("leapjax/GoToLocalS7N5/other-v1", Collection(saved[:2]), "another")
-    assert_same(storage.load(NAME, LEVEL, SIDE), saved)
-    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL, SIDE), saved[:2])
+    save(saved[:2], "leapjax/GoToLocalS7N5/other-v1")
+    assert_same(storage.load(NAME, LEVEL), saved)
+    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL), saved[:2])
 
 
 class Killed(BaseException):
     """What a program that dies in the middle is to its callers."""
 
 
-@pytest.mark.parametrize("moment", ["minari", "rename"])
+@pytest.mark.parametrize("moment", ["writing", "renaming"])
 def test_a_killed_save_leaves_nothing_under_the_name(
     moment, local_demonstrations, monkeypatch, minari_folder
 ):
-    written = minari.create_dataset_from_buffers
-
-    def die(*args, **kwargs):
-        if moment == "minari":
-            written(*args, **kwargs)
-        raise Killed
-
     with monkeypatch.context() as patch:
-        if moment == "minari":
-            patch.setattr(minari, "create_dataset_from_buffers", die)
+        if moment == "writing":
+            patch.setattr(MinariStorage, "update_metadata", die)
         else:
-            patch.setattr(storage, "_rename_id", die)
+            patch.setattr(Path, "rename", die)
         with pytest.raises(Killed):
-            storage.save(NAME, Collection(local_demonstrations), "killed")
-    assert any(minari_folder.rglob("main_data.hdf5"))  # the scratch folder is left behind
+            save(local_demonstrations)
+    assert any(minari_folder.glob(f"{storage.SCRATCH}*"))  # what a killed program leaves behind
     assert not storage.exists(NAME)
     assert "no Minari data set" in refused()
-    storage.save(NAME, Collection(local_demonstrations), "again")
-    assert_same(storage.load(NAME, LEVEL, SIDE), local_demonstrations)
-    assert list(minari.list_local_datasets()) == [NAME]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Minari warns of what is no data set
+        assert list(minari.list_local_datasets()) == []
+        save(local_demonstrations)
+        assert list(minari.list_local_datasets()) == [NAME]
+    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert not any(minari_folder.glob(f"{storage.SCRATCH}*"))
+
+
+def die(*args, **kwargs):
+    raise Killed
 
 
 def test_a_killed_save_leaves_what_was_there(saved, monkeypatch):
-    def die(*args):
-        raise Killed
+    with monkeypatch.context() as patch:
+        patch.setattr(MinariStorage, "update_metadata", die)
+        with pytest.raises(Killed):
+            save(saved[:1])
+    assert_same(storage.load(NAME, LEVEL), saved)
 
-    monkeypatch.setattr(storage, "_rename_id", die)
-    with pytest.raises(Killed):
-        storage.save(NAME, Collection(saved[:1]), "killed")
-    assert_same(storage.load(NAME, LEVEL, SIDE), saved)
+
+def test_several_processes_make_the_same_data_set(local_demonstrations, minari_folder):
+    """Threads with one process id, as processes in containers have, on an empty folder."""
+    with futures.ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(save, local_demonstrations) for _ in range(4)]
+        for job in jobs:
+            job.result()
+    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert sorted(path.name for path in minari_folder.iterdir()) == [
+        storage.LOCK,
+        "leapjax",
+    ]
+
+
+def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
+    monkeypatch.setattr(storage, "SPARE_BYTES", 2**60)
+    with pytest.raises(UserError, match=r"\d+ MiB are free in .* MINARI_DATASETS_PATH"):
+        save(local_demonstrations)
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(storage, "SPARE_BYTES", 0)
+    monkeypatch.setattr(MinariStorage, "update_metadata", full)
+    with pytest.raises(UserError, match="cannot write the data set .*No space left on device"):
+        save(local_demonstrations)
+    assert not storage.exists(NAME)
+
+
+@pytest.mark.parametrize("kind", ["a file", "empty", "below a file"])
+def test_a_folder_of_data_sets_that_cannot_be(kind, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    path = {"a file": tmp_path / "file", "empty": "", "below a file": tmp_path / "file" / "sets"}
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(path[kind]))
+    with pytest.raises(UserError, match="MINARI_DATASETS_PATH"):
+        storage.exists(NAME)
+
+
+def test_a_folder_of_data_sets_that_is_relative(local_demonstrations, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", "sets")
+    save(local_demonstrations)
+    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert (tmp_path / "sets" / NAME).is_dir()
 
 
 def test_exists():
@@ -193,7 +317,7 @@ def test_a_missing_episode(saved, minari_folder):
     assert "cannot be read" in refused()
 
 
-@pytest.mark.parametrize("field", ["observations", "actions", "observations/goal"])
+@pytest.mark.parametrize("field", ["observations", "actions", "rewards", "observations/goal"])
 def test_a_missing_part_of_an_episode(saved, minari_folder, field):
     with h5py.File(file_of(minari_folder), "r+") as file:
         del file["episode_2"][field]
@@ -208,12 +332,15 @@ def test_no_episodes(saved, minari_folder):
 
 
 def test_another_level(saved):
-    assert "instruction has shape" in refused(level=levels.find_level("PickUpLoc"))
+    assert "level PickUpLoc needs" in refused(domain=BABYAI.make("PickUpLoc", Settings()))
 
 
-@pytest.mark.parametrize("side", [6, 8])
-def test_another_side(saved, side):
-    assert "grid has shape" in refused(side=side)
+@pytest.mark.parametrize(
+    ("side", "words", "field"), [(6, WORDS, "grid"), (8, WORDS, "grid"), (SIDE, 9, "instruction")]
+)
+def test_another_shape(saved, side, words, field):
+    other = LEVEL._replace(blank=observations.blank(side, words))
+    assert f"{field} has shape" in refused(domain=other)
 
 
 @pytest.mark.parametrize(
@@ -265,6 +392,20 @@ def test_an_episode_without_actions(saved, minari_folder):
     assert "no actions" in refused()
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_rewards_that_are_not_finite(saved, minari_folder, bad):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        file["episode_1"]["rewards"][0] = bad
+    message = refused()
+    assert "rewards that are not finite" in message and "episode 1" in message
+
+
+def test_rewards_of_another_length(saved, minari_folder):
+    rewards = np.append(saved[2].rewards, 1.0)
+    replace(file_of(minari_folder), "episode_2", "rewards", rewards)
+    assert "rewards have shape" in refused()
+
+
 def test_actions_of_64_bits_do_not_wrap_around(saved, minari_folder):
     actions = saved[0].actions.astype(np.int64) + 2**32
     replace(file_of(minari_folder), "episode_0", "actions", actions)
@@ -280,7 +421,7 @@ def other_data_set(observation_space, observations, action_space, actions, **epi
                 id=0,
                 observations=observations,
                 actions=actions,
-                rewards=[0.0] * steps,
+                rewards=[float(reward) for reward in range(steps)],
                 terminations=[False] * steps,
                 truncations=[False] * (steps - 1) + [True],
                 **episode,
@@ -322,18 +463,23 @@ def test_a_data_set_of_minigrids_own_observations():
 def test_a_users_data_set_without_seeds(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     other_data_set(
-        storage.observation_space(SIDE, LEVEL.words),
+        storage.observation_space(LEVEL.blank),
         demonstration.observations._asdict(),
         gym.spaces.Discrete(6),
         list(demonstration.actions),
     )
-    expected = demonstration._replace(seed=storage.UNKNOWN_SEED)
-    assert_same(storage.load(NAME, LEVEL, SIDE), [expected])
+    expected = demonstration._replace(
+        rewards=np.arange(len(demonstration.actions), dtype=np.float32),
+        terminated=False,
+        truncated=True,
+        seed=storage.UNKNOWN_SEED,
+    )
+    assert_same(storage.load(NAME, LEVEL), [expected])
 
 
 def test_fields_of_text_instead_of_numbers(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(SIDE, LEVEL.words)
+    space = storage.observation_space(LEVEL.blank)
     space["instruction"] = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
     states = demonstration.observations._asdict()
     states["instruction"] = ["go to the red ball"] * len(states["pose"])
@@ -345,7 +491,7 @@ def test_continuous_actions(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     steps = len(demonstration.actions)
     other_data_set(
-        storage.observation_space(SIDE, LEVEL.words),
+        storage.observation_space(LEVEL.blank),
         demonstration.observations._asdict(),
         gym.spaces.Box(0, 1, (2,), np.float32),
         list(np.full((steps, 2), 0.5, np.float32)),
@@ -355,7 +501,7 @@ def test_continuous_actions(local_demonstrations):
 
 def test_numbers_that_wrap_around_are_out_of_range(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(SIDE, LEVEL.words)
+    space = storage.observation_space(LEVEL.blank)
     space["grid"] = gym.spaces.Box(0, 1000, (SIDE, SIDE, 3), np.int32)
     states = demonstration.observations._asdict()
     states["grid"] = states["grid"].astype(np.int32) + 256
@@ -365,7 +511,7 @@ def test_numbers_that_wrap_around_are_out_of_range(local_demonstrations):
 
 def test_numbers_that_are_not_whole(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(SIDE, LEVEL.words)
+    space = storage.observation_space(LEVEL.blank)
     space["grid"] = gym.spaces.Box(0, 1, (SIDE, SIDE, 3), np.float32)
     states = demonstration.observations._asdict()
     states["grid"] = states["grid"] / np.float32(255)  # scaled, as pictures often are
@@ -375,7 +521,7 @@ def test_numbers_that_are_not_whole(local_demonstrations):
 
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
-    ids = [storage.dataset_id(level, 500, 0) for level in known]
+    ids = [storage.dataset_id(LEVEL._replace(level=level.name), 500, 0) for level in known]
     shared = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
     assert not shared
 

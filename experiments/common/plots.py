@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.common.results import Row
-from leapjax import scores
+from leapjax import files, scores
 
 
 def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
@@ -87,5 +87,8 @@ def data_efficiency(rows_by_level: Mapping[str, Mapping[int, Sequence[Row]]], pa
 
 
 def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    try:
+        with files.whole(path) as scratch:
+            figure.savefig(scratch, dpi=120)
+    finally:
+        plt.close(figure)

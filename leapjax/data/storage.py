@@ -10,7 +10,7 @@ import math
 import os
 import re
 import shutil
-import warnings
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,17 @@ import jax
 import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
+from leapjax import files
 from leapjax.domain import Collection, Domain
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
+SPARE_BYTES = 2**24  # that must be free on the disk beside what is written
+SCRATCH, LOCK = ".leapjax-unfinished-", ".leapjax-lock"  # hidden: Minari passes them over
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
 FORMAT = 2  # raised whenever what a demonstration holds changes: old caches are then unused
 
@@ -66,30 +70,83 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
         )
         for index, demonstration in enumerate(collection.demonstrations)
     ]
-    final = get_dataset_path(name)
-    final.parent.mkdir(parents=True, exist_ok=True)
-    # Minari writes in place, under an id: write under a temporary id, then rename.
-    scratch = f"leapjax/unfinished-{os.getpid()}-v0"
-    shutil.rmtree(get_dataset_path(scratch), ignore_errors=True)
-    with warnings.catch_warnings():
-        # Minari would have an author's e-mail and an environment that Gymnasium can make.
-        warnings.simplefilter("ignore", UserWarning)
-        minari.create_dataset_from_buffers(
-            dataset_id=scratch,
-            buffer=buffers,
-            action_space=gym.spaces.Discrete(domain.num_actions - 1),
-            observation_space=observation_space(domain.blank),
-            algorithm_name="a demonstrator",
-            author="leapjax",
-            code_permalink="https://github.com/Farama-Foundation/Minari",
-            description=description,
-            jpeg_encoding=False,  # grids are symbols, not pictures
+    root = datasets_folder()
+    try:
+        with files.only_process_in(root / LOCK, wait=True):
+            _check_room(root, collection)
+            for left_over in root.glob(f"{SCRATCH}*"):  # by a program that was killed
+                shutil.rmtree(left_over, ignore_errors=True)
+            # Minari lists no hidden folders: nothing is a data set before it is whole.
+            scratch = Path(tempfile.mkdtemp(prefix=SCRATCH, dir=root))
+            whole, final = scratch / "whole", get_dataset_path(name)
+            _write(whole, buffers, domain, {"dataset_id": name, "description": description})
+            final.parent.mkdir(parents=True, exist_ok=True)
+            if final.exists():
+                final.rename(scratch / "before")
+            whole.rename(final)
+            files.flush(final.parent)
+            shutil.rmtree(scratch, ignore_errors=True)
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
+        raise UserError(
+            f"cannot write the data set {name!r} to {root} ({first_line(error)}): make room, or "
+            "name another folder in MINARI_DATASETS_PATH"
+        ) from None
+
+
+def datasets_folder() -> Path:
+    """Minari's folder of data sets, made if it is not there.
+
+    Raises:
+        UserError: it cannot be made, or is no folder.
+    """
+    chosen = os.environ.get("MINARI_DATASETS_PATH")
+    if chosen == "":
+        raise UserError("MINARI_DATASETS_PATH is empty: name a folder in it, or unset it")
+    try:
+        return get_dataset_path().absolute()
+    except OSError as error:
+        raise UserError(
+            f"no folder for data sets at {chosen or Path.home()} ({first_line(error)}): name "
+            "another in MINARI_DATASETS_PATH"
+        ) from None
+
+
+def _check_room(root: Path, collection: Collection) -> None:
+    """HDF5 may crash, not fail, where the disk fills up: look before."""
+    arrays = jax.tree.leaves([d.observations for d in collection.demonstrations])
+    needed = SPARE_BYTES + sum(array.nbytes for array in arrays) // 4  # they compress well
+    free = shutil.disk_usage(root).free
+    if free < needed:
+        raise UserError(
+            f"{free >> 20} MiB are free in {root}, and the data set may need {needed >> 20}: make "
+            "room, or name another folder in MINARI_DATASETS_PATH"
         )
-    path = get_dataset_path(scratch)
-    _rename_id(path, scratch, name)
-    if final.exists():
-        shutil.rmtree(final)
-    path.rename(final)
+
+
+def _write(
+    folder: Path, buffers: list[EpisodeBuffer], domain: Domain, details: dict[str, str]
+) -> None:
+    """A data set in a new folder."""
+    folder.mkdir()
+    storage = MinariStorage.new(
+        folder / "data",
+        observation_space=observation_space(domain.blank),
+        action_space=gym.spaces.Discrete(domain.num_actions - 1),
+        jpeg_encoding=False,  # grids are symbols, not pictures
+    )
+    storage.update_metadata(
+        {
+            "minari_version": minari.__version__,
+            "algorithm_name": "a demonstrator",
+            "author": {"leapjax"},
+            **details,
+        }
+    )
+    storage.update_episodes(buffers)
+    for path in [*(folder / "data").iterdir(), folder / "data", folder]:
+        files.flush(path)
 
 
 def _stored(observations: PyTree) -> Any:
@@ -108,9 +165,9 @@ def load(name: str, domain: Domain) -> list[Demonstration]:
     Raises:
         UserError: missing, damaged, empty, or not of this domain's observations.
     """
-    if not get_dataset_path(name).exists():
+    if not exists(name):
         raise UserError(
-            f"no Minari data set {name!r} in {get_dataset_path()}: "
+            f"no Minari data set {name!r} in {datasets_folder()}: "
             "check the id with `minari list local`"
         )
     version = re.fullmatch(r"leapjax/.*/bot-.*-v(\d+)", name)
@@ -278,12 +335,6 @@ def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
     return narrow
 
 
-def _rename_id(path: Path, old: str, new: str) -> None:
-    """Minari keeps the id inside the data set too."""
-    metadata = path / "data" / "metadata.json"
-    metadata.write_text(metadata.read_text().replace(old, new))
-
-
 def exists(name: str) -> bool:
     """Whether a data set of that id is in the local Minari folder."""
-    return get_dataset_path(name).exists()
+    return (datasets_folder() / name).exists()
