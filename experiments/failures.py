@@ -118,7 +118,7 @@ def report(options: Options) -> None:
     if failed and options.drawn > 0:
         path = options.gallery or options.runs[0] / "failures.png"
         draw(failed[: options.drawn], path)
-        console.print(f"gallery: {path}", highlight=False)
+        console.print(f"gallery: {path}", highlight=False, markup=False)
 
 
 def only_level(runs: Sequence[Path], executed: int | None) -> Level:

@@ -18,9 +18,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 import tensorstore
 
-from leapjax import processes, sharding
+from leapjax import files, processes, sharding
 from leapjax.errors import UserError, first_line
-from leapjax.files import read_text
 from leapjax.types import PyTree, TrainState
 
 UNUSABLE = ("[", "*", "?", ":/")  # in a path: Orbax takes them for patterns and for addresses
@@ -51,7 +50,10 @@ class Checkpoints:
     def _open(self) -> ocp.CheckpointManager:
         alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0})
         # Orbax makes no folders for some processes only.
-        self._folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"cannot write to {self._folder}: {first_line(error)}") from None
         options = ocp.CheckpointManagerOptions(
             max_to_keep=self._keep, cleanup_tmp_directories=True, create=False,
             multiprocessing_options=alone,
@@ -73,6 +75,8 @@ class Checkpoints:
         values = jax.tree.map(np.array, sharding.to_host(state))
 
         def write() -> None:
+            # Where the disk fills up meanwhile Orbax says so on every thread, with tracebacks.
+            files.check_room(self._folder, sum(x.nbytes for x in jax.tree.leaves(values)))
             with self._writing():
                 arguments = ocp.args.StandardSave(_sealed(values._asdict(), self._identity))
                 self._manager.save(int(values.step), args=arguments)
@@ -359,7 +363,7 @@ def read_json(path: Path) -> Any:
     Raises:
         UserError: it is missing or is not JSON.
     """
-    text = read_text(path)
+    text = files.read_text(path)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

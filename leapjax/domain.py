@@ -96,8 +96,14 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
     Raises:
         UserError: says what has which shape.
     """
-    expected = jax.tree.leaves_with_path(blank_context(domain, length))
-    found = jax.tree.leaves(context)
+    blank = blank_context(domain, length)
+    structures = [str(jax.tree.structure(tree)) for tree in (context, blank)]
+    if structures[0] != structures[1]:
+        raise UserError(
+            f"a context of structure {structures[0]}, but this network was made for "
+            f"{structures[1]}: use the level that it was trained with"
+        )
+    expected, found = jax.tree.leaves_with_path(blank), jax.tree.leaves(context)
     for (path, leaf), given in zip(expected, found, strict=True):
         if np.shape(given) != leaf.shape:
             raise UserError(

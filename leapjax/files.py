@@ -2,10 +2,13 @@
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from leapjax.errors import UserError, first_line
+
+SPARE = 2**23  # bytes that are left free on every disk
 
 try:
     import fcntl
@@ -68,6 +71,24 @@ def flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_room(folder: Path, needed: int) -> None:
+    """Refuses to begin what the disk has no room for: other libraries may crash there.
+
+    Args:
+        folder: to be written to.
+        needed: bytes, at most; as many again as `SPARE` must be free.
+
+    Raises:
+        UserError: says how much is free, and how much would be needed.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < needed + SPARE:
+        raise UserError(
+            f"{free >> 20} MiB are free in {folder}, and {(needed + SPARE) >> 20} may be needed: "
+            "make room, or use another folder"
+        )
 
 
 @contextlib.contextmanager

@@ -4,17 +4,19 @@ import argparse
 import dataclasses
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
+import jax
 import tyro
 
 from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.data import seeds
-from leapjax.domain import Domain
+from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
 from leapjax.methods import find_method
@@ -193,6 +195,34 @@ def check(config: Config[Any, Any]) -> None:
         )
     # An agent costs nothing to make, and says what its method cannot do.
     pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
+    check_memory(config, domain)
+
+
+def check_memory(config: Config[Any, Any], domain: Domain) -> None:
+    """Refuses what would need more memory than the machine has, by what it needs at least.
+
+    Raises:
+        UserError: says which options ask for it.
+    """
+    if not hasattr(os, "sysconf"):  # Windows does not say
+        return
+    model, search = config.model, config.planner
+    context = jax.tree.leaves(blank_context(domain, config.context))
+    drawn = search.resampled * domain.num_actions + search.horizon
+    needs = {
+        # Noise and trace of a chunk of 128 plans, in 4 bytes each.
+        "--iterations, --restarts": 4 * 128 * search.restarts * search.iterations * drawn,
+        "--batch, --context": config.training.batch * sum(leaf.nbytes for leaf in context),
+        # Parameters of the transformer, their gradients and Adam's two moments.
+        "--width, --layers": 4 * 4 * 12 * model.layers * model.width**2,
+    }
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for options, needed in needs.items():
+        if needed > memory:
+            raise UserError(
+                f"{options}: at least {needed >> 30} GiB of memory would be needed, and this "
+                f"machine has {memory >> 30}"
+            )
 
 
 def make_domain(config: Config[Any, Any]) -> Domain:

@@ -45,13 +45,21 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
         versions = results.versions()  # of the code that runs, whatever is committed meanwhile
         runtime.start(configs[0].cluster)
         console = Console(quiet=not processes.is_first())
+        rows, failure = [], None
         with interruptible() as interruption:
-            rows = [
-                run_one(experiment, config, seed, versions, console, interruption)
-                for config in configs
-                for seed in config.seeds
-            ]
-        console.print(results.success_table(rows), results.time_table(rows))
+            runs = [(config, seed) for config in configs for seed in config.seeds]
+            for config, seed in runs:
+                try:
+                    rows.append(run_one(experiment, config, seed, versions, console, interruption))
+                except program.FAILURES as error:
+                    if len(runs) > 1:  # the others can still be run
+                        line = f"{config.level}, seed {seed}, failed: {error}"
+                        console.print(line, markup=False)
+                    failure = failure or error
+        if rows:
+            console.print(results.success_table(rows), results.time_table(rows))
+        if failure is not None:
+            raise failure
 
     return program.guarded(f"experiments.{experiment.name}", arguments, work)
 
@@ -67,20 +75,21 @@ def run_one(
     """One level and one seed, from demonstrations to a row."""
     name = configuration_hash(config, seed)
     recorded = Path("results") / f"{experiment.name}.jsonl"
-    if config.record and not config.force:
-        known = processes.first_does(lambda: results.find(recorded, name))
-        if known is not None:
-            console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
-            return known
+    # Read even where nothing is looked for: a damaged file is better found now than after the run.
+    rows = recorded if config.record else config.runs / recorded.name
+    known = processes.first_does(lambda: results.find(rows, name))
+    if config.record and not config.force and known is not None:
+        console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
+        return known
     played = episode_seeds(config)
     label = f"{experiment.name}-{config.level}-{config.method}-{config.preset}-seed{seed}-{name}"
     folder = config.runs / ("evaluations" if config.checkpoint else "") / label
     domain = make_domain(config)
     this = Run(config, domain, specify(config, seed, domain), folder, console, interruption)
     console.print(
-        f"[bold]{config.level}[/bold], {config.method}, preset {config.preset}, seed {seed}: "
-        f"{config.checkpoint or folder}"
-    )
+        f"{config.level}, {config.method}, preset {config.preset}, seed {seed}: "
+        f"{config.checkpoint or folder}", markup=False,
+    )  # fmt: skip
     # What can be refused is refused before the run has a folder.
     if config.episodes < jax.process_count():
         raise UserError(
@@ -100,12 +109,12 @@ def run_one(
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
 
         def write() -> None:
-            results.record(recorded if config.record else config.runs / recorded.name, row)
+            results.record(rows, row)
             if config.pictures:
                 run.draw(planner, this, played, metrics)
                 if experiment.animate is not None:
                     experiment.animate(planner, this, played[:3], folder / "plan.gif")
-                console.print(f"pictures: {folder}", highlight=False)
+                console.print(f"pictures: {folder}", highlight=False, markup=False)
 
         processes.first_does(write)
     paper = f", paper {domain.paper_score}%" if domain.paper_score is not None else ""

@@ -12,6 +12,8 @@ from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
 from leapjax.training import NonFiniteLoss
 
+FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can be said in one line
+
 
 def arguments_of(arguments: Sequence[str] | None) -> list[str]:
     """The command line of a program: what was given, or the real one."""

@@ -25,6 +25,9 @@ FIELDS = {
 }  # fmt: skip
 
 
+LARGEST = 1e18
+
+
 def read(path: Path) -> list[Row]:
     """The rows of a file; none if there is no file.
 
@@ -57,10 +60,12 @@ def _what_is_wrong(row: Any) -> str | None:
         return f"a row without {', '.join(missing)}"
     optional = {} if row.get("paper_success") is None else {"paper_success": float}
     for name, kind in {**FIELDS, **optional}.items():
-        value = row[name]
+        value: Any = row[name]
         expected = (int, float) if kind is float else kind
         if not isinstance(value, expected) or isinstance(value, bool):
             return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
+        if not isinstance(value, str) and not abs(value) < LARGEST:  # NaN too
+            return f"{name} is {str(value)[:20]}: no number that a run could give"
     if not 0 <= row["successes"] <= row["episodes"] or row["episodes"] < 1:
         return f"{row['successes']} successes of {row['episodes']} episodes"
     return None

@@ -96,6 +96,8 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
     agent = pretrained.make_agent(run.specification, run.domain, mesh)
     state, key = training.make_begin(agent, mesh)(run.seed)
     steps = sharding.replicate(examples, mesh)
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
+    processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
     metrics: Metrics = []

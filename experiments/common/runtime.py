@@ -55,11 +55,14 @@ def start(cluster: Cluster = Cluster()) -> None:
     """Every program's first step, before JAX has touched a device.
 
     Raises:
-        UserError: the other processes cannot be reached.
+        UserError: the other processes cannot be reached, or JAX is set to compute in 64 bits.
     """
-    # Of a damaged checkpoint many parts fail at once. We say so in one line; asyncio would log
-    # each of them that nobody asked for, with its traceback.
-    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise UserError("leapjax computes in 32 bits: unset JAX_ENABLE_X64")
+    # Of a damaged checkpoint, or on a full disk, many parts fail at once. We say so in one line;
+    # asyncio and Orbax would log each of them that nobody asked for, with its traceback.
+    for name in ("asyncio", "absl"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     use_every_core()
     use_compilation_cache()
     connect(cluster)
@@ -71,7 +74,7 @@ def connect(cluster: Cluster) -> None:
     Raises:
         UserError: they cannot be reached.
     """
-    launched = any(int(os.environ.get(name, "1")) > 1 for name in LAUNCHED)
+    launched = any(_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
     if cluster.coordinator is None and not launched:
         return
     try:
@@ -84,6 +87,11 @@ def connect(cluster: Cluster) -> None:
             f"cannot join the other processes of this run ({first_line(error)}): check that all "
             "were started, and that process 0 can be reached at --coordinator"
         ) from None
+
+
+def _count(text: str) -> int:
+    """A number of processes; 1 where nothing, or no number, is said."""
+    return int(text) if text.strip().isdecimal() else 1
 
 
 def leave(code: int) -> int:

@@ -29,7 +29,6 @@ from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
-SPARE_BYTES = 2**24  # that must be free on the disk beside what is written
 SCRATCH, LOCK = ".leapjax-unfinished-", ".leapjax-lock"  # hidden: Minari passes them over
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
 FORMAT = 2  # raised whenever what a demonstration holds changes: old caches are then unused
@@ -73,7 +72,8 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
     root = datasets_folder()
     try:
         with files.only_process_in(root / LOCK, wait=True):
-            _check_room(root, collection)
+            arrays = jax.tree.leaves([d.observations for d in collection.demonstrations])
+            files.check_room(root, sum(x.nbytes for x in arrays) // 4)  # they compress well
             for left_over in root.glob(f"{SCRATCH}*"):  # by a program that was killed
                 shutil.rmtree(left_over, ignore_errors=True)
             # Minari lists no hidden folders: nothing is a data set before it is whole.
@@ -111,18 +111,6 @@ def datasets_folder() -> Path:
             f"no folder for data sets at {chosen or Path.home()} ({first_line(error)}): name "
             "another in MINARI_DATASETS_PATH"
         ) from None
-
-
-def _check_room(root: Path, collection: Collection) -> None:
-    """HDF5 may crash, not fail, where the disk fills up: look before."""
-    arrays = jax.tree.leaves([d.observations for d in collection.demonstrations])
-    needed = SPARE_BYTES + sum(array.nbytes for array in arrays) // 4  # they compress well
-    free = shutil.disk_usage(root).free
-    if free < needed:
-        raise UserError(
-            f"{free >> 20} MiB are free in {root}, and the data set may need {needed >> 20}: make "
-            "room, or name another folder in MINARI_DATASETS_PATH"
-        )
 
 
 def _write(
@@ -283,9 +271,7 @@ def _rewards(values: Any, where: str, steps: int) -> np.ndarray:
     rewards = _numbers(np.zeros((), np.float32), values, f"{where}: rewards")
     if rewards.shape != (steps,):
         raise UserError(f"{where}: rewards have shape {rewards.shape}, expected ({steps},)")
-    if not np.isfinite(rewards).all():
-        raise UserError(f"{where}: rewards that are not finite numbers")
-    return rewards.astype(np.float32)
+    return _narrowed(np.zeros((), np.float32), rewards, f"{where}: rewards")
 
 
 def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") -> PyTree:
@@ -331,7 +317,7 @@ def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
         narrow = array.astype(blank.dtype)
     whole = np.issubdtype(blank.dtype, np.integer)
     if not (np.array_equal(narrow, array) if whole else np.isfinite(narrow).all()):
-        raise UserError(f"{where}: observations that do not fit {blank.dtype}, or are not finite")
+        raise UserError(f"{where}: numbers that do not fit {blank.dtype}, or are not finite")
     return narrow
 
 
