@@ -15,9 +15,8 @@ import jax
 import pytest
 
 from experiments import babyai
-from leapjax.data import demonstrations
-from leapjax.data.demonstrations import Demonstration
-from leapjax.envs import levels
+from leapjax.babyai import demonstrations, levels
+from leapjax.types import Demonstration
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +32,7 @@ def local_demonstrations() -> list[Demonstration]:
     """Five demonstrations of GoToLocalS7N5; not to be changed."""
     level = levels.find_level("GoToLocalS7N5")
     collected = demonstrations.collect(level, 5, seed=0).demonstrations
-    for leaf in jax.tree.leaves([(d.observations, d.actions) for d in collected]):
+    for leaf in jax.tree.leaves([(d.observations, d.actions, d.rewards) for d in collected]):
         leaf.setflags(write=False)
     return collected
 

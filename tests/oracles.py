@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from leapjax.types import Observation
+from leapjax.babyai.observations import Observation
 
 
 def slow_path_lengths(

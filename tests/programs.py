@@ -1,4 +1,4 @@
-"""The real program in processes of its own, at toy size: started, watched, compared."""
+"""The real program at toy size: what it leaves behind; processes of its own, watched, compared."""
 
 import os
 import subprocess
@@ -7,27 +7,64 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import results
-from leapjax import checkpoints
+from experiments.common import config, experiment, results
+from experiments.common.experiment import Experiment
+from leapjax import checkpoints, domains, pretrained
+from leapjax.checkpoints import Checkpoints
+from leapjax.files import only_process_in
+from leapjax.types import TrainState
+from tests.frozen_lake import FROZEN_LAKE
 
 ROOT = Path(__file__).parent.parent
 LONG = os.environ.get("LEAPJAX_TEST_LONG") == "1"  # `make test-long`: minutes to an hour
 only_long = pytest.mark.skipif(not LONG, reason="make test-long runs it")
-COMMAND = (
-    "-m experiments.babyai --demos 6 --episodes 3 --batch 4 --width 16 --heads 2 --layers 1 "
-    "--channels 4 --rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures "
-    "--checkpoint-seconds 0.1"
-).split()
+
+SMALL = "--episodes 3 --batch 4 --width 16 --heads 2 --layers 1 --iterations 2 --no-pictures".split()
+TOY = [*SMALL, *"--demos 6 --channels 4 --rounds 1 --fields 2 --sweeps 2".split()]
+RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
+
+# What processes of their own run. The short form is of another domain, which compiles in a third
+# of the time; nothing that happens to a process depends on the domain.
+LAKE = Experiment("lake", "frozen_lake")
+NAME, COMMAND = (
+    ("babyai", ["-m", "experiments.babyai", *TOY])
+    if LONG
+    else (LAKE.name, ["-m", "tests.programs", *SMALL, "--demos", "6"])
+)
+STEPS = 200
+
+
+def main():
+    """An experiment in FrozenLake: `python -m tests.programs`."""
+    domains.DOMAINS[LAKE.domain] = FROZEN_LAKE
+    return experiment.main(LAKE)
+
+
+def untrained_run(folder, *options):
+    """The folder of a run that has learned nothing: nothing is compiled for it."""
+    (chosen,) = config.parse("babyai", [*TOY, *options])
+    domain = config.make_domain(chosen)
+    specification = config.specify(chosen, chosen.seeds[0], domain)
+    pretrained.save_specification(folder, specification)
+    agent = pretrained.make_agent(specification, domain)
+    shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda x: rng.normal(0, 0.1, x.shape).astype(x.dtype), shapes)
+    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(specification))
+    saved.save(TrainState(params, (), jnp.int32(0)))
+    saved.close()
+    return folder
 
 
 class Place:
     """A folder to run in, with its own data sets and compilation cache."""
 
-    def __init__(self, folder, steps):
-        self.folder, self.steps = folder, steps
+    def __init__(self, folder):
+        self.folder = folder
 
     def start(self, runs, *options, devices=2):
         """Starts a run whose results go to the folder `runs`."""
@@ -38,8 +75,9 @@ class Place:
             "LEAPJAX_COMPILATION_CACHE": str(self.folder / "cache"),
             "JAX_NUM_CPU_DEVICES": str(devices),
         }
+        often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
         return subprocess.Popen(
-            [sys.executable, *COMMAND, "--steps", str(self.steps), "--runs", runs, *options],
+            [sys.executable, *COMMAND, *often, "--runs", runs, *options],
             cwd=self.folder, env=environment, text=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
@@ -56,25 +94,44 @@ class Place:
     def wait_for_checkpoint(self, run, runs, after=0):
         """Until there is a checkpoint later than a step, and training goes on."""
         deadline = time.monotonic() + 120
-        while not any(after < step < self.steps for step in self.steps_saved(runs)):
+        while not any(after < step < STEPS for step in self.steps_saved(runs)):
             assert run.poll() is None, f"the run ended too soon: {run.stderr.read()}"
             assert time.monotonic() < deadline
             time.sleep(0.005)
 
+    def rows(self, runs):
+        """What the runs in a folder have reported."""
+        return results.read(self.folder / runs / f"{NAME}.jsonl")
+
     def parameters(self, runs):
         """The final parameters of the only run in a folder."""
-        (path,) = (self.folder / runs).glob(f"*/checkpoints/{self.steps}/default")
+        (path,) = (self.folder / runs).glob(f"*/checkpoints/{STEPS}/default")
         with checkpoints.ocp.PyTreeCheckpointer() as checkpointer:
             return checkpointer.restore(path.absolute())["params"]
 
-    def check_same_end(self, runs, tolerance=0.0, expected="whole"):
-        """A run ended exactly as another one, or nearly, and left one row."""
+    def check_same_end(self, runs, tolerance=0.0):
+        """A run ended exactly as the one that nothing happened to, or nearly, with one row."""
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance),
             self.parameters(runs),
-            self.parameters(expected),
+            self.parameters("whole"),
         )
-        (row,) = results.read(self.folder / runs / "babyai.jsonl")
-        (other,) = results.read(self.folder / expected / "babyai.jsonl")
+        (row,), (other,) = self.rows(runs), self.rows("whole")
         for name in ("hash", "successes", "mean_length", "plans"):
             assert row[name] == other[name]
+
+
+def place_with_a_run(tmp_path_factory):
+    """A place where a run on two devices has ended: the same for all tests of a session."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    place = Place(folder / "programs")
+    with only_process_in(place.folder, wait=True):
+        if not place.rows("whole"):
+            place.finish(place.start("whole"))
+    return place
+
+
+if __name__ == "__main__":
+    sys.exit(main())

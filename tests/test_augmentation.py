@@ -9,10 +9,10 @@ import pytest
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.core.grid import Grid
 
-from leapjax.data import augmentation, demonstrations, windows
-from leapjax.envs import levels, vocabulary
-from leapjax.envs.adapter import END
-from leapjax.types import Observation
+from leapjax.babyai import augmentation, demonstrations, levels, vocabulary
+from leapjax.babyai.adapter import END
+from leapjax.babyai.observations import Observation
+from leapjax.data import windows
 from tests.dynamics import FRONT, stepped
 from tests.oracles import slow_path_lengths
 
@@ -27,6 +27,7 @@ GRID_WORDS = augmentation.GridWords(
 augment = jax.jit(augmentation.augment, static_argnums=3)
 clutter = jax.jit(augmentation.clutter)
 window_at = jax.jit(windows.window, static_argnums=(2, 3, 4))
+lay_out = functools.partial(windows.concatenate, extras=augmentation.way)
 
 
 @functools.cache
@@ -34,7 +35,7 @@ def whole_windows(name: str, context: int, horizon: int) -> list[windows.Window]
     """The window at the start of each of some demonstrations."""
     level = levels.find_level(name)
     collected = demonstrations.collect(level, 6, seed=1).demonstrations
-    steps = windows.concatenate([d for d in collected if len(d.actions) < horizon])
+    steps = lay_out([d for d in collected if len(d.actions) < horizon])
     steps = jax.tree.map(jnp.asarray, steps)
     return [window_at(steps, i, context, horizon, END) for i in steps.starts]
 
@@ -106,7 +107,7 @@ def test_the_past_is_transformed_with_the_present(name):
     [demonstration] = [
         d for d in demonstrations.collect(level, 6, seed=1).demonstrations if len(d.actions) > 5
     ][:1]
-    steps = jax.tree.map(jnp.asarray, windows.concatenate([demonstration]))
+    steps = jax.tree.map(jnp.asarray, lay_out([demonstration]))
     window = window_at(steps, jnp.int32(4), context, 2, END)
     for key in range(6):
         changed = jax.device_get(augment(jax.random.key(key), window, GRID_WORDS, True))
@@ -135,7 +136,7 @@ def test_half_of_the_sequences_are_said_the_other_way_round():
 def test_what_was_before_the_start_stays_blank():
     level = levels.find_level("GoToLocalS7N5")
     collected = demonstrations.collect(level, 1, seed=1).demonstrations
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected))
+    steps = jax.tree.map(jnp.asarray, lay_out(collected))
     window = window_at(steps, jnp.int32(0), 3, 2, END)
     for key in range(8):
         changed = augment(jax.random.key(key), window, GRID_WORDS, True)
@@ -186,7 +187,7 @@ def test_in_clutter_a_demonstration_stays_possible_and_shortest(name):
 def test_clutter_leaves_half_of_the_windows_and_fills_up_to_its_share():
     window = whole_windows("GoToLocalS8N7", 0, 32)[0]
     before = jax.device_get(window.context.observation)
-    free = (before.grid[..., 0] == EMPTY) & ~np.asarray(window.way)
+    free = (before.grid[..., 0] == EMPTY) & ~np.asarray(window.extras)
     keys = jax.random.split(jax.random.key(0), 400)
     many = jax.vmap(lambda k, share: clutter(k, window, share), in_axes=(0, None))
     grids = np.asarray(many(keys, 0.5).context.observation.grid)
@@ -202,10 +203,10 @@ def test_what_a_demonstration_puts_down_keeps_its_place():
     collected = demonstrations.collect(level, 4, seed=1).demonstrations
     dropped = 0
     for demonstration in collected:
-        steps = windows.concatenate([demonstration])
+        steps = lay_out([demonstration])
         for start in range(0, len(demonstration.actions), 3):
             state = jax.tree.map(lambda leaf, i=start: leaf[i], demonstration.observations)
-            free = (state.grid[..., 0] == EMPTY) & ~steps.way[start]
+            free = (state.grid[..., 0] == EMPTY) & ~steps.extras[start]
             state.grid[free] = (BALL, 0, 0)
             for index, action in enumerate(demonstration.actions[start:], start + 1):
                 state = stepped(state, int(action))
@@ -222,7 +223,7 @@ def test_clutter_was_always_there_and_needs_a_goal():
     demonstration = max(
         demonstrations.collect(level, 6, seed=1).demonstrations, key=lambda d: len(d.actions)
     )
-    steps = jax.tree.map(jnp.asarray, windows.concatenate([demonstration]))
+    steps = jax.tree.map(jnp.asarray, lay_out([demonstration]))
     seen = 0
     for context, start in ((3, 4), (3, 1)):
         window = window_at(steps, jnp.int32(start), context, 2, END)

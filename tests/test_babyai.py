@@ -10,22 +10,27 @@ import pytest
 from PIL import Image
 
 from benchmarks import quality
-from experiments import babyai, pipeline, results
-from experiments.config import PRESETS, preset
+from experiments import babyai
+from experiments.common import results, run
+from experiments.common.config import parse, preset
 from leapjax import UserError, files, load, plan_keys, rollouts
+from leapjax.agents import leap
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.levels import LEVELS
+from leapjax.babyai.settings import Settings
 from leapjax.data import seeds, storage
-from leapjax.envs.adapter import BabyAIAdapter
-from leapjax.envs.levels import LEVELS
 from leapjax.planners import GibbsConfig
+from tests import programs
+from tests.programs import RANDOM, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
-TOY = (
-    "--demos 6 --episodes 5 --steps 4 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
-    "--rounds 1 --fields 2 --sweeps 2 --iterations 3"
-).split()
+DOMAIN = BABYAI.make(LEVEL, Settings())
+TOY = [*programs.TOY, "--steps", "4", "--iterations", "3"]
+SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
 FIELDS = (
-    "experiment level method preset seed demos episodes successes mean_length horizon "
-    "iterations executed train_steps train_seconds eval_seconds plans_per_second params "
+    "experiment domain level method preset seed demos episodes successes mean_return mean_length "
+    "horizon iterations executed train_steps train_seconds eval_seconds plans_per_second params "
     "versions date hash"
 ).split()
 
@@ -37,9 +42,15 @@ def workplace(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "datasets"))
-        patch.setenv("LEAPJAX_COMPILATION_CACHE", str(folder / "cache"))
-        assert babyai.main(TOY) == 0
+        patch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+        assert babyai.main([*TOY, "--pictures"]) == 0
         yield folder
+
+
+@pytest.fixture(scope="module")
+def planner(workplace):
+    """The planner of that run, loaded."""
+    return load(run_folder(workplace))
 
 
 @pytest.fixture(autouse=True)
@@ -49,15 +60,21 @@ def minari_folder(workplace, monkeypatch):
 
 
 def run_folder(workplace):
-    (folder,) = (p for p in (workplace / "runs").iterdir() if p.is_dir() and "leapjax" in p.name)
+    return only_folder(workplace / "runs")
+
+
+def only_folder(runs):
+    (folder,) = (path for path in runs.iterdir() if path.is_dir())
     return folder
 
 
 def test_a_run_leaves_a_row_with_every_field(workplace):
     (row,) = results.read(workplace / "runs" / "babyai.jsonl")
     assert set(FIELDS) <= row.keys()
-    assert row["level"] == LEVEL and row["preset"] == "leapjax" and row["demos"] == 6
-    assert row["episodes"] == 5 and 0 <= row["successes"] <= 5
+    assert (row["domain"], row["level"], row["method"]) == ("babyai", LEVEL, "leap")
+    assert row["preset"] == "leapjax" and row["demos"] == 6
+    assert row["episodes"] == 3 and 0 <= row["successes"] <= 3
+    assert 0 <= row["mean_return"] <= row["successes"] / 3
     assert row["iterations"] == 3 and row["horizon"] == 5 and row["train_steps"] == 4
     assert row["configuration"]["training"]["batch"] == 4
     assert not (workplace / "results").exists()
@@ -68,56 +85,103 @@ def test_a_run_leaves_pictures_metrics_and_a_checkpoint(workplace):
     for name in ("loss.png", "iterations.png"):
         assert Image.open(folder / name).size[0] > 300
     assert getattr(Image.open(folder / "plan.gif"), "n_frames", 1) > 3
-    metrics = pipeline.read_metrics(folder)
+    metrics = run.read_metrics(folder)
     assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
 
 
-def test_the_checkpoint_evaluates_again_without_training(workplace, capsys):
+def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
+    arguments = ["--checkpoint", str(run_folder(workplace)), "--episodes", "3", "--no-pictures"]
+    arguments += ["--runs", "again"]
+    assert babyai.main(arguments) == 0
     (before,) = results.read(workplace / "runs" / "babyai.jsonl")
-    arguments = ["--checkpoint", str(run_folder(workplace)), "--runs", "again", "--no-pictures"]
-    assert babyai.main([*TOY, *arguments]) == 0
     (after,) = results.read(workplace / "again" / "babyai.jsonl")
     assert after["train_steps"] == 0 and after["train_seconds"] == 0
-    assert (after["successes"], after["mean_length"]) == (
-        before["successes"],
-        before["mean_length"],
-    )
+    for name in ("successes", "mean_length", "mean_return", "demos", "configuration"):
+        assert after[name] == before[name], name
+    assert after["hash"] != before["hash"]  # to train and to play are two rows
+    assert parse("babyai", [*TOY, *arguments]) == parse("babyai", arguments)
+    assert [path.name for path in (workplace / "again").iterdir() if path.is_dir()] == []
 
 
-def test_a_checkpoint_needs_no_other_setting(workplace):
-    arguments = ["--checkpoint", str(run_folder(workplace)), "--episodes", "5", "--no-pictures"]
-    assert babyai.main([*arguments, "--runs", "alone"]) == 0
-    (before,) = results.read(workplace / "runs" / "babyai.jsonl")
-    (after,) = results.read(workplace / "alone" / "babyai.jsonl")
-    assert after["successes"] == before["successes"]
-    assert after["configuration"]["model"] == before["configuration"]["model"]
-    assert after["demos"] == before["demos"] == 6
-
-
-def test_a_row_of_a_checkpoint_has_the_seed_that_it_was_trained_with(workplace, tmp_path, capsys):
-    copy = tmp_path / "copy"
-    shutil.copytree(run_folder(workplace), copy)
-    settings = json.loads((copy / "config.json").read_text())
-    (copy / "config.json").write_text(json.dumps({**settings, "seed": 2}))
-    arguments = ["--checkpoint", str(copy), "--no-pictures", "--runs", str(tmp_path / "again")]
-    assert babyai.main([*arguments, "--episodes", "1"]) == 0
+def test_a_checkpoint_brings_its_seed_and_leaves_only_pictures(workplace, tmp_path, capsys):
+    folder = untrained_run(tmp_path / "random", "--method", "random", "--seeds", "2")
+    arguments = ["--checkpoint", str(folder), "--episodes", "1", "--runs", str(tmp_path / "again")]
+    assert babyai.main(arguments) == 0
     (row,) = results.read(tmp_path / "again" / "babyai.jsonl")
-    assert row["seed"] == row["configuration"]["seed"] == 2
+    assert row["seed"] == row["configuration"]["seed"] == 2 and row["method"] == "random"
+    pictures = only_folder(tmp_path / "again" / "evaluations")
+    assert {path.name for path in pictures.iterdir()} == {"iterations.png", "plan.gif"}
     capsys.readouterr()
     assert babyai.main([*arguments, "--seeds", "0"]) == 2
     assert "does not fit: seed is 2, not 0" in capsys.readouterr().err
-    assert babyai.main([*arguments, "--demos", "5"]) == 2
-    assert "does not fit: demos is 6, not 5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--level", "GoToLocalS8N7", f"level is {LEVEL}, not GoToLocalS8N7"),
+        ("--method", "classifier", "method is leap, not classifier"),
+        ("--preset", "paper", "preset is leapjax, not paper"),
+        ("--demos", "5", "demos is 6, not 5"),
+        ("--horizon", "4", "horizon is 5, not 4"),
+        ("--heads", "4", "heads is 2, not 4"),
+        ("--masking", "one", "masking is random, not one"),
+        ("--learning-rate", "0.01", "learning_rate is 0.0015, not 0.01"),
+        ("--channels", "8", "channels is 4, not 8"),
+        ("--steps", "5", "steps is 4, not 5"),
+    ],
+)
+def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
+    workplace, tmp_path, capsys, option, value, message
+):
+    checkpoint = ["--checkpoint", str(run_folder(workplace)), "--runs", str(tmp_path / "runs")]
+    assert babyai.main([*checkpoint, option, value]) == 2
+    error = capsys.readouterr().err
+    assert f"does not fit: {message}" in error and error.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
+    shutil.copytree(workplace / "runs", workplace / "both")
+    assert babyai.main([*TOY, *SIMPLE, "--method", "classifier", "--runs", "both"]) == 0
+    before, after = results.read(workplace / "both" / "babyai.jsonl")
+    assert (before["method"], after["method"]) == ("leap", "classifier")
+    assert before["hash"] != after["hash"] and after["params"] > 0
+    (folder,) = (workplace / "both").glob("*-classifier-*")
+    assert {"loss", "absolute_error"} < run.read_metrics(folder)[-1].keys()
+    plan = plans(load(folder), 3)
+    assert plan.actions.shape == (3, 5) and plan.actions.max() < 7
+
+
+def test_the_random_method_has_a_row_and_plans_uniformly(workplace):
+    assert babyai.main([*RANDOM, "--runs", "random"]) == 0
+    (row,) = results.read(workplace / "random" / "babyai.jsonl")
+    assert (row["method"], row["demos"], row["train_steps"]) == ("random", 0, 0)
+    assert (row["params"], row["horizon"]) == (0, 1)
+    plan = plans(load(only_folder(workplace / "random")), 1200)
+    counts = np.bincount(plan.actions[:, 0], minlength=7)
+    assert counts[6] == 0  # the end
+    assert 150 < counts[:6].min() and counts[:6].max() < 250  # four standard deviations
+
+
+def plans(planner, count):
+    """Plans for the same state, each with a key of its own."""
+    adapter = BabyAIAdapter(LEVELS[LEVEL])
+    history = rollouts.History(adapter.reset(0), 0, adapter.num_actions)
+    contexts = rollouts.stack_contexts([history] * count)
+    return planner(plan_keys(0, np.arange(count), np.zeros(count)), contexts)
 
 
 def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
-    assert babyai.main([*TOY, "--no-pictures"]) == 0
+    arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", "twice"]
+    assert babyai.main(arguments) == 0
+    capsys.readouterr()
+    assert babyai.main(arguments) == 0
     assert "continuing at step 4 of 4" in capsys.readouterr().out
-    assert len(results.read(workplace / "runs" / "babyai.jsonl")) == 1
+    assert len(results.read(workplace / "twice" / "babyai.jsonl")) == 1
 
 
-def test_a_loaded_planner_plans(workplace):
-    planner = load(run_folder(workplace))
+def test_a_loaded_planner_plans(planner):
     adapter = BabyAIAdapter(LEVELS[LEVEL])
     histories = [rollouts.History(adapter.reset(s), 0, adapter.num_actions) for s in range(3)]
     plan = planner(plan_keys(0, np.arange(3), np.zeros(3)), rollouts.stack_contexts(histories))
@@ -127,21 +191,25 @@ def test_a_loaded_planner_plans(workplace):
     assert (actions[:, 0] != 6).all()  # end is never first
 
 
-def test_a_planner_of_a_smaller_grid_is_refused_a_larger_level(workplace):
-    planner = load(run_folder(workplace))
+def test_a_planner_of_another_horizon_is_refused(workplace):
+    with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
+        load(run_folder(workplace), GibbsConfig(horizon=4))
+
+
+def test_a_planner_of_a_smaller_grid_is_refused_a_larger_level(planner):
     large = LEVELS["GoToLocalS8N7"]
     with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
         rollouts.evaluate(
             lambda: BabyAIAdapter(large), [0], planner.plan, planner.params, context=0
         )
-    with pytest.raises(UserError, match=r"past actions has shape \(2,\), but .* \(0,\)"):
+    with pytest.raises(UserError, match=r"context.past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"):
         rollouts.evaluate(
             lambda: BabyAIAdapter(LEVELS[LEVEL]), [0], planner.plan, planner.params, context=2
         )
 
 
 def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
-    arguments = [*TOY, "--record", "--no-pictures"]
+    arguments = [*RANDOM, "--record", "--runs", "recorded"]
     assert babyai.main(arguments) == 0
     path = workplace / "results" / "babyai.jsonl"
     first = path.read_text()
@@ -153,19 +221,23 @@ def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
     shutil.rmtree(workplace / "results")
 
 
-def test_the_paper_preset_and_a_level_with_context_run(workplace):
-    arguments = ["--preset", "paper", "--level", "GoToSeqS5R2", "--context", "2"]
-    assert babyai.main([*TOY, *arguments, "--no-pictures", "--runs", "paper"]) == 0
-    (row,) = results.read(workplace / "paper" / "babyai.jsonl")
-    assert row["preset"] == "paper" and row["level"] == "GoToSeqS5R2"
+# A level by its id, whose grid is not square.
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        ("paper", "BabyAI-PutNextS4N1-v0"),
+        pytest.param("paper", "GoToSeqS5R2", marks=only_long),
+        pytest.param("leapjax", "BabyAI-PutNextS4N1-v0", marks=only_long),
+    ],
+)
+def test_both_presets_run_on_any_level_with_context(workplace, name, level):
+    runs = f"{name} {level}"
+    arguments = ["--preset", name, "--level", level, "--context", "2", "--runs", runs]
+    assert babyai.main([*TOY, *SIMPLE, *arguments]) == 0
+    (row,) = results.read(workplace / runs / "babyai.jsonl")
+    assert (row["preset"], row["level"]) == (name, level)
     assert row["configuration"]["context"] == 2
-
-
-def test_a_level_by_its_id_that_is_not_square(workplace):
-    arguments = ["--level", "BabyAI-PutNextS4N1-v0", "--no-pictures", "--runs", "id"]
-    assert babyai.main([*TOY, *arguments]) == 0
-    (row,) = results.read(workplace / "id" / "babyai.jsonl")
-    assert row["level"] == "BabyAI-PutNextS4N1-v0" and row["paper_success"] is None
+    assert (row["paper_success"] is None) == level.startswith("BabyAI-")
 
 
 @pytest.mark.parametrize(
@@ -173,6 +245,7 @@ def test_a_level_by_its_id_that_is_not_square(workplace):
     [
         (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
         (["--preset", "papr"], "unknown preset 'papr'"),
+        (["--method", "bc"], "unknown method 'bc': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--horizon", "50", "--resampled", "1"], "longer than an episode"),
@@ -192,14 +265,6 @@ def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, m
     assert error.count("\n") == 1 and error.startswith("error: ")
 
 
-def test_a_checkpoint_of_another_level_or_shape_is_refused(workplace, capsys):
-    checkpoint = ["--checkpoint", str(run_folder(workplace))]
-    assert babyai.main([*TOY, *checkpoint, "--level", "GoToLocalS8N7"]) == 2
-    assert "level is GoToLocalS7N5, not GoToLocalS8N7" in capsys.readouterr().err
-    assert babyai.main([*TOY, *checkpoint, "--horizon", "4"]) == 2
-    assert "horizon is 5, not 4" in capsys.readouterr().err
-
-
 def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
     copy = tmp_path / "copy"
     shutil.copytree(run_folder(workplace), copy)
@@ -214,15 +279,17 @@ def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
 
 
 def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_path, capsys):
-    folder = tmp_path / "runs" / run_folder(workplace).name
-    shutil.copytree(run_folder(workplace), folder)
+    runs = tmp_path / "runs"
+    arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", str(runs)]
+    assert babyai.main(arguments) == 0
+    folder, (before,) = only_folder(runs), results.read(runs / "babyai.jsonl")
     damage(folder / "checkpoints" / "4")
-    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs"), "--no-pictures"]) == 0
+    assert babyai.main(arguments) == 0
     error = capsys.readouterr().err
     assert "checkpoints/4 is damaged" in error and "there is none before it" in error
-    (before,) = results.read(workplace / "runs" / "babyai.jsonl")
-    (after,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    (after,) = results.read(runs / "babyai.jsonl")
     assert after["successes"] == before["successes"]
+    assert [m["step"] for m in run.read_metrics(folder)] == [4]
     with pytest.raises(UserError, match="cannot be read"):
         damage(folder / "checkpoints" / "4")
         load(folder)
@@ -248,26 +315,26 @@ def test_a_folder_in_use_is_refused(workplace, capsys):
         assert babyai.main(TOY) == 2
     error = capsys.readouterr().err
     assert f"in use by another process ({os.getpid()})" in error and error.count("\n") == 1
-    assert babyai.main([*TOY, "--no-pictures"]) == 0
 
 
 def test_a_data_set_of_the_users_own_is_trained_on(workplace):
-    mine = storage.dataset_id(LEVELS[LEVEL], 6, 0)
-    arguments = ["--demonstrations", mine, "--runs", "mine", "--no-pictures"]
-    assert babyai.main([*TOY, *arguments]) == 0
-    (row,) = results.read(workplace / "mine" / "babyai.jsonl")
-    (original,) = results.read(workplace / "runs" / "babyai.jsonl")
-    assert row["successes"] == original["successes"]
+    mine = storage.dataset_id(DOMAIN, 6, 0)
+    arguments = ["--steps", "1", "--demos", "6", "--demonstrations", mine, "--runs", "mine"]
+    assert babyai.main([*RANDOM, *arguments]) == 0
+    found, expected = (
+        json.loads((folder / "data.json").read_text())
+        for folder in (only_folder(workplace / "mine"), run_folder(workplace))
+    )
+    assert found == expected
 
 
 def test_too_few_demonstrations_in_a_data_set(workplace, capsys):
-    mine = storage.dataset_id(LEVELS[LEVEL], 6, 0)
+    mine = storage.dataset_id(DOMAIN, 6, 0)
     assert babyai.main([*TOY, "--demonstrations", mine, "--demos", "7"]) == 2
     assert "fewer than --demos 7" in capsys.readouterr().err
 
 
-def test_evaluation_does_not_depend_on_the_batch(workplace):
-    planner = load(run_folder(workplace))
+def test_evaluation_does_not_depend_on_the_batch(planner):
     level = LEVELS[LEVEL]
 
     def play(seeds):
@@ -291,15 +358,13 @@ def test_rows_refuse_damage_by_line_number(tmp_path):
         results.read(path)
 
 
-def test_parameters_are_plain_arrays(workplace):
-    assert all(
-        isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(load(run_folder(workplace)).params)
-    )
+def test_parameters_are_plain_arrays(planner):
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(planner.params))
 
 
 def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        quality, "variants", lambda trained, most: {"trained": trained, "one": GibbsConfig(5, 1)}
+        quality, "variants", lambda trained, most: {"trained": trained, "two": GibbsConfig(1, 2)}
     )
     played = []
     evaluate = rollouts.evaluate
@@ -311,11 +376,11 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     monkeypatch.setattr(rollouts, "evaluate", record)
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
     arguments = "--episodes 3 --batch 4 --seconds 0.01 --json".split()
-    folder = str(run_folder(workplace))
+    folder = str(untrained_run(tmp_path / "run", "--method", "random", "--iterations", "1"))
     assert quality.main([folder, *arguments, str(rows), "--plot", str(plot)]) == 0
     written = json.loads(rows.read_text())
-    assert [row["variant"] for row in written] == ["trained", "one"]
-    assert [row["iterations"] for row in written] == [3, 1]
+    assert [row["variant"] for row in written] == ["trained", "two"]
+    assert [row["iterations"] for row in written] == [1, 2]
     assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
     assert played == [list(seeds.validation_seeds(0, 3))] * 2
     assert plot.stat().st_size > 1000
@@ -323,8 +388,9 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 
 def test_every_search_setting_can_be_made():
     for level in LEVELS.values():
-        for name in PRESETS:
-            variants = quality.variants(preset(level, name).planner, level.iterations)
+        for name in leap.PRESETS:
+            config = preset("babyai", level.name, "leap", name)
+            variants = quality.variants(config.planner, level.iterations)
             assert len(variants) > 10
             assert max(config.iterations for config in variants.values()) == level.iterations
 

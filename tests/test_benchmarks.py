@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks import planning, scaling, training
-from experiments.config import preset
+from experiments.common.config import preset
 from leapjax import pretrained
-from leapjax.envs import levels
+from leapjax.babyai import levels
 from leapjax.models import trajectory
 
 HORIZON = 5

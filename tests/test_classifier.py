@@ -6,24 +6,25 @@ import numpy as np
 import pytest
 
 from leapjax import batching, training
-from leapjax.agents import classifier, leap
-from leapjax.agents.leap import TrainingConfig
+from leapjax.agents import classifier
+from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
-from leapjax.envs import vocabulary
-from leapjax.envs.adapter import NUM_ACTIONS
-from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
+from tests import toy
+from tests.enumerable import quick_jit
 
-SIZES = Sizes(7, vocabulary.SIZE, NUM_ACTIONS, 0, 4, 49)
-MODEL = ModelConfig(layers=1, heads=1, width=16, channels=8, fields=2, sweeps=4, rounds=1)
+NUM_ACTIONS, END = toy.DOMAIN.num_actions, toy.END
 TRAINING = TrainingConfig(steps=150, batch=16, warmup=10, learning_rate=1e-2)
-END = NUM_ACTIONS - 1
+MODEL = ModelConfig(layers=1, heads=1, width=16)
+SETUP = Setup(toy.DOMAIN, 0, 4, MODEL, TRAINING, classifier.Settings())
 
 
 def test_corruption_is_as_many_other_actions_as_it_says():
     actions = jnp.array([0, 2, 2, END])
     keys = jax.random.split(jax.random.key(0), 4000)
-    corrupted, degrees = jax.vmap(lambda k: classifier.corrupt(k, actions, NUM_ACTIONS))(keys)
+    corrupt = quick_jit(jax.vmap(lambda key: classifier.corrupt(key, actions, NUM_ACTIONS)))
+    corrupted, degrees = corrupt(keys)
     assert ((corrupted >= 0) & (corrupted < NUM_ACTIONS)).all()
     np.testing.assert_allclose((corrupted != actions).mean(axis=1), degrees)
     # Every degree is as likely, every position too, and every other action.
@@ -37,19 +38,17 @@ def test_corruption_is_as_many_other_actions_as_it_says():
 
 
 @pytest.fixture(scope="module")
-def trained(local_demonstrations):
-    """An agent that was trained for a moment, its parameters and all steps of its data."""
-    agent = classifier.make_agent(MODEL, TRAINING, GibbsConfig(4, 9), SIZES, 5)
-    step = training.make_train_step(
-        agent, lambda key, data: leap.make_batch(key, data, TRAINING, SIZES)
-    )
-    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations))
+def trained():
+    """An agent that was trained for a moment, its parameters, a batch and the losses."""
+    agent = classifier.make_agent(SETUP)
+    data = jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
     losses = []
     state = training.train(
-        step, jax.jit(agent.init)(jax.random.key(0)), data, jax.random.key(1), TRAINING.steps,
+        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), data,
+        jax.random.key(1), TRAINING.steps,
         lambda done, state, means: losses.append(means["loss"]),
     )  # fmt: skip
-    return agent, state.params, leap.make_batch(jax.random.key(2), data, TRAINING, SIZES), losses
+    return agent, state.params, jax.jit(agent.batch)(jax.random.key(2), data), losses
 
 
 def test_it_learns_how_corrupted_a_plan_is(trained):
@@ -82,7 +81,3 @@ def test_one_plans_with_it_as_with_any_energy(trained):
     assert finite[:, -1].all()
     assert (np.diff(energies, axis=1)[finite[:, :-1]] <= 1e-5).all()
     assert (plan.actions[:, 0] != END).all()
-    acted = jax.jit(agent.act)(
-        params, jax.random.wrap_key_data(keys[0]), jax.tree.map(lambda x: x[0], batch.context)
-    )
-    assert acted.actions.shape == (4,)

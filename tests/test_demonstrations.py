@@ -1,4 +1,5 @@
 import functools
+from collections import Counter
 
 import jax
 import numpy as np
@@ -6,12 +7,14 @@ import pytest
 from minigrid.core.world_object import Door
 from minigrid.utils.baby_ai_bot import BabyAIBot
 
-from leapjax.data import demonstrations, seeds
-from leapjax.data.demonstrations import Collection, Demonstration, FullViewBot
-from leapjax.envs import levels, observations
-from leapjax.envs.adapter import BabyAIAdapter
+from leapjax.babyai import demonstrations, levels, observations
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
+from leapjax.babyai.observations import Observation
+from leapjax.data import seeds
+from leapjax.domain import Collection
 from leapjax.errors import UserError
-from leapjax.types import Observation
+from leapjax.types import Demonstration
 from tests.oracles import assert_same_observation, slow_path_lengths
 
 FORWARD, PICKUP, DROP, TOGGLE = 2, 3, 4, 5
@@ -57,8 +60,18 @@ def test_a_demonstration_can_be_replayed_from_its_seed(name):
             transition = adapter.step(int(action))
             last = index == len(demonstration.actions) - 1
             assert_same_observation(transition.observation, state(demonstration, index + 1))
+            assert np.float32(transition.reward) == demonstration.rewards[index]
             assert transition.success == transition.terminated == last
             assert not transition.truncated or last
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_a_demonstration_is_rewarded_at_its_end_as_the_level_does(name):
+    for demonstration in collected(name).demonstrations:
+        steps, limit = len(demonstration.actions), reset(name, demonstration.seed).max_steps
+        assert demonstration.rewards.dtype == np.float32 and not demonstration.rewards[:-1].any()
+        assert demonstration.rewards[-1] == pytest.approx(1 - 0.9 * steps / limit)
+        assert (demonstration.terminated, demonstration.truncated) == (True, False)
 
 
 @pytest.mark.parametrize("name", [n for n in COUNTS if "Seq" not in n and "PutNext" not in n])
@@ -176,7 +189,7 @@ def test_level_seeds_lie_in_the_training_range(name):
     assert first <= found[0] and found[-1] < first + seeds.TRAINING_STRIDE
     result = collected(name)
     # No level is passed over but those that are counted as dropped.
-    assert found[-1] - first + 1 == len(found) + result.failed + result.other_goal
+    assert found[-1] - first + 1 == len(found) + result.dropped.total()
 
 
 @pytest.mark.parametrize("count", [0, -1])
@@ -187,6 +200,8 @@ def test_no_demonstrations_are_refused(count):
 
 def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
     class Lost:
+        stack = ()
+
         def replan(self, action_taken):
             raise AssertionError("unreachable\nobject")
 
@@ -197,29 +212,44 @@ def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
 
 
 def test_a_bot_that_gives_up_or_runs_out_of_time_has_failed(monkeypatch):
-    level = levels.find_level("GoToLocalS7N5")
-    env = levels.make_environment(level)
+    adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
     end, drop = 6, DROP  # dropping nothing never does anything
     for constant in (end, drop):
 
         class Stubborn:
+            stack = ()
+
             def replan(self, action_taken, constant=constant):
                 return constant
 
         monkeypatch.setattr(demonstrations, "make_bot", lambda env, bot=Stubborn: bot())
-        tally = Collection([])
-        assert demonstrations.demonstrate(env, level, 7, 0, tally) is None
-        assert (tally.failed, tally.other_goal) == (1, 0)
-        assert env.step_count == (0 if constant == end else env.max_steps)
+        dropped = Counter()
+        assert demonstrations.demonstrate(adapter, 0, dropped) is None
+        assert dropped == {FAILED: 1}
+        assert adapter.env.step_count == (0 if constant == end else adapter.env.max_steps)
+
+
+def test_a_bot_that_never_decides_has_failed(monkeypatch):
+    class Undecided:
+        stack = ("explore",)
+
+        def replan(self, action_taken):
+            while self.stack[-1] == "explore":
+                pass
+
+    monkeypatch.setattr(demonstrations, "make_bot", lambda env: Undecided())
+    dropped = Counter()
+    adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
+    assert demonstrations.demonstrate(adapter, 0, dropped) is None
+    assert dropped == {FAILED: 1}
 
 
 def test_an_episode_that_ends_at_another_match_is_dropped(monkeypatch):
-    level = levels.find_level("GoToLocalS7N5")
-    env = levels.make_environment(level)
+    adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
     monkeypatch.setattr(observations, "nearest_goal", lambda env: (0, 0))
-    tally = Collection([])
-    assert demonstrations.demonstrate(env, level, 7, 0, tally) is None
-    assert (tally.failed, tally.other_goal) == (0, 1)
+    dropped = Counter()
+    assert demonstrations.demonstrate(adapter, 0, dropped) is None
+    assert dropped == {OTHER_GOAL: 1}
 
 
 def test_pickup_demonstrations_end_with_the_pickup():

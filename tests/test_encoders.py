@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.models import encoders
+from leapjax.babyai import encoders
 
 SIDE = 6
 
@@ -40,12 +40,13 @@ def dijkstra(start, cost):
 
 def unrolled(start, cost, sweeps):
     """The recursion as it is written, for autodiff."""
-    distance = start
-    for _ in range(sweeps):
+
+    def sweep(distance, _):
         padded = jnp.pad(distance, ((1, 1), (1, 1), (0, 0)), constant_values=encoders.FAR)
         near = [padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]]
-        distance = jnp.minimum(start, cost + jnp.stack(near).min(axis=0))
-    return distance
+        return jnp.minimum(start, cost + jnp.stack(near).min(axis=0)), None
+
+    return jax.lax.scan(sweep, start, length=sweeps)[0]
 
 
 def test_distances_are_dijkstras(field):
@@ -107,33 +108,36 @@ def test_reading_around_and_at_a_cell():
         around = encoders.neighbourhood(image, jnp.array([x, y]), 2)
         np.testing.assert_array_equal(around, padded[x : x + 5, y : y + 5].reshape(-1))
         np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([x, y])), image[x, y])
+    assert not encoders.one_cell(jnp.array([-1, -1]), SIDE).any()
     np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([-1, -1])), [0, 0])
 
 
 def test_the_state_after_the_last_word_ignores_padding():
     encoder = encoders.InstructionEncoder(10, 8)
     words = jnp.array([3, 1, 4, 0, 0])
-    params = encoder.init(jax.random.key(0), words)
-    short = encoder.apply(params, words[:3])
-    long = encoder.apply(params, words)
+    params = jax.jit(encoder.init)(jax.random.key(0), words)
+    encode = jax.jit(encoder.apply)
+    short, long = encode(params, words[:3]), encode(params, words)
     np.testing.assert_allclose(long.whole, short.whole, atol=1e-6)
     np.testing.assert_allclose(long.words[:3], short.words, atol=1e-6)
     assert long.given.tolist() == [True] * 3 + [False] * 2
-    assert not np.allclose(encoder.apply(params, words[jnp.array([1, 0, 2])]).whole, short.whole)
+    for other in ([1, 3, 4], [3, 1, 0], [3, 1, 6]):
+        assert not np.allclose(encode(params, jnp.array(other)).whole, short.whole)
 
 
 def test_cells_attend_to_the_words_that_are_given():
     encoder, attention = encoders.InstructionEncoder(10, 8), encoders.WordAttention(2, 4)
     cells = jax.random.normal(jax.random.key(0), (3, 4, 5))
     words = jnp.array([3, 1, 4])
-    encoded = encoder.init_with_output(jax.random.key(1), words)[0]
-    params = attention.init(jax.random.key(2), cells, encoded)
-    said = attention.apply(params, cells, encoded)
+    encoded = jax.jit(encoder.init_with_output)(jax.random.key(1), words)[0]
+    params = jax.jit(attention.init)(jax.random.key(2), cells, encoded)
+    attend = jax.jit(attention.apply)
+    said = attend(params, cells, encoded)
     assert said.shape == cells.shape
     padded = jax.tree.map(lambda x: jnp.concatenate([x, 100 * x]), encoded)
     padded = padded._replace(given=jnp.arange(6) < 3, whole=encoded.whole)
-    np.testing.assert_allclose(attention.apply(params, cells, padded), said, atol=1e-6)
+    np.testing.assert_allclose(attend(params, cells, padded), said, atol=1e-6)
     # Each cell by itself, and none is told the same as another.
-    alone = attention.apply(params, cells[1:2, 2:3], encoded)
+    alone = attend(params, cells[1:2, 2:3], encoded)
     np.testing.assert_allclose(alone[0, 0], said[1, 2], atol=1e-6)
     assert np.unique(np.asarray(said).reshape(12, -1).round(4), axis=0).shape[0] == 12

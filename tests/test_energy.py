@@ -5,12 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.energy import compose, constrain, from_total, pseudo_likelihood, view
+from leapjax.energy import (
+    compose,
+    constrain,
+    from_total,
+    pseudo_likelihood,
+    single_action,
+    view,
+)
+from leapjax.planners import GibbsConfig, bind
 from leapjax.types import Energy, mask_token, pad_token
 from tests.enumerable import (
     all_plans,
     conditional_by_counting,
     enumerable_energy,
+    fit_p_value,
     joint_probabilities,
     no_tilt,
     quick_jit,
@@ -213,6 +222,21 @@ def test_conditional_from_the_exact_total_is_exact():
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
+def test_totals_may_be_counts():
+    energy = from_total(lambda p, c: None, lambda p, m, actions: jnp.sum(actions == 1), ACTIONS)
+    assert energy.total(None, None, np.array([1, 0, 1])).dtype == jnp.float32
+    np.testing.assert_array_equal(
+        energy.conditional(None, None, np.array([1, 0, 1]), np.array([1, 2])),
+        [[2, 3, 2], [1, 2, 1]],
+    )
+
+
+def test_a_total_that_is_not_one_number_is_refused():
+    energy = from_total(lambda p, c: None, lambda p, m, actions: 1.0 * actions, ACTIONS)
+    with pytest.raises(ValueError, match=r"must be one number, got shape \(3,\)"):
+        energy.total(None, None, jnp.zeros(HORIZON, jnp.int32))
+
+
 # Sums of energies.
 
 
@@ -390,6 +414,19 @@ def test_constraints_add_up():
     )
 
 
+def test_a_reward_excuses_no_other_violation():
+    rewarded = constrain(CONSTRAINED, lambda context, actions: -5.0 * (actions[0] == 2))
+    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
+    found = violations(rewarded, TABLE, context)
+    np.testing.assert_allclose(found, violations(CONSTRAINED, TABLE, context))
+    assert (found[PLANS[:, 0] == 2] > 0).any()
+    np.testing.assert_allclose(
+        totals(rewarded, TABLE, context),
+        totals(CONSTRAINED, TABLE, context) - 5 * (PLANS[:, 0] == 2),
+        rtol=1e-5,
+    )
+
+
 def test_view_hides_the_rest_of_the_context():
     seen = np.random.default_rng(8).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
 
@@ -424,6 +461,95 @@ def test_two_views_make_the_product_of_what_each_sees():
     )
     actual = probabilities(conditionals(halves, (TABLE, OTHER_TABLE), context))
     np.testing.assert_allclose(actual, exact_conditionals(product / product.sum()), atol=1e-5)
+
+
+# Methods that choose one action at a time.
+
+
+CHOICES = 5  # and the end action
+SCORES = np.array([0.3, -1.0, 1.2, -np.inf, 0.9], np.float32)
+OTHER_SCORES = np.array([0.5, 2.0, -1.0, 3.0, 0.4], np.float32)
+SINGLE = single_action(
+    lambda params, context: context, lambda params, memory: params + memory, CHOICES + 1
+)
+
+
+@functools.cache
+def chooser(energy, temperature):
+    planner = bind(energy, GibbsConfig(1, 1, temperature=temperature, score=True))
+    return quick_jit(jax.vmap(planner, (None, 0, None)))
+
+
+def choices(energy, params, context, temperature=1.0):
+    """Actions that are chosen for many keys; checks that their energies are their totals."""
+    keys = jax.random.split(jax.random.key(0), 5000)
+    plan = chooser(energy, temperature)(params, keys, context)
+    assert plan.actions.shape == (5000, 1)
+    assert plan.valid.all()
+    return np.asarray(plan.actions)[:, 0], np.asarray(plan.energy)
+
+
+def softmax(scores):
+    weights = np.exp(np.append(scores, -np.inf).astype(np.float64))  # the end action is never
+    return weights / weights.sum()
+
+
+def counts_of(actions):
+    return np.bincount(actions, minlength=CHOICES + 1)
+
+
+def test_one_action_at_temperature_one_is_a_sample_of_the_policy():
+    shift = np.linspace(-0.5, 0.5, CHOICES, dtype=np.float32)
+    actions, energies = choices(SINGLE, SCORES, shift)
+    counts = counts_of(actions)
+    assert counts[3] == counts[CHOICES] == 0  # forbidden by its score, and the end action
+    assert fit_p_value(counts, softmax(SCORES + shift)) > 1e-3
+    assert fit_p_value(counts, softmax(SCORES)) < 1e-9
+    np.testing.assert_allclose(energies, -(SCORES + shift)[actions], rtol=1e-6)
+
+
+def test_one_action_at_temperature_zero_is_the_best():
+    for scores in (SCORES, OTHER_SCORES, -np.abs(OTHER_SCORES) - 100):
+        actions, _ = choices(SINGLE, scores, 0.0, temperature=0.0)
+        assert (actions == scores.argmax()).all()
+
+
+def test_scores_of_composed_methods_add_up():
+    both = compose([SINGLE, SINGLE], [1.0, 0.5])
+    actions, _ = choices(both, (SCORES, OTHER_SCORES), np.float32(0))
+    expected = softmax(SCORES + 0.5 * OTHER_SCORES)
+    assert fit_p_value(counts_of(actions), expected) > 1e-3
+    for alone in (SCORES, OTHER_SCORES):
+        assert fit_p_value(counts_of(actions), softmax(alone)) < 1e-9
+
+
+def test_a_constraint_removes_an_action():
+    best = int(SCORES.argmax())
+    without = constrain(SINGLE, lambda c, plan: jnp.where(plan[0] == best, jnp.inf, 0.0))
+    actions, _ = choices(without, SCORES, np.float32(0))
+    left = np.where(np.arange(CHOICES) == best, -np.inf, SCORES)
+    assert fit_p_value(counts_of(actions), softmax(left)) > 1e-3
+
+
+def test_the_total_of_one_action_is_its_score():
+    memory = SINGLE.encode(SCORES, np.float32(0))
+    for action in range(CHOICES + 1):
+        expected = -SCORES[action] if action < CHOICES else np.inf
+        assert SINGLE.total(SCORES, memory, jnp.array([action])) == expected
+    assert SINGLE.total(SCORES, memory, jnp.array([mask_token(CHOICES + 1)])) == np.inf
+
+
+def test_one_action_at_a_time_has_no_other_horizon():
+    with pytest.raises(ValueError, match="its horizon is 1"):
+        bind(SINGLE, GibbsConfig(2, 1))(SCORES, jax.random.key(0), np.float32(0))
+    with pytest.raises(ValueError, match="its horizon is 1"):
+        SINGLE.total(SCORES, np.float32(0), jnp.zeros(3, jnp.int32))
+
+
+def test_scores_are_one_for_each_action_but_the_end():
+    wrong = single_action(lambda params, context: (), lambda p, m: jnp.zeros(3), 3)
+    with pytest.raises(AssertionError):
+        wrong.total(None, (), jnp.zeros(1, jnp.int32))
 
 
 # What is refused where values can be seen.

@@ -22,12 +22,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experiments import config, pipeline, results
+from experiments.common import config, results, run
 from leapjax import checkpoints, pretrained
+from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import storage
-from leapjax.data.demonstrations import Collection
-from leapjax.envs import levels
+from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import TrainState
 from tests.programs import LONG
@@ -155,7 +155,7 @@ def data_set(local_demonstrations, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(folder))
-        storage.save(NAME, Collection(local_demonstrations), "for a test")
+        storage.save(NAME, Collection(local_demonstrations, {}), LEVEL, "for a test")
     return folder
 
 
@@ -166,7 +166,7 @@ def read_data_set(whole, change):
         shutil.copytree(whole, copied)
         change(copied / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(copied))
-        return outcome(lambda: storage.load(NAME, LEVEL, SIDE))
+        return outcome(lambda: storage.load(NAME, LEVEL))
 
 
 @cases
@@ -224,7 +224,7 @@ def change_and_load(whole, change):
         shutil.copytree(whole, Path(folder) / "datasets")
         change(Path(folder) / "datasets" / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(Path(folder) / "datasets"))
-        return storage.load(NAME, LEVEL, SIDE)
+        return storage.load(NAME, LEVEL)
 
 
 def replace_actions(replace):
@@ -297,18 +297,12 @@ CURVE = "step,seconds,loss,accuracy\n20,0.5,1.25,0.5\n40,1.0,0.75,0.75\n"
 def test_a_damaged_training_curve(tmp_path_factory, seed):
     folder = tmp_path_factory.mktemp("curve")
     (folder / "metrics.csv").write_bytes(damaged(CURVE.encode(), np.random.default_rng(seed)))
-    for entry in outcome(lambda: pipeline.read_metrics(folder)) or []:
+    for entry in outcome(lambda: run.read_metrics(folder)) or []:
         assert entry["step"] is not None and all(isinstance(v, float) for v in entry.values())
 
 
-SPECIFICATION = pretrained.Specification(
-    "GoToLocalS7N5",
-    config.Config().model,
-    pretrained.Sizes(7, pretrained.vocabulary.SIZE, 8, 0, 5, 49),
-    config.Config().training,
-    config.Config().planner,
-    5,
-    pretrained.vocabulary.WORDS,
+SPECIFICATION = config.specify(
+    config.preset("babyai", "GoToLocalS7N5", "leap", "leapjax"), seed=0, domain=LEVEL
 )
 
 
@@ -327,7 +321,7 @@ def test_a_damaged_specification(tmp_path_factory, data):
 # The command line.
 
 WORDS = [f"--{name.replace('_', '-')}" for name in (
-    "level preset seeds demos demonstrations episodes test_seed validation context executed "
+    "level method preset seeds demos demonstrations episodes test_seed validation context executed "
     "checkpoint record runs pictures checkpoint_seconds architecture layers heads width dropout "
     "channels rounds fields sweeps word_heads radius dtype steps batch learning_rate warmup "
     "betas clip masking windows augment exchange_objects clutter horizon iterations resampled "
@@ -337,7 +331,7 @@ VALUES = st.sampled_from(
     ["0", "1", "-1", "7", "1e9", "nan", "inf", "-inf", "99999999999999999999", "None", "all",
      "paper", "leapjax", "GoToSeqS5R2", "GoToLocal", "BabyAI-GoToObj-v0", "random", "each", "True",
      "--", "-", "=", "", "\x00", "\n", "/dev/null", "{}", "$(touch x)", "bfloat16", "localhost:1",
-     "x" * 5000]
+     "classifier", "x" * 5000]
 ) | st.text(max_size=10) | st.integers().map(str) | st.floats().map(str)  # fmt: skip
 ARGUMENT = st.sampled_from(WORDS) | VALUES | st.text(max_size=10)
 OPTIONS = st.lists(st.tuples(st.sampled_from(WORDS), VALUES).map(list), max_size=4).map(
@@ -354,7 +348,7 @@ def test_any_command_line(arguments):
                 contextlib.redirect_stdout(io.StringIO()),
                 contextlib.redirect_stderr(io.StringIO()),
             ):
-                return config.parse(arguments)
+                return config.parse("babyai", arguments)
         except SystemExit as stopped:  # help, or what argparse and tyro have to say
             assert stopped.code in (0, 2)
             return None
@@ -362,7 +356,8 @@ def test_any_command_line(arguments):
     for parsed in outcome(parse) or []:
         # What is accepted has a name, a level and episodes.
         assert len(config.configuration_hash(parsed, parsed.seeds[0])) == 12
-        assert levels.find_level(parsed.level) and parsed.demos > 0 < parsed.episodes
+        assert levels.find_level(parsed.level) and parsed.episodes > 0
+        assert parsed.demos > 0 or parsed.training.steps == 0
 
 
 # Checkpoints.

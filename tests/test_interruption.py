@@ -11,22 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.interruption import Interrupted, interruptible
+from experiments import babyai
+from experiments.common import results, run
+from experiments.common.interruption import Interrupted, interruptible
+from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, write_text
 from leapjax.types import TrainState
-from tests.programs import LONG, ROOT, Place
+from tests.programs import LONG, RANDOM, ROOT, STEPS, only_long, place_with_a_run
 
-STEPS = 400
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """Where the runs of this file go, with one that nothing happened to."""
-    place = Place(tmp_path_factory.mktemp("interruption"), STEPS)
-    place.finish(place.start("whole"))
-    return place
+place = pytest.fixture(place_with_a_run, scope="module")
 
 
 def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
@@ -43,7 +38,37 @@ def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(place, number, code):
+def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
+    tmp_path, monkeypatch, capsys, number, code
+):
+    class Stopped(Meter):
+        """The signal comes at step 20 of the training."""
+
+        def update(self, done, note=""):
+            if done == 20:
+                os.kill(os.getpid(), number)
+            super().update(done, note)
+
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+    options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "Meter", Stopped)
+        assert babyai.main(options) == code
+    error = capsys.readouterr().err
+    stopped = f"stopped by {signal.Signals(number).name}"
+    assert error == f"{stopped}; continue with: python -m experiments.babyai {' '.join(options)}\n"
+    (folder,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["20"]
+    assert not (tmp_path / "runs" / "babyai.jsonl").exists()
+    assert babyai.main(options) == 0
+    assert "continuing at step 20 of 60" in capsys.readouterr().out
+    assert [m["step"] for m in run.read_metrics(folder)] == [20, 40, 60]
+    assert len(results.read(tmp_path / "runs" / "babyai.jsonl")) == 1
+
+
+@only_long
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_process_that_is_asked_to_stop_goes_on_as_if_it_had_not_been(place, number, code):
     runs = f"stopped{number}"
     run = place.start(runs)
     place.wait_for_checkpoint(run, runs)
@@ -53,10 +78,9 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(place, number, 
     assert f"stopped by {signal.Signals(number).name}; continue with: python -m" in error
     assert f"--runs {runs}" in error and "Traceback" not in error
     assert 0 < max(place.steps_saved(runs)) < STEPS
-    assert not (place.folder / runs / "babyai.jsonl").exists()
-    if number == signal.SIGTERM:
-        place.finish(place.start(runs))
-        place.check_same_end(runs)
+    assert not place.rows(runs)
+    place.finish(place.start(runs))
+    place.check_same_end(runs)
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
@@ -129,7 +153,6 @@ from leapjax import files
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import LONG, ROOT, Place
 def state(step, size):
     noise = jax.random.normal(jax.random.key(0), (size, size))  # does not compress
     return TrainState({{"w": noise}}, (), jnp.int32(step))

@@ -1,6 +1,4 @@
-import dataclasses
 import functools
-import heapq
 import re
 
 import jax
@@ -8,26 +6,43 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.data import symmetries
+from leapjax.babyai import encoders, symmetries, vocabulary
+from leapjax.babyai.adapter import END, NUM_ACTIONS
+from leapjax.babyai.observations import Observation
+from leapjax.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
-from leapjax.models import encoders
-from leapjax.models.trajectory import ARCHITECTURES, ModelConfig, Sizes, blank_context, build
-from leapjax.types import Context, Observation, mask_token, pad_token
+from leapjax.models.trajectory import (
+    ARCHITECTURES,
+    ModelConfig,
+    SequenceClassifier,
+    Sizes,
+    build,
+)
+from leapjax.types import Context, mask_token, pad_token
 from tests.enumerable import all_plans, quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
 SIDE = 7
 EMPTY, WALL, BALL = 1, 2, 6
-VOCABULARY, ACTIONS, HORIZON, WORDS, MAX_STEPS = 9, 5, 3, 4, 20
-END, MASK, PAD = ACTIONS - 1, mask_token(ACTIONS), pad_token(ACTIONS)
+ACTIONS, HORIZON, WORDS, MAX_STEPS = NUM_ACTIONS, 3, 4, 20
+MASK, PAD = mask_token(ACTIONS), pad_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
 
 
-def tiny(architecture):
-    return ModelConfig(
-        architecture, layers=2, heads=2, width=16, channels=8, rounds=1, fields=2, sweeps=5,
-        word_heads=2,
-    )  # fmt: skip
+def make(kind, architecture, past, dtype="float32"):
+    """A tiny model of BabyAI's states."""
+    config = ModelConfig(architecture, layers=2, heads=2, width=16, dtype=dtype)
+    settings = Settings(channels=8, rounds=1, fields=2, sweeps=5, word_heads=2)
+    encoder = {
+        "paper": encoders.StateTokens(SIDE, config.width, dtype),
+        "leapjax": encoders.ContextTokens(settings, config.width, dtype),
+    }[architecture]
+    return kind(config, Sizes(ACTIONS, past, HORIZON, MAX_STEPS), encoder)
+
+
+def everything(module, context, actions):
+    """What touches every parameter."""
+    return module.logits(module.encode(context), actions, EVERYWHERE)
 
 
 @functools.cache
@@ -38,18 +53,13 @@ def model(architecture, past):
     the actions as they are, at all positions and at one alone; the energies of the
     conditional at one position and at all positions masked together; and the total energy.
     """
-    sizes = Sizes(SIDE, VOCABULARY, ACTIONS, past, HORIZON, MAX_STEPS)
-    config = tiny(architecture)
-    module = build(config, sizes)
+    module = make(build, architecture, past)
 
     def encode(params, context):
         return module.apply(params, context, method="encode")
 
     def logits(params, memory, actions, positions):
         return module.apply(params, memory, actions, positions, method="logits")
-
-    def touch(module, context, actions):
-        return module.logits(module.encode(context), actions, EVERYWHERE)
 
     energy = pseudo_likelihood(encode, logits, ACTIONS)
 
@@ -65,9 +75,9 @@ def model(architecture, past):
         }
 
     shapes = jax.eval_shape(
-        functools.partial(module.init, method=touch),
+        functools.partial(module.init, method=everything),
         jax.random.key(0),
-        blank_context(sizes, WORDS),
+        random_context(0, past),
         np.zeros(HORIZON, np.int32),
     )
     return random_parameters(shapes), evaluate
@@ -95,7 +105,7 @@ def random_observation(rng, goal=True):
         pose=np.array([x, y, direction], np.int32),
         carried=np.array([rng.integers(5, 8), rng.integers(0, 6)], np.int32),
         goal=(rng.integers(0, SIDE, 2) if goal else np.array([-1, -1])).astype(np.int32),
-        instruction=np.append(rng.integers(1, VOCABULARY, WORDS - 1), 0).astype(np.int32),
+        instruction=np.append(rng.integers(1, vocabulary.SIZE, WORDS - 1), 0).astype(np.int32),
     )
 
 
@@ -108,7 +118,9 @@ def random_context(seed, past, goal=True):
         observation=observation,
         past=jax.tree.map(lambda *x: np.stack(x), *steps) if past else empty,
         actions=rng.integers(0, ACTIONS - 1, past).astype(np.int32),
+        rewards=rng.normal(size=past).astype(np.float32),
         step=np.int32(past + 3),
+        return_so_far=np.float32(rng.normal()),
     )
 
 
@@ -154,7 +166,7 @@ def test_end_is_forbidden_at_the_first_position_only(architecture, past):
 @EACH_MODEL
 def test_only_plans_that_end_at_once_have_infinite_energy(architecture, past):
     context = random_context(1, past)
-    for actions in all_plans(HORIZON, ACTIONS)[:: 7 if past else 3]:
+    for actions in all_plans(HORIZON, ACTIONS)[:: 20 if past else 9]:
         total = run(architecture, past, context, actions)["total"]
         assert np.isposinf(total) if actions[0] == END else np.isfinite(total)
 
@@ -275,6 +287,14 @@ def test_only_the_papers_model_reads_past_actions(architecture):
     assert (largest_change(after, before) > 1e-4) == (architecture == "paper")
 
 
+@EACH_ARCHITECTURE
+def test_rewards_are_not_read(architecture):
+    context = random_context(9, 2)
+    others = context._replace(rewards=context.rewards + 1, return_so_far=np.float32(-5))
+    before, after = (run(architecture, 2, c, [0, MASK, 1]) for c in (context, others))
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
 @pytest.mark.parametrize("kind", [EMPTY, WALL])
 def test_ours_remembers_only_what_has_a_name(kind):
     context = with_kind(random_context(9, 2), kind)
@@ -293,7 +313,7 @@ def test_ours_sees_what_the_agent_faces_now_and_forgets_what_was_before_the_star
     context = context._replace(past=context.past._replace(pose=past))
     dx, dy = symmetries.DIRECTION_VECTORS[direction if faced_now else behind]
     context.observation.grid[x + dx, y + dy] = BALL, 2, 0
-    begun = context._replace(actions=np.full(2, ACTIONS + 1, np.int32))  # all PAD
+    begun = context._replace(actions=np.full(2, PAD, np.int32))
     known = run("leapjax", 2, context, [0, MASK, 1])["logits"]
     unknown = run("leapjax", 2, begun, [0, MASK, 1])["logits"]
     if faced_now:  # the past adds nothing to it
@@ -363,139 +383,30 @@ def test_turning_the_whole_world_changes_no_logits(past, goal):
         assert largest_change(other, before) > 1e-3
 
 
-# The encoders' building blocks against slow truths.
-
-
-def test_padding_after_the_instruction_changes_nothing():
-    module = encoders.InstructionEncoder(VOCABULARY, 16)
-    words = np.array([3, 1, 7], np.int32)
-    params = random_parameters(jax.eval_shape(module.init, jax.random.key(0), words))
-    encode = quick_jit(lambda p, w: module.apply(p, w).whole)
-    before = encode(params, words)
-    np.testing.assert_allclose(encode(params, np.append(words, [0, 0])), before, atol=1e-6)
-    for other in ([3, 1, 0], [3, 1, 6], [1, 3, 7]):
-        assert largest_change(encode(params, np.array(other, np.int32)), before) > 1e-3
-
-
-def test_min_plus_is_shortest_ways():
-    rng = np.random.default_rng(14)
-    cost = rng.uniform(0.1, 2.0, size=(SIDE, SIDE)).astype(np.float32)
-    start = rng.uniform(0.0, 12.0, size=(SIDE, SIDE)).astype(np.float32)
-    # Dijkstra from all cells at once: a way may end anywhere, at that cell's price.
-    distance = start.astype(np.float64)
-    queue = [(d, cell) for cell, d in np.ndenumerate(distance)]
-    heapq.heapify(queue)
-    while queue:
-        d, (x, y) = heapq.heappop(queue)
-        if d > distance[x, y]:
-            continue
-        for near in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
-            if min(near) >= 0 and max(near) < SIDE and d + cost[near] < distance[near]:
-                distance[near] = d + cost[near]
-                heapq.heappush(queue, (distance[near], near))
-    far = quick_jit(encoders.min_plus, static_argnums=2)
-    actual = far(start[..., None], cost[..., None], SIDE * SIDE)[..., 0]
-    np.testing.assert_allclose(actual, distance, rtol=1e-5)
-    assert (distance < start - 0.1).mean() > 0.3
-    # One sweep carries a distance one cell.
-    once = np.asarray(far(start[..., None], cost[..., None], 1)[..., 0])
-    padded = np.pad(start, 1, constant_values=np.inf)
-    near = np.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])
-    np.testing.assert_allclose(once, np.minimum(start, cost + near.min(0)), rtol=1e-6)
-
-
-def test_gradient_of_min_plus_is_its_slope():
-    rng = np.random.default_rng(0)  # no two ways of nearly equal length
-    cost = rng.uniform(0.1, 2.0, size=(3, 3, 1)).astype(np.float32)
-    start = rng.uniform(0.0, 6.0, size=(3, 3, 1)).astype(np.float32)
-    weight = rng.normal(size=(3, 3, 1)).astype(np.float32)
-
-    def weighted(start, cost):
-        return (weight * encoders.min_plus(start, cost, 9)).sum()
-
-    height = quick_jit(weighted)
-    gradients = quick_jit(jax.grad(weighted, (0, 1)))(start, cost)
-    assert all(np.count_nonzero(gradient) for gradient in gradients)
-    for which, gradient in enumerate(gradients):
-        for cell in np.ndindex(3, 3, 1):
-            up, down = [start.copy(), cost.copy()], [start.copy(), cost.copy()]
-            up[which][cell] += 1e-2
-            down[which][cell] -= 1e-2
-            slope = (height(*up) - height(*down)) / 2e-2
-            assert float(gradient[cell]) == pytest.approx(float(slope), abs=2e-3)
-
-
-@pytest.mark.parametrize(("side", "padding"), [(3, (1, 1)), (2, (1, 1)), (2, (0, 0))])
-def test_convolution_is_a_sum_over_neighbours(side, padding):
-    rng = np.random.default_rng(15)
-    image = rng.normal(size=(SIDE, SIDE, 2)).astype(np.float32)
-    module = encoders.Convolution(3, side, padding)
-    shapes = jax.eval_shape(module.init, jax.random.key(0), image)
-    params = random_parameters(shapes)
-    actual = quick_jit(module.apply)(params, image)
-    ((_, dense),) = params["params"].items()
-    kernel = dense["kernel"].reshape(side, side, 2, 3)
-    padded = np.pad(image, (padding, padding, (0, 0)))
-    size = SIDE + sum(padding) - side + 1
-    expected = np.broadcast_to(dense["bias"], (size, size, 3)).copy()
-    for x in range(size):
-        for y in range(size):
-            for dx in range(side):
-                for dy in range(side):
-                    expected[x, y] += padded[x + dx, y + dy] @ kernel[dx, dy]
-    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("position", [(0, 0), (2, 3), (6, 6), (0, 6)])
-def test_cells_are_read_where_they_are(position):
-    image = np.random.default_rng(16).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
-    where = np.array(position)
-    np.testing.assert_allclose(encoders.feature_at(image, where), image[position], rtol=1e-6)
-    x, y = position
-    for radius in (1, 2):
-        padded = np.pad(image, ((radius, radius), (radius, radius), (0, 0)))
-        expected = padded[x : x + 2 * radius + 1, y : y + 2 * radius + 1].reshape(-1)
-        actual = encoders.neighbourhood(image, where, radius)
-        np.testing.assert_array_equal(actual, expected)
-
-
-def test_a_goal_that_is_not_available_is_nowhere():
-    assert not np.asarray(encoders.one_cell(np.array([-1, -1]), SIDE)).any()
-    image = np.ones((SIDE, SIDE, 2), np.float32)
-    np.testing.assert_array_equal(encoders.feature_at(image, np.array([-1, -1])), [0, 0])
-
-
 # Lower precision.
 
 
 @EACH_ARCHITECTURE
 def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
-    sizes = Sizes(SIDE, VOCABULARY, ACTIONS, 2, HORIZON, MAX_STEPS)
-    config = tiny(architecture)
     params, _ = model(architecture, 2)
     context = random_context(0, 2)
     actions = jnp.zeros(HORIZON, jnp.int32)
-
-    def everything(module, context, actions):
-        return module.logits(module.encode(context), actions, EVERYWHERE)
-
-    found = {}
+    programs = {}
     for dtype in ("float32", "bfloat16"):
-        module = build(dataclasses.replace(config, dtype=dtype), sizes)
+        module = make(build, architecture, 2, dtype)
         shapes = jax.eval_shape(
             functools.partial(module.init, method=everything), jax.random.key(0), context, actions
         )
         assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
-        run = jax.jit(functools.partial(module.apply, method=everything))
-        found[dtype] = np.asarray(run(params, context, actions))[:, :-1]  # the end may be -inf
-        products = re.findall(
-            r"stablehlo.dot_general.*-> tensor<[^>]*x(\w+)>",
-            run.lower(params, context, actions).as_text(),
-        )
+        scores = jax.jit(functools.partial(module.apply, method=everything))
+        programs[dtype] = scores.lower(params, context, actions)
+        pattern = r"stablehlo.dot_general.*-> tensor<[^>]*x(\w+)>"
+        products = re.findall(pattern, programs[dtype].as_text())
         assert products and ("bf16" in products) == (dtype == "bfloat16")
-    assert found["bfloat16"].dtype == np.float32
-    difference = np.abs(found["bfloat16"] - found["float32"]).max()
-    assert 0 < difference < 0.05 * np.abs(found["float32"]).max()
+    low = np.asarray(programs["bfloat16"].compile()(params, context, actions))[:, :-1]
+    high = run(architecture, 2, context, actions)["logits"][:, :-1]  # the end may be -inf
+    assert low.dtype == np.float32
+    assert 0 < np.abs(low - high).max() < 0.05 * np.abs(high).max()
 
 
 def test_unknown_precision_is_refused():
@@ -514,3 +425,23 @@ def test_unknown_architecture_is_refused():
 def test_width_that_does_not_split_into_heads_is_refused():
     with pytest.raises(ValueError, match="width 10 is not a multiple of 4 heads"):
         ModelConfig(width=10, heads=4)
+
+
+def judge(module, context, actions):
+    return module.degree(module.encode(context), actions)
+
+
+@pytest.mark.parametrize(("kind", "method"), [(build, everything), (SequenceClassifier, judge)])
+@EACH_ARCHITECTURE
+def test_plans_of_another_length_are_refused(kind, method, architecture):
+    module = make(kind, architecture, 0)
+    init = functools.partial(module.init, method=method)
+
+    def parameters(horizon):
+        actions = np.zeros(horizon, np.int32)
+        return jax.eval_shape(init, jax.random.key(0), random_context(0, 0), actions)
+
+    assert parameters(HORIZON)
+    for horizon in (HORIZON - 1, HORIZON + 1):
+        with pytest.raises(ValueError, match=rf"shape \({horizon},\): .* was made for \(3,\)"):
+            parameters(horizon)

@@ -6,21 +6,13 @@ import socket
 import numpy as np
 import pytest
 
-from experiments.runtime import Cluster
+from experiments.common.runtime import Cluster
 from leapjax import processes
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes, join
-from tests.programs import Place, only_long
+from tests.programs import only_long, place_with_a_run
 
-STEPS = 60
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """Where the runs of this file go, with one of a single process on two devices."""
-    place = Place(tmp_path_factory.mktemp("processes"), STEPS)
-    place.finish(place.start("whole"))
-    return place
+place = pytest.fixture(place_with_a_run, scope="module")
 
 
 def start_two(place, runs, *options):
@@ -42,15 +34,15 @@ def test_two_processes_train_and_evaluate_as_one(place, fsdp, tolerance):
 
 @only_long
 def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
-    runs = start_two(place, "stopped")
-    place.wait_for_checkpoint(runs[0], "stopped")
+    runs = start_two(place, "one stopped")
+    place.wait_for_checkpoint(runs[0], "one stopped")
     runs[1].send_signal(signal.SIGTERM)
     errors = [run.communicate(timeout=100)[1] for run in runs]
     assert [run.returncode for run in runs] == [0, 0], errors
     assert all("stopped by SIGTERM; continue with" in error for error in errors)
     # A checkpoint does not know how many processes wrote it.
-    place.finish(place.start("stopped"))
-    place.check_same_end("stopped")
+    place.finish(place.start("one stopped"))
+    place.check_same_end("one stopped")
 
 
 def test_what_one_process_refuses_is_refused_by_all_before_any_work(place):
@@ -91,10 +83,10 @@ def test_alone_a_process_agrees_with_itself():
 
 def test_episodes_that_were_played_side_by_side_are_joined_in_order():
     seeds = np.arange(5)
-    whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, 9, 2.0, 3.0)
+    whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, seeds / 2, 9, 2.0, 3.0)
     parts = [
-        Episodes(seeds[:2], whole.successes[:2], whole.lengths[:2], 4, 1.0, 3.0),
-        Episodes(seeds[2:], whole.successes[2:], whole.lengths[2:], 5, 2.0, 2.5),
+        Episodes(*(array[:2] for array in whole[:4]), 4, 1.0, 3.0),
+        Episodes(*(array[2:] for array in whole[:4]), 5, 2.0, 2.5),
     ]
     for field, expected in zip(join(parts), whole, strict=True):
         np.testing.assert_array_equal(field, expected)

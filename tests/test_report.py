@@ -2,28 +2,31 @@
 
 from PIL import Image
 
-from experiments import plots, report
+from experiments import report
+from experiments.common import plots
 
 
 def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
     return {
-        "level": level, "preset": "leapjax", "demos": demos, "seed": seed, "episodes": 10,
-        "successes": successes, "validation": False, "paper_success": 95.0, "horizon": 5,
-        "executed": 5, "mean_length": 6.0, "configuration": {"training": {"masking": "random"}},
-        **others,
+        "level": level, "method": "leap", "preset": "leapjax", "demos": demos, "seed": seed,
+        "first_episode_seed": 0, "episodes": 200, "successes": 20 * successes,
+        "validation": False, "train_steps": 3000, "paper_success": 95.0, "horizon": 5, "executed": 5,
+        "mean_length": 6.0, "configuration": {"method_settings": {"masking": "random"}}, **others,
     }  # fmt: skip
 
 
 ROWS = [
     row(), row(seed=1, successes=10), row(demos=50, successes=5), row(demos=50, successes=7),
     row(demos=100, validation=True), row(demos=100, preset="paper"), row("PickUpLoc", successes=3),
+    # Other levels than all others are measured on, and a checkpoint played again.
+    row(first_episode_seed=1000, successes=0), row(episodes=400), row(train_steps=0, successes=0),
 ]  # fmt: skip
 
 
 def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_papers():
     found = cells(report.success(ROWS), "S8N7")
-    assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
-    assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
+    assert found[:5] == ["GoToLocalS8N7", "95.0%", "-", "-", "-"]
+    assert found[5].startswith("95.0% [") and found[5].endswith("2 seeds")
 
 
 def cells(table, level):
@@ -33,14 +36,20 @@ def cells(table, level):
 
 def test_settings_are_kept_apart():
     paper = [
-        row(preset="paper", successes=successes, configuration={"training": {"masking": masking}})
-        for masking, successes in (("one", 7), ("each", 8), ("random", 0))
+        row(preset="paper", successes=s, configuration={"method_settings": {"masking": masking}})
+        for masking, s in (("one", 7), ("each", 8), ("random", 0))
+    ]
+    nothing = {"configuration": {"method_settings": {}}}
+    others = [
+        row(method="random", demos=0, train_steps=0, successes=1, **nothing),
+        row(method="classifier", successes=0, **nothing),
     ]
     sooner = [row(executed=3, successes=10, mean_length=4.0), row(executed=1, successes=0)]
-    found = cells(report.success([*ROWS, *paper, *sooner]), "S8N7")
-    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "70.0", "80.0", "95.0", "100.0"]
+    found = cells(report.success([*ROWS, *paper, *others, *sooner]), "S8N7")
+    rates = ["95.0", "10.0", "70.0", "80.0", "95.0", "100.0"]
+    assert [cell.split("%")[0] for cell in found[1:]] == rates
     found = cells(report.steps([*ROWS, *sooner]), "S8N7")
-    assert found[1:] == ["-", "-", "6.0", "4.0"]
+    assert found[1:] == ["-", "-", "-", "6.0", "4.0"]
 
 
 def test_fewer_demonstrations_are_side_by_side():

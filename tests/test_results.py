@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from experiments import results
+from experiments.common import results
 
 
 @pytest.fixture

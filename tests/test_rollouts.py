@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from leapjax.envs.adapter import GymnasiumAdapter, Transition
+from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.planners import GibbsConfig
-from leapjax.rollouts import History, stack_contexts
+from leapjax.rollouts import History, join, stack_contexts
 from leapjax.types import Context, Plan
 
 LEFT, RIGHT, END = range(3)
@@ -21,13 +21,17 @@ GOAL, LIMIT = 6, 30
 
 
 class Corridor:
-    """Cells 0 .. 6; an episode starts at (seed mod 7) - 1, or at 0; 6 is success, -1 a fall."""
+    """Cells 0 .. 6; an episode starts at (seed mod 7) - 1, or at 0; 6 is success, -1 a fall.
+
+    Rewards say nothing of success: a quarter for each cell from 0.
+    """
 
     num_actions = NUM_ACTIONS
     made: ClassVar[list["Corridor"]] = []
 
     def __init__(self) -> None:
         self.taken: list[int] = []
+        self.rewards: list[float] = []
         Corridor.made.append(self)
 
     def reset(self, seed: int):
@@ -46,9 +50,9 @@ class Corridor:
         self.steps += 1
         over = self.position in (-1, GOAL)
         success = self.position == GOAL
-        return Transition(
-            self.observe(), float(success), over, not over and self.steps >= LIMIT, success
-        )
+        self.rewards.append(self.position / 4)
+        truncated = not over and self.steps >= LIMIT
+        return Transition(self.observe(), self.rewards[-1], over, truncated, success)
 
 
 @pytest.fixture(autouse=True)
@@ -103,6 +107,10 @@ class Recorder:
         self.contexts: list[Context] = []
         self.plans: list[Plan] = []
 
+    @property
+    def num_actions(self) -> int:
+        return self.plan.num_actions
+
     def __call__(self, params, keys, contexts) -> Plan:
         plans = self.plan(params, keys, contexts)
         self.contexts.append(contexts)
@@ -122,25 +130,30 @@ def test_history_against_everything_that_happened(length):
         for _ in range(8)
     ]
     actions = rng.integers(0, 3, 7).tolist()
+    rewards = (rng.integers(-9, 10, 7) / 4).tolist()
     history = History(states[0], length, NUM_ACTIONS)
     contexts = [history.context()]
-    for action, state in zip(actions, states[1:], strict=True):
-        history.advance(action, state)
+    for action, state, reward in zip(actions, states[1:], rewards, strict=True):
+        history.advance(action, state, reward)
         contexts.append(history.context())
     # Compared at the end, so that a later step that changes an earlier context shows.
     for now, context in enumerate(contexts):
         assert context.step == now == int(context.step)
+        assert context.return_so_far == sum(rewards[:now])
+        assert context.return_so_far.dtype == context.rewards.dtype == np.float32
         jax.tree.map(np.testing.assert_array_equal, context.observation, states[now])
         assert context.past["grid"].shape == (length, 2, 2)
-        assert context.past["x"].shape == context.actions.shape == (length,)
+        for values in (context.past["x"], context.actions, context.rewards):
+            assert values.shape == (length,)
         assert context.past["grid"].dtype == np.uint8 and context.actions.dtype == np.int32
         for slot in range(length):
             step = now - length + slot
             if step < 0:
-                assert context.actions[slot] == PAD
+                assert context.actions[slot] == PAD and context.rewards[slot] == 0
                 assert not context.past["grid"][slot].any() and context.past["x"][slot] == 0
             else:
                 assert context.actions[slot] == actions[step]
+                assert context.rewards[slot] == rewards[step]
                 np.testing.assert_array_equal(context.past["grid"][slot], states[step]["grid"])
                 assert context.past["x"][slot] == states[step]["x"]
 
@@ -151,10 +164,11 @@ def test_stacked_contexts_are_the_contexts_one_after_the_other(length):
     for episode in range(4):
         history = History({"x": np.array([10 * episode])}, length, NUM_ACTIONS)
         for step in range(episode):
-            history.advance(step, {"x": np.array([10 * episode + step + 1])})
+            history.advance(step, {"x": np.array([10 * episode + step + 1])}, float(step - 5))
         histories.append(history)
     stacked = stack_contexts(histories)
-    assert stacked.actions.shape == (4, length)
+    assert stacked.actions.shape == stacked.rewards.shape == (4, length)
+    np.testing.assert_array_equal(stacked.return_so_far, [0, -5, -9, -12])
     np.testing.assert_array_equal(stacked.step, [0, 1, 2, 3])
     for row, history in enumerate(histories):
         jax.tree.map(
@@ -172,6 +186,7 @@ def test_the_end_action_stops_a_plan_and_makes_the_next(steps):
     np.testing.assert_array_equal(episodes.seeds, seeds)
     assert episodes.successes.all()
     np.testing.assert_array_equal(episodes.lengths, distances)
+    np.testing.assert_array_equal(episodes.returns, [sum(c.rewards) for c in Corridor.made])
     # Every plan is good for so many steps, and an episode that is over asks for none.
     assert episodes.plans == np.ceil(distances / steps).sum()
     assert 0 < episodes.planning_seconds <= episodes.seconds
@@ -234,11 +249,15 @@ def test_finished_episodes_leave_the_batch():
         positions = np.array([start(seed) + call for seed in left])
         np.testing.assert_array_equal(contexts.observation["position"], positions)
         np.testing.assert_array_equal(contexts.step, np.full(len(left), call))
+        gained = sum((positions - back) / 4 for back in range(call))
+        np.testing.assert_array_equal(contexts.return_so_far, gained + 0 * positions)
         for back in (1, 2):
             known = call >= back
             past = contexts.past["position"][:, -back]
             np.testing.assert_array_equal(past, positions - back if known else 0 * positions)
             assert (contexts.actions[:, -back] == (RIGHT if known else PAD)).all()
+            reward = (positions - back + 1) / 4 if known else 0 * positions
+            np.testing.assert_array_equal(contexts.rewards[:, -back], reward)
     over = [sum(distance <= call + 1 for distance in distances) for call in range(max(distances))]
     assert reported == [(number, number) for number in over]
 
@@ -255,6 +274,7 @@ def test_an_episode_is_a_success_only_where_the_environment_says_so():
     )
     assert not fallen.successes.any()
     np.testing.assert_array_equal(fallen.lengths, [2, 5])
+    np.testing.assert_array_equal(fallen.returns, [-0.25, 1.25])  # (0 - 1) / 4, (3+2+1+0-1) / 4
     late = leap.evaluate(Corridor, [2], compiled(scripted_energy(there_and_back)), None, context=0)
     assert not late.successes.any()
     assert late.lengths == [LIMIT]
@@ -309,22 +329,61 @@ def give_up_after(rounds: int):
     return progress
 
 
+def test_episodes_that_were_played_side_by_side():
+    first, second, whole = (
+        leap.evaluate(Corridor, seeds, walker(), jnp.int32(2), context=0)
+        for seeds in ([0, 3], [6], [0, 3, 6])
+    )
+    joined = join([first, second])
+    for field in ("seeds", "successes", "lengths", "returns", "plans"):
+        np.testing.assert_array_equal(getattr(joined, field), getattr(whole, field), field)
+    assert joined.seconds == max(first.seconds, second.seconds)
+
+
 def test_plans_that_end_at_once_do_not_go_on_for_ever():
     plan = compiled(scripted_energy(ends_at_once))
     leap.evaluate(Corridor, [0], plan, None, context=0, progress=give_up_after(50))
 
 
-def test_to_execute_nothing_is_refused():
-    with pytest.raises(ValueError, match="executed"):
-        leap.evaluate(
-            Corridor,
-            [0],
-            walker(),
-            jnp.int32(1),
-            context=0,
-            executed=0,
-            progress=give_up_after(50),
-        )
+@pytest.mark.parametrize("max_steps", [1, 3, 6, 9])
+def test_an_episode_may_be_cut_off(max_steps):
+    seeds = [0, 3, 6]
+    episodes = leap.evaluate(
+        Corridor, seeds, walker(), jnp.int32(2), context=0, max_steps=max_steps
+    )
+    distances = np.array([GOAL - start(seed) for seed in seeds])
+    np.testing.assert_array_equal(episodes.lengths, np.minimum(distances, max_steps))
+    np.testing.assert_array_equal(episodes.successes, distances <= max_steps)
+    assert episodes.plans == np.ceil(episodes.lengths / 2).sum()
+
+
+@pytest.mark.parametrize("option", ["executed", "max_steps"])
+def test_to_execute_nothing_is_refused(option):
+    with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), context=0, **{option: 0})
+
+
+class WiderCorridor(Corridor):
+    num_actions = NUM_ACTIONS + 1
+
+
+class GrowingCorridor(Corridor):
+    def observe(self):
+        return {"position": np.zeros(self.steps, np.int32), "goal": np.array([GOAL], np.int32)}
+
+
+@pytest.mark.parametrize(
+    ("make", "seeds", "says"),
+    [
+        (Corridor, [], "no seeds"),
+        (functools.cache(Corridor), [0, 1], "same environment twice"),
+        (WiderCorridor, [0], "planner has 3 actions and the environment 4"),
+        (GrowingCorridor, [0], "observation of other shapes"),
+    ],
+)
+def test_environments_that_would_give_wrong_episodes_are_refused(make, seeds, says):
+    with pytest.raises(ValueError, match=says):
+        leap.evaluate(make, seeds, walker(), jnp.int32(1), context=0)
 
 
 @pytest.mark.parametrize("iteration", [0, ITERATIONS + 1])
@@ -338,7 +397,7 @@ def test_an_environment_may_reuse_its_buffers():
     history = History(buffer, 2, NUM_ACTIONS)
     for step in (1.0, 2.0):
         buffer["x"][:] = step
-        history.advance(0, buffer)
+        history.advance(0, buffer, 0.0)
     np.testing.assert_array_equal(history.context().past["x"], [[0, 0], [1, 1]])
     np.testing.assert_array_equal(history.context().observation["x"], [2, 2])
 
@@ -407,6 +466,8 @@ def test_evaluation_in_a_gymnasium_environment():
     episodes = leap.evaluate(make, seeds, plan, jnp.float32(1.5), context=0)
     np.testing.assert_array_equal(episodes.successes, starts < 1.5)
     np.testing.assert_array_equal(episodes.lengths, np.where(starts < 1.5, 4 - starts, 1))
+    # All steps cost one but the last, which gives two where it arrives.
+    np.testing.assert_array_equal(episodes.returns, np.where(starts < 1.5, starts - 1, -1))
     assert len(made) == len(seeds)
 
 
@@ -417,6 +478,16 @@ def test_evaluation_in_a_gymnasium_environment():
 def test_other_action_spaces_are_refused(space):
     with pytest.raises(ValueError, match="Discrete action space"):
         GymnasiumAdapter(Line(space))
+
+
+class OldLine(Line):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed, options=options)[0]
+
+
+def test_an_environment_of_the_old_interface_is_refused():
+    with pytest.raises(TypeError, match=r"not \(observation, info\): .*old interface"):
+        GymnasiumAdapter(OldLine()).reset(0)
 
 
 def test_actions_that_do_not_start_at_zero():

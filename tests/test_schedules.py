@@ -1,10 +1,8 @@
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from leapjax.schedules import MASKINGS, linear_temperatures, sample_masks
+from leapjax.schedules import MASKINGS, sample_masks
 from tests.enumerable import fit_p_value, quick_jit
 
 HORIZON = 4
@@ -62,28 +60,3 @@ def test_a_single_action_is_always_masked(masking):
 def test_unknown_masking_is_refused(masking):
     with pytest.raises(ValueError, match=r"unknown masking.*one, each, random"):
         sample_masks(jax.random.key(0), HORIZON, masking)
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.floats(0, 100), st.floats(0, 100), st.integers(1, 12))
-def test_temperatures_are_linear(first, last, iterations):
-    # One iteration has nowhere to go: it is the first.
-    steps = max(iterations - 1, 1)
-    expected = [first + (last - first) * i / steps for i in range(iterations)]
-    actual = linear_temperatures(first, last, iterations)
-    assert actual.shape == (iterations,)
-    np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=1e-5)
-    assert (np.asarray(actual) >= 0).all()
-
-
-@pytest.mark.parametrize("temperature", [-0.1, float("inf"), float("nan")])
-def test_impossible_temperatures_are_refused(temperature):
-    with pytest.raises(ValueError, match="finite and at least 0"):
-        linear_temperatures(temperature, 1.0, 3)
-    with pytest.raises(ValueError, match="finite and at least 0"):
-        linear_temperatures(1.0, temperature, 3)
-
-
-def test_no_iteration_is_refused():
-    with pytest.raises(ValueError, match="iterations"):
-        linear_temperatures(1.0, 1.0, 0)

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import babyai, results
-from experiments.config import Config
+from experiments.common.config import Config
 from leapjax import batching, planners, pretrained, rollouts, sharding, training
 from leapjax.agents import leap
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.envs import levels
-from leapjax.envs.adapter import BabyAIAdapter
+from leapjax.babyai import levels
+from leapjax.babyai.adapter import BabyAIAdapter
 from tests.programs import LONG, only_long
 from tests.test_training import MODEL, TRAINING
 

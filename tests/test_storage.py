@@ -14,6 +14,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage
 
+from leapjax import files
 from leapjax.babyai import levels, observations
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.observations import Observation
@@ -233,14 +234,14 @@ def test_several_processes_make_the_same_data_set(local_demonstrations, minari_f
 
 
 def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
-    monkeypatch.setattr(storage, "SPARE_BYTES", 2**60)
-    with pytest.raises(UserError, match=r"\d+ MiB are free in .* MINARI_DATASETS_PATH"):
+    monkeypatch.setattr(files, "SPARE", 2**60)
+    with pytest.raises(UserError, match=r"\d+ MiB are free in .* make room"):
         save(local_demonstrations)
 
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(storage, "SPARE_BYTES", 0)
+    monkeypatch.setattr(files, "SPARE", 0)
     monkeypatch.setattr(MinariStorage, "update_metadata", full)
     with pytest.raises(UserError, match="cannot write the data set .*No space left on device"):
         save(local_demonstrations)

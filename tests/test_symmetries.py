@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from minigrid.envs.babyai.core.verifier import AfterInstr, BeforeInstr
 
-from leapjax.data import demonstrations, symmetries
-from leapjax.data.symmetries import Renaming
-from leapjax.envs import levels, vocabulary
-from leapjax.envs.adapter import BabyAIAdapter
-from leapjax.types import Observation
+from leapjax.babyai.symmetries import Renaming
+from leapjax.babyai import demonstrations, levels, symmetries, vocabulary
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.observations import Observation
 from tests.dynamics import FRONT, stepped
 from tests.oracles import assert_same_observation
 

@@ -10,41 +10,40 @@ import optax
 import pytest
 
 from leapjax import sharding, training
-from leapjax.agents import leap
-from leapjax.agents.leap import TrainingConfig
+from leapjax.agents import leap, learning
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.babyai.adapter import NUM_ACTIONS
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.settings import Settings
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.envs import vocabulary
-from leapjax.envs.adapter import NUM_ACTIONS
+from leapjax.domain import blank_context
+from leapjax.errors import UserError
 from leapjax.models import trajectory
-from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.planners import GibbsConfig
+from leapjax.models.trajectory import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
+from tests import toy
 
-WORDS, SIDE = 5, 7
-SIZES = Sizes(SIDE, vocabulary.SIZE, NUM_ACTIONS, context=0, horizon=4, max_steps=49)
-MODEL = ModelConfig(
-    layers=1, heads=2, width=16, channels=4, rounds=1, sweeps=2, fields=2, dropout=0.0
-)
-TRAINING = TrainingConfig(steps=400, batch=8, warmup=20, learning_rate=1e-2)
-DROPOUT = dataclasses.replace(MODEL, dropout=0.1)
-AUGMENTED = dataclasses.replace(TRAINING, augment=True)
+MODEL = ModelConfig(layers=1, heads=2, width=16)
+TRAINING = TrainingConfig(steps=250, batch=16, warmup=20, learning_rate=1e-2)
+LEVEL = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
+
+
+def setup(domain=toy.DOMAIN, model=MODEL, training=TRAINING) -> Setup:
+    return Setup(domain, 0, 4, model, training, leap.Settings())
 
 
 @functools.cache
 def tiny() -> tuple[Agent, object]:
     """An agent and its train step, compiled once for all tests."""
-    agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS)
-    step = training.make_train_step(
-        agent, lambda key, data: leap.make_batch(key, data, TRAINING, SIZES)
-    )
-    return agent._replace(init=jax.jit(agent.init)), step
+    agent = leap.make_agent(setup())
+    return agent._replace(init=jax.jit(agent.init)), training.make_train_step(agent)
 
 
-@pytest.fixture
-def data(local_demonstrations):
-    return jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations))
+@pytest.fixture(scope="module")
+def data():
+    return jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
 
 
 def ignore(step, state, means):
@@ -90,14 +89,12 @@ def recording_agent() -> Agent:
         metrics = {"loss": jnp.zeros(()), "batch": batch, "key": jax.random.key_data(key)}
         return TrainState(params, (), state.step + 1), metrics
 
-    return Agent(init, update, None, lambda params, key, context: None)
+    return Agent(init, learning.window_batches(setup()), update, None)
 
 
 def test_batch_k_is_a_function_of_the_key_and_k(data):
     agent = recording_agent()
-    step = training.make_train_step(
-        agent, lambda key, data: leap.make_batch(key, data, AUGMENTED, SIZES)
-    )
+    step = training.make_train_step(agent)
     key = jax.random.key(3)
 
     def at(k: int, weight: float = 0.0, key=key):
@@ -105,9 +102,9 @@ def test_batch_k_is_a_function_of_the_key_and_k(data):
         return step(state, data, key)[1]
 
     shapes = jax.tree.map(jnp.shape, at(0)["batch"])
-    assert shapes.actions == (8, 4)
-    assert shapes.context.observation.grid == (8, SIDE, SIDE, 3)
-    assert shapes.context.past.grid == (8, 0, SIDE, SIDE, 3)
+    assert shapes.actions == (16, 4)
+    assert shapes.context.observation == (16, 3)
+    assert shapes.context.past == (16, 0, 3)
 
     state, seen = agent.init(key), []
     for k in range(4):
@@ -130,27 +127,51 @@ def test_batch_k_is_a_function_of_the_key_and_k(data):
     assert not np.array_equal(seen[0]["key"], jax.random.key_data(batch_key))
 
 
+def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
+    def noted(key, window):
+        return window._replace(extras=(*window.extras, jax.random.uniform(key)))
+
+    def doubled(key, window):
+        window = noted(key, window)
+        return window._replace(actions=2 * window.actions)
+
+    def shifted(key, window):
+        window = noted(key, window)
+        return window._replace(actions=window.actions + 1)
+
+    def draw(*augmentations):
+        domain = toy.DOMAIN._replace(augmentations=augmentations)
+        return jax.jit(learning.window_batches(setup(domain)))(jax.random.key(0), data)
+
+    first, second = draw(doubled, shifted), draw(shifted, doubled)
+    original = (second.actions - 1) // 2
+    np.testing.assert_array_equal(first.actions, 2 * (original + 1))
+    assert ((original >= 0) & (original <= toy.END)).all()
+    assert len(np.unique(np.stack(first.extras))) == 2 * TRAINING.batch
+
+
 def entropy_of_positions(data) -> float:
     """The least loss of a model that looks at nothing but the position in the plan."""
     many = dataclasses.replace(TRAINING, batch=1000)
-    draw = jax.jit(lambda key: leap.make_batch(key, data, many, SIZES).actions)
-    actions = np.asarray(draw(jax.random.key(0)))
+    draw = jax.jit(learning.window_batches(setup(LEVEL, training=many)))
+    actions = np.asarray(draw(jax.random.key(0), data).actions)
     shares = np.stack([(actions == action).mean(axis=0) for action in range(NUM_ACTIONS)])
     return float(-(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=0).mean())
 
 
-def test_it_learns_a_few_demonstrations_by_heart(data):
-    agent, step = tiny()
+def test_it_learns_a_few_demonstrations_by_heart(local_demonstrations):
+    agent = leap.make_agent(setup(LEVEL, dataclasses.replace(MODEL, dropout=0.0)))
+    step = training.make_train_step(agent)
+    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
     losses, accuracies = [], []
 
     def report(done, state, means):
         losses.append(means["loss"])
         accuracies.append(means["accuracy"])
 
-    training.train(
-        step, agent.init(jax.random.key(0)), data, jax.random.key(1), 400, report, report_every=50
-    )
-    assert len(losses) == 8
+    state = jax.jit(agent.init)(jax.random.key(0))
+    training.train(step, state, data, jax.random.key(1), TRAINING.steps, report, 25)
+    assert len(losses) == 10
     assert losses[-1] < 0.6 * losses[0]
     assert losses[-1] < 0.7 * entropy_of_positions(data)
     assert accuracies[-1] > accuracies[0] + 0.15
@@ -224,11 +245,9 @@ def test_a_real_run_whose_parameters_break_is_stopped(data):
 
 def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
     """A model's parameters, and the paths of the modules that are embeddings or norms."""
-    model = ModelConfig(
-        architecture, layers=1, heads=2, width=16, channels=4, rounds=1, sweeps=2, fields=2
-    )
-    sizes = Sizes(SIDE, vocabulary.SIZE, NUM_ACTIONS, context=2, horizon=3, max_steps=49)
-    module = trajectory.build(model, sizes)
+    model = dataclasses.replace(MODEL, architecture=architecture)
+    made = Setup(LEVEL, 2, 3, model, TRAINING, leap.Settings())
+    module = trajectory.build(model, made.sizes, made.encoder())
     found = set()
 
     def note(call, args, kwargs, context):
@@ -236,20 +255,19 @@ def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
             found.add(context.module.path)
         return call(*args, **kwargs)
 
-    def init(key):
-        context = trajectory.blank_context(sizes, WORDS)
+    def init(key, context):
         with nn.intercept_methods(note):
-            actions = jnp.zeros(sizes.horizon, jnp.int32)
+            actions = jnp.zeros(3, jnp.int32)
             return module.init(key, context, actions, method=leap._encode_and_score)
 
-    return jax.eval_shape(init, jax.random.key(0)), found
+    return jax.eval_shape(init, jax.random.key(0), blank_context(LEVEL, 2)), found
 
 
 @pytest.mark.parametrize("architecture", trajectory.ARCHITECTURES)
 def test_weight_decay_leaves_embeddings_norms_and_biases(architecture):
     params, special = parameters_of(architecture)
     assert len(special) > 4
-    mask = leap.decayed_parameters(params)
+    mask = learning.decayed_parameters(params)
     assert jax.tree.structure(mask) == jax.tree.structure(params)
     decayed = 0
     for path, is_decayed in jax.tree_util.tree_leaves_with_path(mask):
@@ -263,7 +281,7 @@ def test_weight_decay_leaves_embeddings_norms_and_biases(architecture):
 
 def test_weight_decay_shrinks_what_has_no_gradient():
     config = TrainingConfig(steps=100, warmup=0, learning_rate=0.5, weight_decay=0.1)
-    optimizer = leap.make_optimizer(config)
+    optimizer = learning.make_optimizer(config)
     params = {
         "dense": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)},
         "norm": {"scale": jnp.ones(2)},
@@ -280,7 +298,7 @@ def test_weight_decay_shrinks_what_has_no_gradient():
 
 def learning_rates(config: TrainingConfig) -> np.ndarray:
     """What each step really moves: Adam's update of a constant gradient is the rate itself."""
-    optimizer = leap.make_optimizer(config)
+    optimizer = learning.make_optimizer(config)
     params = {"bias": jnp.zeros(())}
 
     def step(state, _):
@@ -313,7 +331,7 @@ def test_a_short_run_warms_up_for_a_tenth_of_it_at_most(steps):
 def test_gradients_are_clipped_by_their_global_norm():
     config = TrainingConfig(steps=10, warmup=0, clip=1.0)
     # Adam forgets the scale of a gradient, so look at what it remembers of the first.
-    optimizer = leap.make_optimizer(config)
+    optimizer = learning.make_optimizer(config)
     params = {"bias": jnp.zeros(2)}
     start, update = optimizer.init(params), jax.jit(optimizer.update)
 
@@ -330,49 +348,52 @@ def test_gradients_are_clipped_by_their_global_norm():
 
 
 @pytest.mark.parametrize(
-    ("setting", "says"),
+    ("kind", "setting", "says"),
     [
-        ({"steps": 0}, "steps must be at least 1"),
-        ({"batch": 0}, "batch must be at least 1"),
-        ({"masking": "all"}, "unknown masking 'all'"),
-        ({"windows": "window"}, "unknown windows 'window'"),
+        (TrainingConfig, {"steps": -1}, "steps must be at least 0"),
+        (TrainingConfig, {"batch": 0}, "batch must be at least 1"),
+        (TrainingConfig, {"windows": "window"}, "unknown windows 'window'"),
+        (leap.Settings, {"masking": "all"}, "unknown masking 'all'"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(setting, says):
+def test_settings_that_cannot_work_are_refused(kind, setting, says):
     with pytest.raises(ValueError, match=says):
-        TrainingConfig(**setting)
+        kind(**setting)
+
+
+def test_an_architecture_that_the_domain_has_no_encoder_for_is_refused():
+    paper = dataclasses.replace(MODEL, architecture="paper")
+    with pytest.raises(UserError, match="Line has no encoder for architecture 'paper': .*leapjax"):
+        leap.make_agent(setup(model=paper))
 
 
 # Batches that are split over devices.
 
 
-def gradient_step(devices, data, batch=16, fsdp=1):
-    """The gradient and the metrics of one step on so many devices, and its parameters."""
-    config = dataclasses.replace(AUGMENTED, batch=batch)
-    mesh = sharding.make_mesh(batch, jax.devices()[:devices], fsdp) if devices else None
-    agent = leap.make_agent(DROPOUT, config, GibbsConfig(4, 4), SIZES, WORDS, mesh)
-    step = training.make_train_step(
-        agent, lambda key, data: leap.make_batch(key, data, config, SIZES)
-    )
-    if mesh is None:
-        state, key = jax.jit(agent.init)(jax.random.key(0)), jax.random.key(0)
-    else:
-        assert mesh.size == devices
-        state, key = training.make_begin(agent, mesh)(0)
-        data = sharding.replicate(data, mesh)
+def gradient_step(step, state, data, key):
+    """The gradient and the metrics of one step, and its parameters."""
     before = jax.tree.map(lambda leaf: leaf.sharding, state)
     state, metrics = step(state, data, key)
-    assert jax.tree.map(lambda leaf: leaf.sharding, state) == before or mesh is None
+    assert jax.tree.map(lambda leaf: leaf.sharding, state) == before
     # Adam's first moment after one step from zero is the gradient times 1 - beta.
     moments = optax.tree.get(state.optimizer, "mu")
     return jax.device_get((moments, metrics)), state.params
 
 
-@pytest.mark.parametrize(("devices", "fsdp"), [(1, 1), (8, 1), (8, 2), (8, 8)])
-def test_a_step_split_over_devices_is_the_step_of_one(devices, fsdp, data):
-    (expected, expected_metrics), _ = gradient_step(0, data)
-    (actual, metrics), params = gradient_step(devices, data, fsdp=fsdp)
+@pytest.mark.parametrize("fsdp", [1, 2])
+def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
+    agent, step = tiny()
+    key = jax.random.key(0)
+    (expected, expected_metrics), _ = gradient_step(step, agent.init(key), data, key)
+
+    mesh = sharding.make_mesh(TRAINING.batch, fsdp=fsdp)
+    assert mesh.size == 8
+    agent = leap.make_agent(setup(), mesh)
+    begun, data = training.make_begin(agent, mesh)(0), sharding.replicate(data, mesh)
+    step = training.make_train_step(agent)
+    (actual, metrics), params = gradient_step(step, begun[0], data, begun[1])
     largest = max(jax.tree.leaves(params), key=lambda leaf: leaf.size)
+    assert largest.size >= sharding.SMALLEST_SPLIT
     assert largest.sharding.shard_shape(largest.shape) != largest.shape or fsdp == 1
     assert largest.addressable_data(0).size == largest.size // fsdp
     assert any(np.abs(leaf).max() > 1e-3 for leaf in jax.tree.leaves(expected))
@@ -412,11 +433,11 @@ def test_large_parameters_are_split_and_small_ones_are_not():
     assert_identical(sharding.to_host(placed), jax.device_get(tree))
 
 
-def test_a_checkpoint_goes_on_with_another_split_of_the_parameters(data, tmp_path):
+def test_a_checkpoint_goes_on_with_another_split_of_the_parameters(tmp_path):
     states = {}
     for fsdp in (1, 4):
         mesh = sharding.make_mesh(8, fsdp=fsdp)
-        agent = leap.make_agent(MODEL, TRAINING, GibbsConfig(4, 4), SIZES, WORDS, mesh)
+        agent = leap.make_agent(setup(), mesh)
         states[fsdp], _ = training.make_begin(agent, mesh)(fsdp)
     saved = Checkpoints(tmp_path / "checkpoints")
     saved.save(states[4])
@@ -425,3 +446,73 @@ def test_a_checkpoint_goes_on_with_another_split_of_the_parameters(data, tmp_pat
     assert_identical(restored, sharding.to_host(states[4]))
     kept = jax.tree.map(lambda leaf: leaf.sharding, restored)
     assert kept == jax.tree.map(lambda leaf: leaf.sharding, states[1])
+
+
+# What no gradient touches.
+
+
+RATE, MOMENTUM, KEPT, SIZE = 0.1, 0.5, 0.9, 32  # SIZE^2 is just enough to be split
+
+
+def average_agent(mesh) -> Agent:
+    """Least squares against half of its own slow average."""
+    optimizer = optax.sgd(RATE, MOMENTUM)
+
+    def loss(params, extra, example, key):
+        inputs, targets = example
+        wanted = targets + 0.5 * inputs @ extra["average"]
+        return 0.5 * jnp.sum((inputs @ params["w"] - wanted) ** 2), {}
+
+    def next_extra(extra, params):
+        average = KEPT * extra["average"] + (1 - KEPT) * params["w"]
+        return {"average": average, "steps": extra["steps"] + 1}
+
+    def init(key):
+        w = jax.random.normal(key, (SIZE, SIZE))
+        extra = {"average": jnp.ones((SIZE, SIZE)), "steps": jnp.int32(0)}
+        return TrainState({"w": w}, optimizer.init({"w": w}), jnp.int32(0), extra)
+
+    update = learning.make_update(loss, optimizer, mesh, next_extra)
+    return Agent(init, lambda key, data: data, update, None)
+
+
+def averages(w, inputs, targets, steps):
+    """The same in NumPy."""
+    average, velocity = np.ones_like(w), np.zeros_like(w)
+    for _ in range(steps):
+        errors = inputs @ w - targets - 0.5 * inputs @ average
+        velocity = MOMENTUM * velocity + inputs.T @ errors / len(inputs)
+        w = w - RATE * velocity
+        average = KEPT * average + (1 - KEPT) * w
+    return w, average
+
+
+@pytest.mark.parametrize("fsdp", [None, 1, 8])
+def test_extra_state_follows_the_parameters_and_not_the_gradient(fsdp, tmp_path):
+    rng = np.random.default_rng(0)
+    data = tuple(rng.normal(size=(16, SIZE)).astype(np.float32) for _ in range(2))
+    mesh = sharding.make_mesh(16, fsdp=fsdp) if fsdp else None
+    agent = average_agent(mesh)
+    if mesh is None:
+        begin = lambda seed: (agent.init(jax.random.key(seed)), jax.random.key(seed))  # noqa: E731
+    else:
+        begin, data = training.make_begin(agent, mesh), sharding.replicate(data, mesh)
+    step = training.make_train_step(agent)
+
+    state, key = begin(0)
+    w = np.asarray(state.params["w"], np.float64)
+    split = state.extra["average"].addressable_data(0).size
+    assert split == SIZE**2 // (fsdp or 1)
+    state = training.train(step, state, data, key, 3, ignore)
+    saved = Checkpoints(tmp_path / "checkpoints")
+    saved.save(state)
+    restored = saved.restore(begin(1)[0])
+    saved.close()
+    assert_identical(restored, state)
+    state = training.train(step, restored, data, key, 5, ignore)
+
+    expected = averages(w, *(np.asarray(part, np.float64) for part in data), 5)
+    np.testing.assert_allclose(state.params["w"], expected[0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(state.extra["average"], expected[1], rtol=1e-4, atol=1e-5)
+    assert state.extra["steps"] == 5
+    assert state.extra["average"].addressable_data(0).size == split

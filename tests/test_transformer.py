@@ -1,9 +1,11 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.models.transformer import KeysValues, Transformer
+from leapjax.models.transformer import KeysValues, Transformer, causal_mask
 from tests.enumerable import quick_jit
 
 LAYERS, WIDTH, HEADS = 2, 16, 2
@@ -25,20 +27,14 @@ PARAMS = random_like(jax.eval_shape(MODULE.init, jax.random.key(0), X, EVERYWHER
 
 
 @quick_jit
-def run(params, x, queried):
-    return MODULE.apply(params, x, queried)
+def run(params, x, queried, mask=None):
+    return MODULE.apply(params, x, queried, mask=mask)
 
 
 @quick_jit
-def run_with_prefix(params, fixed, x, queried, prefix_mask):
+def run_with_prefix(params, fixed, x, queried, prefix_mask=None, mask=None):
     memory = MODULE.apply(params, fixed, prefix_mask, method="prefix")
-    return MODULE.apply(params, x, queried, memory, prefix_mask)
-
-
-@quick_jit
-def run_with_unmasked_prefix(params, fixed, x, queried):
-    memory = MODULE.apply(params, fixed, method="prefix")
-    return MODULE.apply(params, x, queried, memory)
+    return MODULE.apply(params, x, queried, memory, mask)
 
 
 # The oracle: all tokens together, an explicit mask, one head at a time, in float64.
@@ -80,15 +76,22 @@ def oracle(params, x, mask):
     return norm(params["norm"], x)
 
 
-def joint_mask(prefix_mask=None):
-    """The prefix sees itself; the tokens see the prefix and each other."""
-    mask = np.zeros((PREFIX + TOKENS, PREFIX + TOKENS), bool)
-    mask[:, :PREFIX] = True if prefix_mask is None else prefix_mask
-    mask[PREFIX:, PREFIX:] = True
-    return mask
+def joint_mask(prefix_mask=True, mask=True):
+    """The prefix sees itself; the tokens see the prefix and each other: where they may."""
+    joint = np.zeros((PREFIX + TOKENS, PREFIX + TOKENS), bool)
+    joint[:PREFIX, :PREFIX] = prefix_mask
+    joint[PREFIX:] = mask
+    return joint
+
+
+def some_mask(rows, columns):
+    """Half of all pairs, and each token itself."""
+    own = np.eye(rows, columns, columns - rows, dtype=bool)
+    return own | (np.random.default_rng(rows + columns).random((rows, columns)) < 0.4)
 
 
 ALL = np.ones((PREFIX + TOKENS, PREFIX + TOKENS), bool)
+AMONG_PREFIX, OF_TOKENS = some_mask(PREFIX, PREFIX), some_mask(TOKENS, PREFIX + TOKENS)
 CLOSE = {"rtol": 1e-4, "atol": 1e-4}
 JOINED = np.concatenate([FIXED, X])
 
@@ -98,8 +101,16 @@ def test_bidirectional_attention_equals_the_oracle():
     np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE), expected, **CLOSE)
 
 
+def test_attention_under_any_mask_equals_the_oracle():
+    mask = some_mask(TOKENS, TOKENS)
+    expected = oracle(PARAMS, X, mask)
+    np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE, mask), expected, **CLOSE)
+    for other in (mask.T, np.ones_like(mask)):  # rows look, columns are looked at
+        assert np.abs(oracle(PARAMS, X, other) - expected).max() > 0.05
+
+
 def test_cached_prefix_equals_running_all_tokens_together():
-    actual = run_with_unmasked_prefix(PARAMS, FIXED, X, EVERYWHERE)
+    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE)
     expected = oracle(PARAMS, JOINED, joint_mask())[PREFIX:]
     np.testing.assert_allclose(actual, expected, **CLOSE)
     # The mask matters: a prefix that saw the tokens would give something else.
@@ -107,41 +118,70 @@ def test_cached_prefix_equals_running_all_tokens_together():
 
 
 def test_masked_prefix_equals_running_all_tokens_together():
-    prefix_mask = np.array([True, False, True, False])
-    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, prefix_mask)
-    expected = oracle(PARAMS, JOINED, joint_mask(prefix_mask))[PREFIX:]
+    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, AMONG_PREFIX, OF_TOKENS)
+    expected = oracle(PARAMS, JOINED, joint_mask(AMONG_PREFIX, OF_TOKENS))[PREFIX:]
     np.testing.assert_allclose(actual, expected, **CLOSE)
-    assert np.abs(oracle(PARAMS, JOINED, joint_mask())[PREFIX:] - expected).max() > 0.05
+    # Each of the two masks matters.
+    for other in (joint_mask(mask=OF_TOKENS), joint_mask(AMONG_PREFIX)):
+        assert np.abs(oracle(PARAMS, JOINED, other)[PREFIX:] - expected).max() > 0.05
+
+
+HIDDEN = np.array([False, True, False, True])  # of the prefix, to all
+
+
+def hiding(hidden):
+    """The two masks that let nobody see some tokens of the prefix."""
+    return np.tile(~hidden, (PREFIX, 1)), np.tile(np.append(~hidden, [True] * TOKENS), (TOKENS, 1))
 
 
 def test_masked_prefix_tokens_change_nothing():
-    prefix_mask = np.array([True, False, True, False])
-    changed = FIXED + np.where(prefix_mask, 0.0, 3.0)[:, None].astype(np.float32)
-    before = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, prefix_mask)
-    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, prefix_mask)
+    changed = FIXED + np.where(HIDDEN, 3.0, 0.0)[:, None].astype(np.float32)
+    before = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, *hiding(HIDDEN))
+    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, *hiding(HIDDEN))
     np.testing.assert_array_equal(after, before)
     changed[0] += RNG.normal(size=WIDTH)
-    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, prefix_mask)
+    after = run_with_prefix(PARAMS, changed, X, EVERYWHERE, *hiding(HIDDEN))
     assert np.abs(after - before).max() > 0.05
 
 
 def test_a_prefix_that_is_masked_everywhere_is_no_prefix():
-    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, np.zeros(PREFIX, bool))
+    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, *hiding(np.ones(PREFIX, bool)))
     np.testing.assert_allclose(actual, run(PARAMS, X, EVERYWHERE), **CLOSE)
+
+
+@pytest.mark.parametrize("prefix", [0, PREFIX])
+def test_a_causal_mask_hides_later_tokens(prefix):
+    mask = np.asarray(causal_mask(TOKENS, prefix))
+    assert mask.dtype == bool
+    expected = [[j < prefix or j - prefix <= i for j in range(prefix + TOKENS)] for i in EVERYWHERE]
+    np.testing.assert_array_equal(mask, expected)
+
+    def outputs(x):
+        if prefix:
+            everything = np.ones((PREFIX, PREFIX), bool)
+            return run_with_prefix(PARAMS, FIXED, x, EVERYWHERE, everything, mask)
+        return run(PARAMS, x, EVERYWHERE, mask)
+
+    before = outputs(X)
+    for token in range(TOKENS):
+        changed = X.copy()
+        changed[token] += RNG.normal(size=WIDTH)
+        difference = np.abs(outputs(changed) - before).max(axis=1)
+        np.testing.assert_array_equal(difference[:token], 0)
+        assert (difference[token:] > 0.01).all()
 
 
 @pytest.mark.parametrize("queried", [[2], [4, 0], [3, 3, 1]])
 def test_last_layer_at_queried_positions_is_the_full_output_there(queried):
     queried = np.array(queried)
-    np.testing.assert_allclose(
-        run(PARAMS, X, queried), run(PARAMS, X, EVERYWHERE)[queried], rtol=1e-5, atol=1e-5
-    )
-    np.testing.assert_allclose(
-        run_with_unmasked_prefix(PARAMS, FIXED, X, queried),
-        run_with_unmasked_prefix(PARAMS, FIXED, X, EVERYWHERE)[queried],
-        rtol=1e-5,
-        atol=1e-5,
-    )
+
+    def masked(queried):
+        return run_with_prefix(PARAMS, FIXED, X, queried, AMONG_PREFIX, OF_TOKENS)
+
+    for outputs in (functools.partial(run, PARAMS, X), masked):
+        np.testing.assert_allclose(
+            outputs(queried), outputs(EVERYWHERE)[queried], rtol=1e-5, atol=1e-5
+        )
 
 
 def test_attention_without_positions_is_equivariant_to_order():

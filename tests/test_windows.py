@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from leapjax.babyai.augmentation import way
+from leapjax.babyai.observations import Observation
 from leapjax.data import windows
-from leapjax.data.demonstrations import Demonstration
-from leapjax.data.windows import Steps, Window
-from leapjax.types import Context, Observation
+from leapjax.data.windows import Steps
+from leapjax.types import Context, Demonstration, Window
 from tests.oracles import assert_same_observation
 
 SIDE, WORDS, DROP = 8, 3, 4
@@ -30,6 +31,9 @@ def toy_demonstration(rng: np.random.Generator, steps: int, episode: int) -> Dem
             rng.integers(1, 30, (n, WORDS)).astype(np.int32),
         ),
         rng.integers(0, END, steps).astype(np.int32),
+        (rng.integers(-9, 10, steps) / 4).astype(np.float32),  # their sums are exact
+        terminated=episode in (0, 2),
+        truncated=episode in (1, 2),
         seed=episode,
     )
 
@@ -39,6 +43,10 @@ def toy_demonstrations(seed: int = 0) -> list[Demonstration]:
     return [toy_demonstration(rng, steps, episode) for episode, steps in enumerate(LENGTHS)]
 
 
+def laid_out(demonstrations: list[Demonstration]) -> Steps:
+    return windows.concatenate(demonstrations, extras=way)
+
+
 def on_device(steps: Steps) -> Steps:
     return jax.tree.map(jnp.asarray, steps)
 
@@ -46,11 +54,12 @@ def on_device(steps: Steps) -> Steps:
 def slow_window(demonstration: Demonstration, start: int, context: int, horizon: int) -> Window:
     """What a window is, one element at a time."""
     states, actions = demonstration.observations, demonstration.actions
-    past, taken = [], []
+    past, taken, given = [], [], []
     for step in range(start - context, start):
         known = step >= 0
         past.append(jax.tree.map(lambda x, s=step, k=known: x[s] if k else 0 * x[0], states))
         taken.append(actions[step] if known else PAD)
+        given.append(demonstration.rewards[step] if known else 0)
     blank = jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), states)
     planned = [actions[i] if i < len(actions) else END for i in range(start, start + horizon)]
     return Window(
@@ -58,7 +67,9 @@ def slow_window(demonstration: Demonstration, start: int, context: int, horizon:
             jax.tree.map(lambda x: x[start], states),
             jax.tree.map(lambda *xs: np.stack(xs), *past) if past else blank,
             np.array(taken, np.int32),
+            np.array(given, np.float32),
             np.int32(start),
+            np.float32(sum(demonstration.rewards[:start].tolist())),
         ),
         np.array(planned, np.int32),
         slow_way(demonstration, start),
@@ -86,19 +97,62 @@ def window_at(context: int, horizon: int):
 def assert_same_window(actual: Window, expected: Window) -> None:
     assert_same_observation(actual.context.observation, expected.context.observation)
     assert_same_observation(actual.context.past, expected.context.past)
-    np.testing.assert_array_equal(actual.context.actions, expected.context.actions)
-    np.testing.assert_array_equal(actual.context.step, expected.context.step)
+    for field in ("actions", "rewards", "step", "return_so_far"):
+        values = (getattr(w.context, field) for w in (actual, expected))
+        np.testing.assert_array_equal(*values, field)
     np.testing.assert_array_equal(actual.actions, expected.actions)
-    np.testing.assert_array_equal(actual.way, expected.way)
+    np.testing.assert_array_equal(actual.extras, expected.extras)
     types = jax.tree.map(lambda x: x.dtype, actual)
     assert types == jax.tree.map(lambda x: x.dtype, expected)
+
+
+def test_steps_are_all_that_happened_in_order():
+    demonstrations = toy_demonstrations()
+    steps = laid_out(demonstrations)
+    row = 0
+    for episode, demonstration in enumerate(demonstrations):
+        n = len(demonstration.actions)
+        assert (steps.starts[episode], steps.lengths[episode]) == (row, n)
+        for step in range(n):
+            # The state before the action, and the one after it: the last one too.
+            for later in (0, 1):
+                assert_same_observation(
+                    jax.tree.map(lambda x, i=steps.state[row] + later: x[i], steps.observations),
+                    jax.tree.map(lambda x, i=step + later: x[i], demonstration.observations),
+                )
+            assert steps.actions[row] == demonstration.actions[step]
+            assert steps.rewards[row] == demonstration.rewards[step]
+            assert steps.return_so_far[row] == sum(demonstration.rewards[:step].tolist())
+            assert steps.terminated[row] == (step == n - 1 and episode in (0, 2))
+            assert steps.truncated[row] == (step == n - 1 and episode in (1, 2))
+            assert (steps.step[row], steps.remaining[row]) == (step, n - step)
+            np.testing.assert_array_equal(steps.extras[row], slow_way(demonstration, step))
+            row += 1
+    assert row == len(steps.actions) == sum(LENGTHS)
+    assert len(steps.observations.grid) == sum(LENGTHS) + len(LENGTHS)
+
+
+def test_observations_of_any_kind_and_no_extras():
+    rng = np.random.default_rng(0)
+    states = [rng.normal(size=(n + 1, 4)).astype(np.float32) for n in (2, 3)]
+    demonstrations = [
+        Demonstration(x, np.arange(n, dtype=np.int32), np.ones(n), True, False, 0)
+        for n, x in zip((2, 3), states, strict=True)
+    ]
+    steps = on_device(windows.concatenate(demonstrations))
+    window = window_at(2, 3)(steps, 3)
+    assert window.extras == ()
+    np.testing.assert_array_equal(window.context.observation, states[1][1])
+    np.testing.assert_array_equal(window.context.past, [np.zeros(4), states[1][0]])
+    np.testing.assert_array_equal(window.context.rewards, [0, 1])
+    np.testing.assert_array_equal(window.actions, [1, 2, END])
 
 
 @pytest.mark.parametrize("context", [0, 2, 5])
 @pytest.mark.parametrize("horizon", [1, 3, 5])
 def test_every_window_against_the_slow_one(context, horizon):
     demonstrations = toy_demonstrations()
-    steps = on_device(windows.concatenate(demonstrations))
+    steps = on_device(laid_out(demonstrations))
     index = 0
     for demonstration in demonstrations:
         for start in range(len(demonstration.actions)):
@@ -109,7 +163,7 @@ def test_every_window_against_the_slow_one(context, horizon):
 
 
 def test_real_demonstrations_against_the_slow_window(local_demonstrations):
-    steps = on_device(windows.concatenate(local_demonstrations))
+    steps = on_device(laid_out(local_demonstrations))
     index = 0
     for demonstration in local_demonstrations:
         for start in range(len(demonstration.actions)):
@@ -121,28 +175,31 @@ def test_real_demonstrations_against_the_slow_window(local_demonstrations):
 @pytest.mark.parametrize(("context", "horizon"), [(0, 5), (2, 3)])
 def test_a_window_knows_nothing_but_itself(context, horizon):
     demonstrations = toy_demonstrations()
-    steps = windows.concatenate(demonstrations)
-    others = windows.concatenate(toy_demonstrations(seed=1))
+    steps = laid_out(demonstrations)
+    others = laid_out(toy_demonstrations(seed=1))
     index = 0
-    for demonstration in demonstrations:
+    for episode, demonstration in enumerate(demonstrations):
         for start in range(len(demonstration.actions)):
             # Everything after the start, of other episodes, or older than the context.
-            seen = np.zeros(len(steps.actions), bool)
-            seen[index - min(context, start) : index + 1] = True
-            chosen = seen.copy()
-            chosen[index : index + min(horizon, len(demonstration.actions) - start)] = True
+            first, planned = min(context, start), min(horizon, len(demonstration.actions) - start)
 
-            def mixed(own, other, keep):
-                shape = (-1,) + (1,) * (own.ndim - 1)
-                return np.where(keep.reshape(shape), own, other)
+            def mixed(own, other, begin, end):
+                keep = (np.arange(len(own)) >= begin) & (np.arange(len(own)) < end)
+                return np.where(keep.reshape((-1,) + (1,) * (own.ndim - 1)), own, other)
 
+            state = index + episode  # every episode before has one more state than actions
             altered = steps._replace(
                 observations=jax.tree.map(
-                    lambda a, b, keep=seen: mixed(a, b, keep),
+                    lambda a, b, i=state, k=first: mixed(a, b, i - k, i + 1),
                     steps.observations,
                     others.observations,
                 ),
-                actions=mixed(steps.actions, others.actions, chosen),
+                actions=mixed(steps.actions, others.actions, index - first, index + planned),
+                rewards=mixed(steps.rewards, others.rewards + 9, index - first, index),
+                return_so_far=mixed(steps.return_so_far, steps.rewards + 9, index, index + 1),
+                terminated=~steps.terminated,
+                truncated=~steps.truncated,
+                extras=mixed(steps.extras, ~steps.extras, index, index + 1),
             )
             assert not np.array_equal(altered.observations.grid, steps.observations.grid)
             actual = window_at(context, horizon)(on_device(altered), index)
@@ -152,7 +209,7 @@ def test_a_window_knows_nothing_but_itself(context, horizon):
 
 def test_a_window_depends_on_each_action_and_state_that_it_holds():
     # The other half of the test above: alterations do show where they should.
-    steps = windows.concatenate(toy_demonstrations())
+    steps = laid_out(toy_demonstrations())
     index = sum(LENGTHS[:3]) + 2  # the third step of the last episode
     before = window_at(2, 3)(on_device(steps), index)
     for offset in range(-2, 3):
@@ -162,13 +219,18 @@ def test_a_window_depends_on_each_action_and_state_that_it_holds():
         assert not np.array_equal(after.actions, before.actions) or not np.array_equal(
             after.context.actions, before.context.actions
         )
+        rewards = steps.rewards.copy()
+        rewards[index + offset] += 1
+        after = window_at(2, 3)(on_device(steps._replace(rewards=rewards)), index)
+        added = np.asarray(after.context.rewards) - np.asarray(before.context.rewards)
+        assert added.tolist() == [offset == -2, offset == -1]  # none of what is to come
 
 
 draw = jax.jit(windows.sample_windows, static_argnums=(2, 3, 4, 5, 6))
 
 
 def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) -> Window:
-    steps = on_device(windows.concatenate(toy_demonstrations()))
+    steps = on_device(laid_out(toy_demonstrations()))
     return draw(jax.random.key(key), steps, batch, context, horizon, END, by)
 
 

@@ -207,12 +207,13 @@ def check_memory(config: Config[Any, Any], domain: Domain) -> None:
     if not hasattr(os, "sysconf"):  # Windows does not say
         return
     model, search = config.model, config.planner
-    context = jax.tree.leaves(blank_context(domain, config.context))
+    context = sum(leaf.nbytes for leaf in jax.tree.leaves(blank_context(domain, config.context)))
+    activations = 4 * 12 * model.layers * model.width * search.horizon
     drawn = search.resampled * domain.num_actions + search.horizon
     needs = {
         # Noise and trace of a chunk of 128 plans, in 4 bytes each.
         "--iterations, --restarts": 4 * 128 * search.restarts * search.iterations * drawn,
-        "--batch, --context": config.training.batch * sum(leaf.nbytes for leaf in context),
+        "--batch, --context": config.training.batch * (context + activations),
         # Parameters of the transformer, their gradients and Adam's two moments.
         "--width, --layers": 4 * 4 * 12 * model.layers * model.width**2,
     }

@@ -64,7 +64,7 @@ def _what_is_wrong(row: Any) -> str | None:
         expected = (int, float) if kind is float else kind
         if not isinstance(value, expected) or isinstance(value, bool):
             return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
-        if not isinstance(value, str) and not abs(value) < LARGEST:  # NaN too
+        if kind is not str and not -LARGEST < row[name] < LARGEST:  # NaN too
             return f"{name} is {str(value)[:20]}: no number that a run could give"
     if not 0 <= row["successes"] <= row["episodes"] or row["episodes"] < 1:
         return f"{row['successes']} successes of {row['episodes']} episodes"
