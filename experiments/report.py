@@ -1,7 +1,6 @@
 """Tables in the documents, made from the committed rows: `python -m experiments.report`."""
 
 import dataclasses
-import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +9,8 @@ from experiments.common import plots, program, results
 from experiments.common.results import Row
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS
-from leapjax.files import write_text
+from leapjax.checkpoints import read_json
+from leapjax.files import read_text, write_text
 
 PAPER_DEMOS = 500
 TEST_LEVELS = (0, 200)  # the first one's seed, and how many
@@ -68,7 +68,7 @@ def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows: dict[str, list[Row]] = {"babyai": results.read(root / "results" / "babyai.jsonl")}
     for name in ("planning", "training", "scaling"):
-        rows[name] = json.loads((root / "results" / f"{name}.json").read_text(encoding="utf-8"))
+        rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
         "results": (success, "babyai"),
         "speed": (speed, "planning"),
@@ -80,7 +80,7 @@ def documents(root: Path) -> dict[Path, str]:
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         for name, (make, source) in sections.items():
             if f"<!-- {name}: begin -->" in text:
                 text = replace_section(text, name, make(rows[source]))

@@ -41,27 +41,31 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
     arguments = program.arguments_of(arguments)
 
     def work() -> None:
-        configs = parse(experiment.domain, arguments)
-        versions = results.versions()  # of the code that runs, whatever is committed meanwhile
-        runtime.start(configs[0].cluster)
-        console = Console(quiet=not processes.is_first())
-        rows, failure = [], None
         with interruptible() as interruption:
-            runs = [(config, seed) for config in configs for seed in config.seeds]
-            for config, seed in runs:
-                try:
-                    rows.append(run_one(experiment, config, seed, versions, console, interruption))
-                except program.FAILURES as error:
-                    if len(runs) > 1:  # the others can still be run
-                        line = f"{config.level}, seed {seed}, failed: {error}"
-                        console.print(line, markup=False)
-                    failure = failure or error
-        if rows:
-            console.print(results.success_table(rows), results.time_table(rows))
-        if failure is not None:
-            raise failure
+            run_all(experiment, arguments, interruption)
 
     return program.guarded(f"experiments.{experiment.name}", arguments, work)
+
+
+def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
+    """Every level and seed of a command line; the failure of one comes after all others."""
+    configs = parse(experiment.domain, arguments)
+    versions = results.versions()  # of the code that runs, whatever is committed meanwhile
+    runtime.start(configs[0].cluster)
+    console = Console(quiet=not processes.is_first())
+    runs = [(config, seed) for config in configs for seed in config.seeds]
+    rows, failure = [], None
+    for config, seed in runs:
+        try:
+            rows.append(run_one(experiment, config, seed, versions, console, interruption))
+        except program.FAILURES as error:
+            if len(runs) > 1:  # the others can still be run
+                console.print(f"{config.level}, seed {seed}, failed: {error}", markup=False)
+            failure = failure or error
+    if rows:
+        console.print(results.success_table(rows), results.time_table(rows))
+    if failure is not None:
+        raise failure
 
 
 def run_one(

@@ -32,7 +32,9 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         work()
     except Interrupted as stopped:
         command = shlex.join(["python", "-m", module, *arguments])
-        return _end(f"stopped by {stopped}; continue with: {command}", stopped.exit_code)
+        print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
+        # At once: threads that still compile or write would crash in the interpreter's own end.
+        runtime.exit_at_once(stopped.exit_code)
     except UserError as error:
         return _end(f"error: {error}", 2)
     except NotANumber as error:

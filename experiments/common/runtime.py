@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 
@@ -102,11 +103,17 @@ def leave(code: int) -> int:
     without it they are aborted.
     """
     if jax.distributed.is_initialized():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        time.sleep(5 if jax.process_index() == 0 else 1)
-        os._exit(code)
+        exit_at_once(code)
     return code
+
+
+def exit_at_once(code: int) -> NoReturn:
+    """Ends the program without the interpreter's own end."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if jax.distributed.is_initialized():
+        time.sleep(5 if jax.process_index() == 0 else 1)
+    os._exit(code)
 
 
 def use_every_core() -> None:

@@ -1,0 +1,75 @@
+"""A world so small that its networks compile in seconds: walk along a line to its middle."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax.domain import Domain
+from leapjax.types import Demonstration
+
+LEFT, RIGHT, WAIT, END = range(4)
+FARTHEST = 5
+
+
+class Token(nn.Module):
+    """The current state as the only token of a context."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, context):
+        return nn.Dense(self.width)(context.observation)[None]
+
+
+def observe(place):
+    return np.array([place, abs(place), 1], np.float32)
+
+
+def mirror(key, window):
+    """The mirror image of a window, or not."""
+    flip = jax.random.bernoulli(key)
+
+    def mirrored(actions):
+        swapped = jnp.array([RIGHT, LEFT, WAIT, END])[jnp.minimum(actions, END)]
+        return jnp.where(flip & (actions <= END), swapped, actions)
+
+    def seen(states):
+        return jnp.where(flip, states * jnp.array([-1, 1, 1]), states)
+
+    context = window.context._replace(
+        observation=seen(window.context.observation),
+        past=seen(window.context.past),
+        actions=mirrored(window.context.actions),
+    )
+    return window._replace(context=context, actions=mirrored(window.actions))
+
+
+def nothing(*arguments):
+    raise NotImplementedError
+
+
+DOMAIN = Domain(
+    level="Line",
+    make_adapter=nothing,
+    collect=nothing,
+    actions=("left", "right", "wait", "end"),
+    max_steps=FARTHEST,
+    blank=np.zeros(3, np.float32),
+    encoders={"leapjax": lambda model, context: Token(model.width)},
+    augmentations=(mirror,),
+)
+
+
+def demonstrations():
+    """The shortest way from every place."""
+    found = []
+    for start in (x for x in range(-FARTHEST, FARTHEST + 1) if x):
+        places = [start]
+        while places[-1]:
+            places.append(places[-1] - np.sign(start))
+        actions = np.full(abs(start), LEFT if start > 0 else RIGHT, np.int32)
+        rewards = np.array(places[1:], np.float32) == 0
+        states = np.stack([observe(place) for place in places])
+        found.append(Demonstration(states, actions, rewards * np.float32(1), True, False, start))
+    return found
