@@ -18,7 +18,7 @@ from experiments.common.config import (
     resolved,
     specify,
 )
-from experiments.common.interruption import Interruption, interruptible
+from experiments.common.interruption import Interrupted, Interruption, interruptible
 from experiments.common.run import Run
 from leapjax import files, processes
 from leapjax.data import seeds
@@ -40,11 +40,17 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
     arguments = program.arguments_of(arguments)
 
+    module = f"experiments.{experiment.name}"
+
+    def give_up(stopped: Interrupted) -> None:
+        if not jax.distributed.is_initialized():  # the others would wait for this one
+            program.stop(module, arguments, stopped)
+
     def work() -> None:
-        with interruptible() as interruption:
+        with interruptible(give_up) as interruption:
             run_all(experiment, arguments, interruption)
 
-    return program.guarded(f"experiments.{experiment.name}", arguments, work)
+    return program.guarded(module, arguments, work)
 
 
 def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:

@@ -1,11 +1,14 @@
 """SIGINT and SIGTERM: stop where nothing is lost, and say how to go on."""
 
 import contextlib
+import os
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+GRACE = 1.0  # seconds in which a signal should have its effect
 
 
 class Interrupted(BaseException):
@@ -30,6 +33,11 @@ class Interruption:
         self._number = number
         if not waits:
             raise Interrupted(number)
+
+    @property
+    def waits(self) -> bool:
+        """Whether a signal waits until something is done."""
+        return self._deferred
 
     @property
     def requested(self) -> int | None:
@@ -58,15 +66,42 @@ class Interruption:
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[Interruption]:
-    """Inside, SIGINT and SIGTERM raise `Interrupted`, at once or where they were deferred."""
+def interruptible(
+    give_up: Callable[[Interrupted], object] = lambda stopped: None,
+) -> Iterator[Interruption]:
+    """Inside, SIGINT and SIGTERM raise `Interrupted`, at once or where they were deferred.
+
+    Python raises nothing while a compiler runs, and drops what is raised in some callbacks.
+
+    Args:
+        give_up: called from another thread where a signal that does not wait had no effect for
+            a second; it ends the program.
+    """
     interruption = Interruption()
     try:
         before = {number: signal.signal(number, interruption.handle) for number in SIGNALS}
     except ValueError:  # not the main thread: signals do not arrive here
-        before = {}
+        yield interruption
+        return
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told)
+
+    def watch() -> None:
+        while byte := os.read(heard, 1):
+            if byte[0] in SIGNALS and not over.wait(GRACE) and not interruption.waits:
+                give_up(Interrupted(byte[0]))
+
+    over = threading.Event()
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
     try:
         yield interruption
     finally:
+        over.set()
+        signal.set_wakeup_fd(-1)
+        os.close(told)
+        watcher.join()
+        os.close(heard)
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -3,6 +3,7 @@
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 import jax
 
@@ -31,10 +32,7 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
     try:
         work()
     except Interrupted as stopped:
-        command = shlex.join(["python", "-m", module, *arguments])
-        print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
-        # At once: threads that still compile or write would crash in the interpreter's own end.
-        runtime.exit_at_once(stopped.exit_code)
+        stop(module, arguments, stopped)
     except UserError as error:
         return _end(f"error: {error}", 2)
     except NotANumber as error:
@@ -51,6 +49,14 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
             1,
         )
     return 0
+
+
+def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoReturn:
+    """Ends an interrupted program, and says how to continue it."""
+    command = shlex.join(["python", "-m", module, *arguments])
+    print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
+    # At once: threads that still compile or write would crash in the interpreter's own end.
+    runtime.exit_at_once(stopped.exit_code)
 
 
 def _end(message: str, code: int) -> int:
