@@ -18,7 +18,8 @@ test: $(READY)
 # The long form of the tests that have one: docs/reliability.md.
 test-long: $(READY)
 	LEAPJAX_TEST_LONG=1 $(BIN)/python -m pytest -rA --durations=10 \
-		tests/test_interruption.py tests/test_processes.py tests/test_fuzz.py tests/test_soak.py $(ARGS)
+		tests/test_interruption.py tests/test_processes.py tests/test_fuzz.py tests/test_soak.py \
+		tests/test_babyai.py tests/test_benchmarks.py $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

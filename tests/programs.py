@@ -23,7 +23,9 @@ ROOT = Path(__file__).parent.parent
 LONG = os.environ.get("LEAPJAX_TEST_LONG") == "1"  # `make test-long`: minutes to an hour
 only_long = pytest.mark.skipif(not LONG, reason="make test-long runs it")
 
-SMALL = "--episodes 3 --batch 4 --width 16 --heads 2 --layers 1 --iterations 2 --no-pictures".split()
+SMALL = (
+    "--episodes 3 --batch 4 --width 16 --heads 2 --layers 1 --iterations 2 --no-pictures".split()
+)
 TOY = [*SMALL, *"--demos 6 --channels 4 --rounds 1 --fields 2 --sweeps 2".split()]
 RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
 

@@ -12,6 +12,7 @@ from minigrid.core.grid import Grid
 from leapjax.babyai import augmentation, demonstrations, levels, vocabulary
 from leapjax.babyai.adapter import END
 from leapjax.babyai.observations import Observation
+from leapjax.babyai.settings import Settings
 from leapjax.data import windows
 from tests.dynamics import FRONT, stepped
 from tests.oracles import slow_path_lengths
@@ -248,3 +249,19 @@ def test_clutter_was_always_there_and_needs_a_goal():
             np.testing.assert_array_equal, clutter(jax.random.key(1), aimless, 1.0), aimless
         )
     assert seen > 20
+
+
+def test_settings_choose_augmentations_and_clutter_comes_first():
+    window = whole_windows("GoToLocalS8N7", 0, 32)[0]
+    before = np.asarray(window.context.observation.grid)
+    assert augmentation.chosen(Settings()) == []
+    both = augmentation.chosen(Settings(augment=True, clutter=1.0))
+    augmented, cluttered = ([jax.jit(f)(jax.random.key(k), window) for k in range(8)] for f in both)
+
+    def objects(windows):
+        return [int((w.context.observation.grid[..., 0] != EMPTY).sum()) for w in windows]
+
+    count = int((before[..., 0] != EMPTY).sum())
+    assert objects(augmented) == [count] * 8  # the same things, elsewhere
+    assert max(objects(cluttered)) > count
+    assert all((w.actions == window.actions).all() for w in cluttered)

@@ -1,39 +1,38 @@
 """The benchmark counts what the program does, and runs."""
 
-import dataclasses
+import functools
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from benchmarks import planning, scaling, training
-from experiments.common.config import preset
-from leapjax import pretrained
-from leapjax.babyai import levels
+from experiments.common.config import make_domain, preset, with_options
+from experiments.common.runtime import Cluster
+from leapjax.agents.learning import Setup
+from leapjax.domain import blank_context
 from leapjax.models import trajectory
+from tests.programs import only_long
 
 HORIZON = 5
 
 
-def tiny_preset(level, name):
+def tiny_preset(*names):
     """The settings of a preset, with a network and batches that take no time."""
-    config = preset(level, name)
-    small = {"width": 16, "heads": 2, "layers": 1, "channels": 4, "rounds": 1, "sweeps": 2}
-    return dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, **small),
-        training=dataclasses.replace(config.training, batch=4),
-    )
+    small = {"width": 16, "heads": 2, "layers": 1, "batch": 4}
+    simple = {"channels": 4, "rounds": 1, "sweeps": 2, "augment": False, "clutter": 0.0}
+    return with_options(preset(*names), {**small, **simple})
 
 
 @pytest.mark.parametrize("name", ["paper", "leapjax"])
 def test_needed_flops_are_what_xla_counts(name):
-    level = levels.find_level("GoToLocalS7N5")
-    model = preset(level, name).model
-    sizes = pretrained.sizes_for(level, 0, HORIZON)
-    module = trajectory.build(model, sizes)
-    context = trajectory.blank_context(sizes, level.words)
+    config = preset("babyai", "GoToLocalS7N5", "leap", name)
+    model, domain = config.model, make_domain(config)
+    setup = Setup(domain, 0, HORIZON, model, config.training, config.method_settings)
+    module = trajectory.build(model, setup.sizes, setup.encoder())
+    context = jax.tree.map(jnp.asarray, blank_context(domain, 0))
     actions = jnp.zeros(HORIZON, jnp.int32)
 
     def everything(module, context):
@@ -58,10 +57,11 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "COMPARED", ("leapjax",))
     monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
     monkeypatch.setattr(planning, "BATCHES", (1, 9))
+    monkeypatch.setattr(planning, "make_planner", functools.cache(planning.make_planner))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
     written = ["--json", str(rows), "--plot", str(plot)]
-    assert planning.main([*written, "--seconds", "0.01", "--large", "20"]) == 0
-    assert "20 plans of (5, 10)" in capsys.readouterr().out
+    assert planning.main([*written, "--seconds", "0.01", "--large", "9"]) == 0
+    assert "9 plans of (5, 10)" in capsys.readouterr().out
     fields = (
         "horizon iterations batch preset compile_seconds plans_per_second gflops peak_gflops "
         "fraction_of_peak"
@@ -92,13 +92,54 @@ def test_the_training_benchmark_refuses_an_unknown_level(capsys):
     assert "Nowhere" in capsys.readouterr().err
 
 
-def test_the_scaling_benchmark_measures_its_settings(tmp_path, monkeypatch, capsys):
+def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypatch):
+    made = []
+
+    class Stepper:
+        """Steps that do nothing."""
+
+        def __init__(self, config, mesh):
+            made.append((config.training.batch, dict(mesh.shape)))
+            self.state = SimpleNamespace(params={"large": jnp.ones((64, 64)), "small": jnp.ones(3)})
+
+        def __call__(self):
+            return jnp.zeros(())
+
+    monkeypatch.setattr(scaling, "Stepper", Stepper)
+    row = scaling.measure(scaling.Options(per_device=3, seconds=0.01, cluster=Cluster(fsdp=4)))
+    assert made == [(24, {"data": 2, "fsdp": 4})]
+    assert (row["processes"], row["devices"], row["fsdp"]) == (1, 8, 4)
+    assert row["examples_per_second"] == pytest.approx(24 / row["seconds_per_step"])
+    assert row["exchange_seconds"] > 0 and row["parameters"] == 64 * 64 + 3
+
+
+def test_the_scaling_benchmark_writes_a_row_for_each_setting(tmp_path, monkeypatch, capsys):
+    def launch(arguments, count, devices, fsdp):
+        measured = {"seconds_per_step": 0.1, "examples_per_second": 10.0, "exchange_seconds": 0.01}
+        return {"processes": count, "devices": count * devices, "fsdp": fsdp, **measured}
+
+    monkeypatch.setattr(scaling, "launch", launch)
+    rows = tmp_path / "rows.json"
+    assert scaling.main(["--json", str(rows)]) == 0
+    found = [tuple(row[n] for n in ("processes", "devices", "fsdp")) for row in read(rows)]
+    assert found == [(count, count * each, fsdp) for count, each, fsdp in scaling.SETTINGS]
+    assert "100%" in capsys.readouterr().out
+    assert scaling.main(["--level", "GoToLocal"]) == 2
+    assert "unknown level" in capsys.readouterr().err
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+@only_long
+def test_the_scaling_benchmark_measures_in_processes_of_its_own(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scaling, "SETTINGS", ((2, 1, 2),))
     rows = tmp_path / "rows.json"
     options = ["--per-device", "1", "--seconds", "0.01", "--json", str(rows)]
     assert scaling.main(options) == 0
-    written = json.loads(rows.read_text())
+    written = read(rows)
     assert [(row["processes"], row["devices"], row["fsdp"]) for row in written] == [(2, 2, 2)]
     assert all(row["examples_per_second"] > 0 < row["exchange_seconds"] for row in written)
-    assert scaling.main(["--level", "GoToLocal"]) == 2
-    assert "unknown level" in capsys.readouterr().err
+    assert scaling.main(["--per-device", "0"]) == 2
+    assert "2 processes of 1 devices: " in capsys.readouterr().err

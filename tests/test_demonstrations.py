@@ -229,21 +229,6 @@ def test_a_bot_that_gives_up_or_runs_out_of_time_has_failed(monkeypatch):
         assert adapter.env.step_count == (0 if constant == end else adapter.env.max_steps)
 
 
-def test_a_bot_that_never_decides_has_failed(monkeypatch):
-    class Undecided:
-        stack = ("explore",)
-
-        def replan(self, action_taken):
-            while self.stack[-1] == "explore":
-                pass
-
-    monkeypatch.setattr(demonstrations, "make_bot", lambda env: Undecided())
-    dropped = Counter()
-    adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
-    assert demonstrations.demonstrate(adapter, 0, dropped) is None
-    assert dropped == {FAILED: 1}
-
-
 def test_an_episode_that_ends_at_another_match_is_dropped(monkeypatch):
     adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
     monkeypatch.setattr(observations, "nearest_goal", lambda env: (0, 0))

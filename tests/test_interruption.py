@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from experiments import babyai
-from experiments.common import results, run
-from experiments.common.interruption import Interrupted, interruptible
+from experiments.common import results, run, runtime
+from experiments.common.interruption import SIGNALS, Interrupted, interruptible
 from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
@@ -53,7 +53,9 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
     with monkeypatch.context() as patch:
         patch.setattr(run, "Meter", Stopped)
-        assert babyai.main(options) == code
+        patch.setattr(runtime, "exit_at_once", sys.exit)
+        with pytest.raises(SystemExit, match=str(code)):
+            babyai.main(options)
     error = capsys.readouterr().err
     stopped = f"stopped by {signal.Signals(number).name}"
     assert error == f"{stopped}; continue with: python -m experiments.babyai {' '.join(options)}\n"
@@ -106,6 +108,27 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
             os.kill(os.getpid(), signal.SIGTERM)
             reached = True
         assert not reached
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
+    monkeypatch.setattr("experiments.common.interruption.GRACE", 0.05)
+    ended = []
+    with interruptible(ended.append) as interruption:
+        with pytest.raises(Interrupted), interruption.deferred():
+            os.kill(os.getpid(), number)
+            time.sleep(0.2)
+        assert not ended
+    with interruptible(ended.append), pytest.raises(Interrupted):
+        os.kill(os.getpid(), number)
+    assert not ended  # it had its effect in time
+    with interruptible(ended.append):
+        with pytest.raises(Interrupted):  # and here, as in a compiler, it has none
+            os.kill(os.getpid(), number)
+        deadline = time.monotonic() + 20
+        while not ended and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert [str(stopped) for stopped in ended] == [signal.Signals(number).name]
 
 
 def state(step):

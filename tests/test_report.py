@@ -10,8 +10,9 @@ def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
     return {
         "level": level, "method": "leap", "preset": "leapjax", "demos": demos, "seed": seed,
         "first_episode_seed": 0, "episodes": 200, "successes": 20 * successes,
-        "validation": False, "train_steps": 3000, "paper_success": 95.0, "horizon": 5, "executed": 5,
-        "mean_length": 6.0, "configuration": {"method_settings": {"masking": "random"}}, **others,
+        "validation": False, "train_steps": 3000, "paper_success": 95.0, "horizon": 5,
+        "executed": 5, "mean_length": 6.0,
+        "configuration": {"method_settings": {"masking": "random"}}, **others,
     }  # fmt: skip
 
 

@@ -8,19 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import babyai, results
-from experiments.common.config import Config
-from leapjax import batching, planners, pretrained, rollouts, sharding, training
+from experiments import babyai
+from experiments.common import results
+from leapjax import batching, planners, rollouts, sharding, training
 from leapjax.agents import leap
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.settings import Settings
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.babyai import levels
-from leapjax.babyai.adapter import BabyAIAdapter
-from tests.programs import LONG, only_long
-from tests.test_training import MODEL, TRAINING
+from leapjax.models.trajectory import ModelConfig
+from tests import frozen_lake
+from tests.programs import LONG, TOY, only_long
 
 CYCLES, RUNS = 300 if LONG else 8, 20
-LEVEL = levels.find_level("GoToLocalS7N5")
+DOMAIN = (
+    BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
+    if LONG
+    else frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())  # it compiles sooner
+)
 
 
 def open_files():
@@ -59,15 +65,15 @@ class Watch:
         )
 
 
-def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsys):
-    config = Config(training=TRAINING, model=MODEL, planner=planners.GibbsConfig(4, 4))
-    sizes = pretrained.sizes_for(LEVEL, config.context, config.planner.horizon)
-    mesh = sharding.make_mesh(TRAINING.batch)
-    agent = leap.make_agent(MODEL, TRAINING, config.planner, sizes, LEVEL.words, mesh)
+def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
+    model, learning = ModelConfig(layers=1, heads=2, width=16), TrainingConfig(steps=10, batch=4)
+    mesh = sharding.make_mesh(learning.batch)
+    agent = leap.make_agent(Setup(DOMAIN, 1, 4, model, learning, leap.Settings()), mesh)
     begin = training.make_begin(agent, mesh)
-    step = training.make_train_step(agent, lambda k, d: leap.make_batch(k, d, TRAINING, sizes))
-    plan = batching.compile_planner(agent.energy, config.planner)
-    data = sharding.replicate(windows.concatenate(local_demonstrations), mesh)
+    step = training.make_train_step(agent)
+    plan = batching.compile_planner(agent.energy, planners.GibbsConfig(4, 4))
+    demonstrations = DOMAIN.collect(5, 0, lambda done: None).demonstrations
+    data = sharding.replicate(windows.concatenate(demonstrations, DOMAIN.extras), mesh)
     watch = Watch()
     for cycle in range(CYCLES):
         state, key = begin(cycle)
@@ -78,8 +84,8 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
         saved.close()
         params = jax.tree.map(jnp.asarray, sharding.to_host(restored.params))
         episodes = rollouts.evaluate(
-            lambda: BabyAIAdapter(LEVEL), [100 * cycle + i for i in range(3)], plan, params,
-            context=0, seed=cycle, progress=lambda over, good: None,
+            DOMAIN.make_adapter, [100 * cycle + i for i in range(3)], plan, params,
+            context=1, seed=cycle, progress=lambda over, good: None,
         )  # fmt: skip
         assert len(episodes.successes) == 3
         row = {
@@ -104,13 +110,9 @@ def test_train_plan_evaluate_over_and_over(local_demonstrations, tmp_path, capsy
 def test_one_run_after_another(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
-    toy = (
-        "--demos 6 --episodes 5 --steps 4 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
-        "--rounds 1 --fields 2 --sweeps 2 --iterations 3 --no-pictures --seeds"
-    ).split()
     watch = Watch()
     for seed in range(RUNS):
-        assert babyai.main([*toy, str(seed)]) == 0
+        assert babyai.main([*TOY, "--steps", "4", "--seeds", str(seed)]) == 0
         watch.look()
     with capsys.disabled():
         print("\nsoak, program:", watch.report())

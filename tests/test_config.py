@@ -1,0 +1,105 @@
+"""What a run is configured by, and the hash that names its results."""
+
+import dataclasses
+import itertools
+
+import pytest
+
+from experiments.common import config
+from experiments.common.config import GROUPS, configuration_hash, preset, resolved
+from leapjax import checkpoints, domains, pretrained
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.settings import Settings
+from leapjax.errors import UserError
+from leapjax.methods import METHODS
+
+LEVEL = "GoToLocalS7N5"
+
+
+@dataclasses.dataclass(frozen=True)
+class Later(Settings):
+    """The settings of a version to come."""
+
+    mood: str = "calm"
+
+
+def parse(*arguments):
+    (found,) = config.parse("babyai", arguments)
+    return found
+
+
+def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
+    cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
+    hashes = {
+        configuration_hash(preset("babyai", level, method, name), seed)
+        for level, method, name, seed in cases
+    }
+    assert len(hashes) == len(cases) > 80
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--demos 499", "--context 1", "--heads 2", "--steps 7", "--iterations 9", "--masking one",
+     "--radius 2", "--test-seed 1", "--validation", "--executed 3"],
+)  # fmt: skip
+def test_what_a_result_depends_on_is_in_its_hash(option):
+    assert configuration_hash(parse(*option.split()), 0) != configuration_hash(parse(), 0)
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--seeds 1 2", "--record", "--runs elsewhere", "--no-pictures", "--checkpoint-seconds 1",
+     "--fsdp 2", "--demos 500"],
+)  # fmt: skip
+def test_what_it_does_not_depend_on_is_not(option):
+    assert configuration_hash(parse(*option.split()), 0) == configuration_hash(parse(), 0)
+
+
+def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
+    def names(*options):
+        chosen = parse(*options)
+        specification = config.specify(chosen, 0, config.make_domain(chosen))
+        return configuration_hash(chosen, 0), pretrained.identity(specification)
+
+    before = [names("--method", method) for method in METHODS]
+    monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=Later))
+    assert isinstance(parse().domain_settings, Later)
+    assert [names("--method", method) for method in METHODS] == before
+    assert names("--mood", "calm") == before[0]
+    assert not set(names("--mood", "angry")) & set(before[0])
+
+
+def test_the_settings_of_a_row_can_be_read_back():
+    chosen = parse("--heads", "2", "--masking", "each", "--clutter", "0.2", "--steps", "7")
+    row = resolved(chosen, seed=0)
+    for group in GROUPS:
+        settings = getattr(chosen, group)
+        assert checkpoints.from_json(type(settings), row[group]) == settings
+        for field in dataclasses.fields(settings):
+            fewer = {name: value for name, value in row[group].items() if name != field.name}
+            default = dataclasses.replace(settings, **{field.name: field.default})
+            assert checkpoints.from_json(type(settings), fewer) == default
+        with pytest.raises(UserError, match="missing or unknown mood"):
+            checkpoints.from_json(type(settings), {**row[group], "mood": "calm"})
+
+
+def test_options_have_the_names_and_defaults_of_their_group():
+    chosen = parse("--preset", "paper", "--method", "classifier", "--level", "GoToSeqS5R2")
+    assert (chosen.context, chosen.planner.horizon, chosen.planner.iterations) == (20, 5, 10)
+    assert (chosen.model.architecture, chosen.training.windows) == ("paper", "episode")
+    assert chosen.domain_settings == Settings()
+    assert not hasattr(chosen.method_settings, "masking")
+
+
+def test_a_level_may_change_the_preset_of_a_method():
+    temperatures = {level: preset("babyai", level, "leap", "leapjax").planner.temperature
+                    for level in (LEVEL, "GoToSeqS5R2")}  # fmt: skip
+    assert temperatures == {LEVEL: 0.5, "GoToSeqS5R2": 1.0}
+    assert preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
+
+
+def test_all_levels_are_those_of_the_paper():
+    found = config.parse("babyai", ["--level", "all", "--demos", "9"])
+    assert [each.level for each in found] == list(BABYAI.levels)
+    assert {each.demos for each in found} == {9}
+    assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
