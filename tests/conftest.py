@@ -1,12 +1,15 @@
 """What several tests share."""
 
 import os
+import shutil
 from pathlib import Path
 
 # Tests compile much and compute little: without optimisations they take a fraction of the time.
 # XLA reads this when JAX starts, so it comes before every import of JAX.
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
 )
 # Several devices, as on a machine with several cores or GPUs: batches are split over them.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "8")
@@ -17,6 +20,13 @@ import pytest
 from experiments import babyai
 from leapjax.babyai import demonstrations, levels
 from leapjax.types import Demonstration
+from tests import OURS
+
+
+def pytest_unconfigure():
+    """The last thing that pytest does."""
+    if OURS:
+        shutil.rmtree(OURS, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +60,6 @@ def toy_run(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
-        patch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
         assert babyai.main(TOY) == 0
     (run,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
     return run

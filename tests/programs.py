@@ -74,7 +74,6 @@ class Place:
             **os.environ,
             "PYTHONPATH": str(ROOT),
             "MINARI_DATASETS_PATH": str(self.folder / "datasets"),
-            "LEAPJAX_COMPILATION_CACHE": str(self.folder / "cache"),
             "JAX_NUM_CPU_DEVICES": str(devices),
         }
         often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]

@@ -110,7 +110,6 @@ def test_a_users_data_set_is_what_was_learned_from():
 
 
 def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     run = untrained_run(tmp_path / "run")
     assert accuracy.main([str(run), "--demos", "4", "--samples", "9"]) == 0
     said = capsys.readouterr().out

@@ -42,8 +42,7 @@ def workplace(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "datasets"))
-        patch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
-        assert babyai.main([*TOY, "--pictures"]) == 0
+        assert babyai.main(TOY) == 0
         yield folder
 
 
@@ -80,13 +79,21 @@ def test_a_run_leaves_a_row_with_every_field(workplace):
     assert not (workplace / "results").exists()
 
 
-def test_a_run_leaves_pictures_metrics_and_a_checkpoint(workplace):
+def test_a_run_leaves_a_training_curve_and_checkpoints(workplace):
     folder = run_folder(workplace)
+    metrics = run.read_metrics(folder)
+    assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["4"]
+    assert not (folder / "plan.gif").exists()  # without --pictures
+
+
+def test_a_run_leaves_pictures(workplace):
+    options = "--steps 40 --demos 1 --episodes 2 --pictures --runs drawn".split()
+    assert babyai.main([*RANDOM, *options]) == 0
+    folder = only_folder(workplace / "drawn")
     for name in ("loss.png", "iterations.png"):
         assert Image.open(folder / name).size[0] > 300
     assert getattr(Image.open(folder / "plan.gif"), "n_frames", 1) > 3
-    metrics = run.read_metrics(folder)
-    assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
 
 
 def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):

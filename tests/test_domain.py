@@ -22,7 +22,6 @@ TOY = (
 @pytest.fixture(autouse=True)
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     monkeypatch.setitem(domains.DOMAINS, "frozen_lake", frozen_lake.FROZEN_LAKE)
     return tmp_path
 

@@ -61,7 +61,6 @@ def test_a_recorder_knows_the_way_that_was_walked():
 
 
 def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     run = untrained_run(tmp_path / "run", "--method", "random")
     assert failures.main([str(run), "--episodes", "6"]) == 0
     said = capsys.readouterr().out

@@ -49,7 +49,6 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
                 os.kill(os.getpid(), number)
             super().update(done, note)
 
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
     with monkeypatch.context() as patch:
         patch.setattr(run, "Meter", Stopped)

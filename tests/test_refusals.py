@@ -26,7 +26,6 @@ from tests.conftest import TOY
 @pytest.fixture(autouse=True)
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     return tmp_path
 
 

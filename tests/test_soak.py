@@ -109,7 +109,6 @@ def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
 @only_long
 def test_one_run_after_another(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     watch = Watch()
     for seed in range(RUNS):
         assert babyai.main([*TOY, "--steps", "4", "--seeds", str(seed)]) == 0

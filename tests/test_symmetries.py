@@ -311,8 +311,11 @@ def said_otherwise(text: str) -> str:
     return text
 
 
+restate_ids = jax.jit(symmetries.restate)
+
+
 def restate(instruction: np.ndarray) -> np.ndarray:
-    return np.asarray(symmetries.restate(instruction, *vocabulary.joining_words()))
+    return np.asarray(restate_ids(instruction, *vocabulary.joining_words()))
 
 
 def test_both_ways_to_tell_a_sequence_mean_the_same():
@@ -343,11 +346,11 @@ def test_both_ways_to_tell_a_sequence_mean_the_same():
 
 
 @settings(deadline=None)
-@given(st.integers(1, 4), st.integers(1, 4), st.booleans(), st.integers(0, 6), st.data())
-def test_told_the_other_way_twice_it_is_told_as_before(first, second, then, padding, data):
+@given(st.integers(1, 4), st.integers(1, 4), st.booleans(), st.sampled_from([10, 13]), st.data())
+def test_told_the_other_way_twice_it_is_told_as_before(first, second, then, length, data):
     words = st.sampled_from(["ball", "red", "and", "go", "door"])
     parts = [" ".join(data.draw(st.lists(words, min_size=n, max_size=n))) for n in (first, second)]
     text = (", then " if then else " after you ").join(parts)
-    ids = vocabulary.encode(text, first + second + 2 + padding)
+    ids = vocabulary.encode(text, length)  # with and without padding
     assert vocabulary.decode(restate(ids)) == said_otherwise(text)
     np.testing.assert_array_equal(restate(restate(ids)), ids)
