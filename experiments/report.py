@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments.common import plots, program, results
+from experiments.common import program, results
 from experiments.common.results import Row
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS
@@ -48,34 +48,30 @@ SETTINGS = (
     Setting("`leapjax`, `--executed 3`", "leapjax", masking="random", executed=3),
 )
 TITLES = " | ".join(setting.title for setting in SETTINGS)
-DOCUMENTS = ("README.md", "docs/performance.md", "docs/scaling.md", "docs/experiments.md")
+DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
 
 
 def main() -> int:
-    """Rewrites every table, and draws what the rows say, here."""
+    """Rewrites every table here."""
     return program.guarded("experiments.report", (), rewrite)
 
 
 def rewrite() -> None:
-    """Rewrites every table, and draws what the rows say, here."""
+    """Rewrites every table here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
-    rows = results.read(Path("results") / "babyai.jsonl")
-    plots.data_efficiency(efficiency_by_level(rows), Path("docs") / "data-efficiency.png")
 
 
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows: dict[str, list[Row]] = {"babyai": results.read(root / "results" / "babyai.jsonl")}
-    for name in ("planning", "training", "scaling"):
+    for name in ("planning", "training"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
         "results": (success, "babyai"),
         "speed": (speed, "planning"),
         "planning": (planning, "planning"),
         "training": (training, "training"),
-        "scaling": (scaling, "scaling"),
-        "efficiency": (efficiency, "babyai"),
         "steps": (steps, "babyai"),
     }
     written = {}
@@ -133,49 +129,6 @@ def _by_level_and_demos(rows: Sequence[Row], setting: Setting) -> dict[tuple[str
     for row in sorted(filter(setting.has, rows), key=lambda row: row["train_steps"] > 0):
         found.setdefault((row["level"], row["demos"]), {})[row["seed"]] = row
     return {key: list(by_seed.values()) for key, by_seed in found.items()}
-
-
-def efficiency_by_level(rows: Sequence[Row]) -> dict[str, dict[int, list[Row]]]:
-    """Rows of preset `leapjax` by number of demonstrations, of levels that have several."""
-    found: dict[str, dict[int, list[Row]]] = {}
-    for (level, demos), chosen in sorted(_by_level_and_demos(rows, OURS).items()):
-        found.setdefault(level, {})[demos] = chosen
-    return {level: by_demos for level, by_demos in found.items() if len(by_demos) > 1}
-
-
-def efficiency(rows: Sequence[Row]) -> str:
-    """Success against demonstrations, beside the paper's from 500."""
-    found = efficiency_by_level(rows)
-    demos = sorted({count for by_demos in found.values() for count in by_demos})
-    lines = [
-        [
-            level,
-            *(_rate(by_demos.get(count, [])) for count in demos),
-            f"{LEVELS[level].paper_success:.1f}%",
-        ]
-        for level, by_demos in found.items()
-    ]
-    counts = " | ".join(f"{count} demonstrations" for count in demos)
-    return _table(f"level | {counts} | paper, {PAPER_DEMOS}", lines)
-
-
-def scaling(rows: Sequence[Row]) -> str:
-    """Every measurement of weak scaling."""
-    (two,) = (r for r in rows if (r["processes"], r["devices"], r["fsdp"]) == (1, 2, 1))
-    lines = [
-        [
-            str(row["processes"]),
-            str(row["devices"]),
-            str(row["fsdp"]),
-            f"{1e3 * row['seconds_per_step']:.1f}",
-            f"{row['examples_per_second']:,.0f}",
-            f"{row['examples_per_second'] / two['examples_per_second']:.0%}",
-            f"{1e3 * row['exchange_seconds']:.1f}",
-        ]
-        for row in rows
-    ]
-    header = "processes | devices | fsdp | ms/step | windows/s | of two devices | exchange (ms)"
-    return _table(header, lines)
 
 
 def speed(rows: Sequence[Row]) -> str:

@@ -29,13 +29,12 @@ SMALL = (
 TOY = [*SMALL, *"--demos 6 --channels 4 --rounds 1 --fields 2 --sweeps 2".split()]
 RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
 
-# What processes of their own run. The short form is of another domain, which compiles in a third
-# of the time; nothing that happens to a process depends on the domain.
+# What processes of their own run. The short form trains in another domain, which compiles in a
+# third of the time; what happens to a process does not depend on the domain.
 LAKE = Experiment("lake", "frozen_lake")
+BABYAI = ["-m", "experiments.babyai", *TOY]
 NAME, COMMAND = (
-    ("babyai", ["-m", "experiments.babyai", *TOY])
-    if LONG
-    else (LAKE.name, ["-m", "tests.programs", *SMALL, "--demos", "6"])
+    ("babyai", BABYAI) if LONG else (LAKE.name, ["-m", "tests.programs", *SMALL, "--demos", "6"])
 )
 STEPS = 200
 
@@ -68,7 +67,7 @@ class Place:
     def __init__(self, folder):
         self.folder = folder
 
-    def start(self, runs, *options, devices=2):
+    def start(self, runs, *options, devices=2, command=COMMAND):
         """Starts a run whose results go to the folder `runs`."""
         environment = {
             **os.environ,
@@ -78,7 +77,7 @@ class Place:
         }
         often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
         return subprocess.Popen(
-            [sys.executable, *COMMAND, *often, "--runs", runs, *options],
+            [sys.executable, *command, *often, "--runs", runs, *options],
             cwd=self.folder, env=environment, text=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip

@@ -1,9 +1,6 @@
 """Tables and plots say what the rows say."""
 
-from PIL import Image
-
 from experiments import report
-from experiments.common import plots
 
 
 def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
@@ -51,28 +48,3 @@ def test_settings_are_kept_apart():
     assert [cell.split("%")[0] for cell in found[1:]] == rates
     found = cells(report.steps([*ROWS, *sooner]), "S8N7")
     assert found[1:] == ["-", "-", "-", "6.0", "4.0"]
-
-
-def test_fewer_demonstrations_are_side_by_side():
-    lines = report.efficiency(ROWS).splitlines()
-    assert lines[0] == "| level | 50 demonstrations | 500 demonstrations | paper, 500 |"
-    assert len(lines) == 3  # PickUpLoc has only one number of demonstrations
-    cells = [cell.strip() for cell in lines[2].strip("|").split("|")]
-    assert cells[0] == "GoToLocalS8N7" and cells[1].startswith("70.0% [")
-    assert cells[2].startswith("95.0% [") and cells[3] == "95.0%"
-
-
-def test_data_efficiency_is_drawn(tmp_path):
-    path = tmp_path / "plot.png"
-    plots.data_efficiency(report.efficiency_by_level(ROWS), path)
-    assert Image.open(path).size[0] > 500
-
-
-def test_scaling_is_relative_to_two_devices_of_one_process():
-    measured = [
-        {"processes": p, "devices": d, "fsdp": 1, "seconds_per_step": 0.01,
-         "examples_per_second": e, "exchange_seconds": 0.001}
-        for p, d, e in ((1, 1, 600.0), (1, 2, 1000.0), (2, 2, 800.0))
-    ]  # fmt: skip
-    lines = report.scaling(measured).splitlines()[2:]
-    assert [line.split("|")[6].strip() for line in lines] == ["60%", "100%", "80%"]
