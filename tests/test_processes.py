@@ -2,6 +2,8 @@
 
 import signal
 import socket
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,16 +12,19 @@ from experiments.common.runtime import Cluster
 from leapjax import processes
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes, join
-from tests.programs import BABYAI, COMMAND, only_long, place_with_a_run
+from tests.programs import BABYAI, COMMAND, ROOT, only_long, place_with_a_run
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
 
-def start_two(place, runs, *options, command=COMMAND):
+def free_address():
     with socket.socket() as free:
         free.bind(("localhost", 0))
-        coordinator = f"localhost:{free.getsockname()[1]}"
-    together = ("--coordinator", coordinator, "--num-processes", "2", *options)
+        return f"localhost:{free.getsockname()[1]}"
+
+
+def start_two(place, runs, *options, command=COMMAND):
+    together = ("--coordinator", free_address(), "--num-processes", "2", *options)
     return [
         place.start(runs, *together, "--process-id", str(index), devices=1, command=command)
         for index in range(2)
@@ -33,6 +38,26 @@ def test_two_processes_train_and_evaluate_as_one(place, fsdp, tolerance):
     for run in start_two(place, f"two{fsdp}", "--fsdp", str(fsdp)):
         place.finish(run)
     place.check_same_end(f"two{fsdp}", tolerance)
+
+
+def test_a_process_that_has_joined_others_can_still_be_stopped():
+    """JAX would have the signal for itself."""
+    program = f"""
+import os, signal, time
+from experiments.common import runtime
+from experiments.common.interruption import Interrupted, interruptible
+with interruptible():
+    runtime.connect(runtime.Cluster({free_address()!r}, 1, 0))
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(1)
+    except Interrupted as stopped:
+        print(stopped)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stdout == "SIGTERM\n", done.stderr
 
 
 @only_long

@@ -138,8 +138,8 @@ def test_the_readme_names_files_that_exist():
         assert (ROOT / name).exists(), name
 
 
-def test_importing_starts_no_backend():
-    """Devices are chosen when a program starts, which is after its imports."""
+def test_neither_imports_nor_a_command_line_start_a_backend():
+    """Devices are chosen when a program starts: after its imports, and its command line."""
     modules = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for folder in ("leapjax", "experiments", "benchmarks")
@@ -150,7 +150,10 @@ def test_importing_starts_no_backend():
         "import importlib, jax\n"
         f"for name in {modules}:\n"
         "    importlib.import_module(name)\n"
-        "from experiments.common import runtime\n"
+        "from experiments.common import config, runtime\n"
+        "for method in ('leap', 'classifier', 'random'):\n"
+        "    for preset in ('paper', 'leapjax'):\n"
+        "        config.parse('babyai', ['--method', method, '--preset', preset])\n"
         "runtime.start()\n"
         "import os\n"
         "assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()\n"

@@ -5,6 +5,7 @@ import dataclasses
 import logging
 import os
 import platform
+import signal
 import sys
 import time
 from pathlib import Path
@@ -78,11 +79,14 @@ def connect(cluster: Cluster) -> None:
     launched = any(_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
     if cluster.coordinator is None and not launched:
         return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         jax.distributed.initialize(
             cluster.coordinator, cluster.num_processes, cluster.process_id,
             initialization_timeout=CONNECT_SECONDS,
         )  # fmt: skip
+        for number, handler in handlers.items():  # JAX takes SIGTERM for itself
+            signal.signal(number, handler)
     except Exception as error:  # noqa: BLE001  (gRPC and JAX raise many kinds)
         raise UserError(
             f"cannot join the other processes of this run ({first_line(error)}): check that all "

@@ -42,8 +42,7 @@ def chosen(settings: Settings) -> list[Augmentation]:
     """The augmentations that are asked for, the one that comes last first."""
     found: list[Augmentation] = []
     if settings.augment:
-        words = jax.tree.map(jnp.asarray, grid_words())
-        found.append(lambda key, w: augment(key, w, words, settings.exchange_objects))
+        found.append(lambda key, w: augment(key, w, grid_words(), settings.exchange_objects))
     if settings.clutter:
         found.append(lambda key, w: clutter(key, w, settings.clutter))
     return found
@@ -116,6 +115,8 @@ def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: 
         exchange_objects: whether key, ball and box are alike, which they are in
             demonstrations that unlock no door and toggle no box.
     """
+    # Here and not before: a program says how many devices it has after a domain is made.
+    words = jax.tree.map(jnp.asarray, words)
     flip_key, colour_key, object_key, restate_key = jax.random.split(key, 4)
     colours = jax.random.permutation(colour_key, len(words.colours))
     objects = jnp.arange(symmetries.AGENT + 1)
