@@ -86,7 +86,8 @@ def connect(cluster: Cluster) -> None:
             initialization_timeout=CONNECT_SECONDS,
         )  # fmt: skip
         for number, handler in handlers.items():  # JAX takes SIGTERM for itself
-            signal.signal(number, handler)
+            if handler is not None:
+                signal.signal(number, handler)
     except Exception as error:  # noqa: BLE001  (gRPC and JAX raise many kinds)
         raise UserError(
             f"cannot join the other processes of this run ({first_line(error)}): check that all "
