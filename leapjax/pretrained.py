@@ -14,7 +14,7 @@ from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.domain import Domain
 from leapjax.domains import find_domain
-from leapjax.errors import UserError
+from leapjax.errors import UserError, check_at_least
 from leapjax.files import write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -51,6 +51,9 @@ class Specification:
     domain_settings: Any
     signature: dict  # of the domain, when it was trained
     origin: Origin
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 0, "context")
 
 
 @dataclasses.dataclass(frozen=True)

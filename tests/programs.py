@@ -67,14 +67,16 @@ class Place:
     def __init__(self, folder):
         self.folder = folder
 
-    def start(self, runs, *options, devices=2, command=COMMAND):
-        """Starts a run whose results go to the folder `runs`."""
+    def start(self, runs, *options, devices=2, command=COMMAND, cache=None):
+        """Starts a run whose results go to the folder `runs`; `cache`: of compiled programs."""
         environment = {
             **os.environ,
             "PYTHONPATH": str(ROOT),
             "MINARI_DATASETS_PATH": str(self.folder / "datasets"),
             "JAX_NUM_CPU_DEVICES": str(devices),
         }
+        if cache is not None:
+            environment["LEAPJAX_COMPILATION_CACHE"] = cache
         often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
         return subprocess.Popen(
             [sys.executable, *command, *often, "--runs", runs, *options],

@@ -19,7 +19,7 @@ from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, write_text
 from leapjax.types import TrainState
-from tests.programs import LONG, RANDOM, ROOT, STEPS, only_long, place_with_a_run
+from tests.programs import LONG, RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
@@ -82,6 +82,19 @@ def test_a_process_that_is_asked_to_stop_goes_on_as_if_it_had_not_been(place, nu
     assert not place.rows(runs)
     place.finish(place.start(runs))
     place.check_same_end(runs)
+
+
+@only_long
+@pytest.mark.parametrize("trial", range(100))
+def test_a_signal_at_any_moment(tmp_path, trial):
+    """Nothing is compiled yet, so that most of the time a compiler runs."""
+    rng = np.random.default_rng(trial)
+    number, code = ((signal.SIGTERM, 0), (signal.SIGINT, 130))[trial % 2]
+    run = Place(tmp_path).start("runs", cache="off")
+    time.sleep(rng.uniform(1.5, 12))  # JAX takes a second to import: before, Python answers
+    over = run.poll() is not None
+    run.send_signal(number)
+    assert run.wait(60) == (0 if over else code), run.stderr.read()[-2000:]
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():

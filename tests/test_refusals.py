@@ -79,6 +79,7 @@ def test_a_checkpoint_belongs_to_its_configuration(workplace):
     [
         ("model", "heads", 1),
         ("domain_settings", "sweeps", 7),
+        ("domain_settings", "sweeps", 0),
         ("domain_settings", "radius", 3),  # the default, which may be left out
         ("planner", "temperature", 0.25),
         ("origin", "seed", 5),
@@ -94,8 +95,19 @@ def test_a_specification_that_was_edited(toy_run, workplace, group, name, value)
     if same:
         leap.load(copy)
         return
-    with pytest.raises(UserError, match="another configuration"):
+    with pytest.raises(UserError, match="must be at least" if not value else "another config"):
         leap.load(copy)
+
+
+def test_a_specification_of_sizes_that_nothing_has(toy_run, workplace):
+    for name, value in {"context": -1, "planner": {"horizon": 0}}.items():
+        copy = workplace / name
+        shutil.copytree(toy_run, copy)
+        specification = json.loads((copy / "specification.json").read_text())
+        specification[name] = value
+        (copy / "specification.json").write_text(json.dumps(specification))
+        with pytest.raises(UserError, match="must be at least"):
+            leap.load(copy)
 
 
 def test_a_setting_that_an_old_specification_lacks_has_its_default(toy_run, workplace):
@@ -231,6 +243,29 @@ def test_a_disk_without_room_is_refused_before_anything_is_written(workplace, mo
         saved.save(small(1.0))
     saved.close()
     assert list((workplace / "a").iterdir()) == []
+
+
+def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
+    monkeypatch.setattr(demonstrations, "collect", lambda *rest: pytest.fail("collected"))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
+
+
+def test_a_home_that_cannot_be_written_to_has_no_compilation_cache(workplace, monkeypatch):
+    before = jax.config.jax_compilation_cache_dir
+    (workplace / "home").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(workplace / "home"))
+    monkeypatch.delenv("LEAPJAX_COMPILATION_CACHE", raising=False)
+    runtime.use_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_a_link_to_no_folder_of_checkpoints(workplace):
+    (workplace / "checkpoints").symlink_to(workplace / "nowhere")
+    with pytest.raises(UserError, match="cannot write to"):
+        Checkpoints(workplace / "checkpoints")
+    with pytest.raises(UserError, match="no checkpoint"):
+        checkpoints.restore_params(workplace / "checkpoints", small(0.0).params)
 
 
 # The bot.

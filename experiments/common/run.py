@@ -75,6 +75,7 @@ def gather(run: Run) -> list[Demonstration]:
 
 
 def _collect(run: Run, name: str) -> None:
+    storage.check_writable()
     count = run.config.demos
     with Meter(run.console, "demonstrations", count) as meter:
         collection = run.domain.collect(count, run.seed, meter.update)

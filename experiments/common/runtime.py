@@ -144,6 +144,10 @@ def use_compilation_cache() -> None:
         return
     home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
     folder = Path(choice) if choice else home / "leapjax" / "xla" / processor()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # JAX would say so at every program, with its traceback
+        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

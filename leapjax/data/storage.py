@@ -113,6 +113,17 @@ def datasets_folder() -> Path:
         ) from None
 
 
+def check_writable() -> None:
+    """Refuses, before there is anything to write, a folder that cannot be written to.
+
+    Raises:
+        UserError: says which folder.
+    """
+    root = datasets_folder()
+    if not os.access(root, os.W_OK):
+        raise UserError(f"cannot write to {root}: name another folder in MINARI_DATASETS_PATH")
+
+
 def _write(
     folder: Path, buffers: list[EpisodeBuffer], domain: Domain, details: dict[str, str]
 ) -> None:
