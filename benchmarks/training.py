@@ -75,18 +75,21 @@ class Stepper:
         self._config, self._domain = config, make_domain(config)
         agent = self._agent(mesh)
         self.energy = agent.energy
-        self.state, self._key = training.make_begin(agent, mesh)(0)
         self._data = sharding.replicate(random_steps(self._domain), mesh)
-        self._compiled = self._lower(agent).compile()
+        begin, self._step = training.compile_ahead(agent, mesh, self._data)
+        self.state, self._key = begin(0)
 
     def __call__(self) -> jax.Array:
         """Makes one step; its loss."""
-        self.state, metrics = self._compiled(self.state, self._data, self._key)
+        self.state, metrics = self._step(self.state, self._data, self._key)
         return metrics["loss"]
 
     def flops(self) -> float:
-        """Of one step, counted by XLA for the whole batch on one device."""
-        return self._lower(self._agent(None)).cost_analysis()["flops"]
+        """Of one update, counted by XLA for the whole batch on one device."""
+        step = training.make_train_step(self._agent(None))
+        arguments = self.state, jax.eval_shape(step.draw, self._key, 0, self._data), self._key
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments)
+        return step.update.lower(*shapes).cost_analysis()["flops"]  # type: ignore[attr-defined]
 
     def encoder_seconds(self, mesh: Mesh, seconds: float) -> float:
         """Seconds for the encoder of a batch and its gradient, on as many devices."""
@@ -108,10 +111,6 @@ class Stepper:
 
     def _agent(self, mesh: Mesh | None) -> Agent:
         return pretrained.make_agent(specify(self._config, 0, self._domain), self._domain, mesh)
-
-    def _lower(self, agent: Agent) -> Any:
-        step = training.make_train_step(agent)
-        return step.lower(self.state, self._data, self._key)  # type: ignore[attr-defined]
 
 
 def measure(config: Config[Any, Any], seconds: float) -> Row:

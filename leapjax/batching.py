@@ -13,6 +13,8 @@ from leapjax import sharding
 from leapjax.planners import PlannerConfig, bind
 from leapjax.types import Array, Energy, Params, Plan, PyTree
 
+CHUNK_SIZES = (1, 16, 128)
+
 
 class NotANumber(ValueError):
     """An energy that was minimised is NaN somewhere; `plan` is what came of it all the same."""
@@ -146,7 +148,7 @@ class CompiledPlanner:
 def compile_planner(
     energy: Energy,
     config: PlannerConfig,
-    chunk_sizes: Sequence[int] = (1, 16, 128),
+    chunk_sizes: Sequence[int] = CHUNK_SIZES,
     devices: Sequence[jax.Device] | None = None,
 ) -> CompiledPlanner:
     """Builds, once, the planner that serves batches of any size.

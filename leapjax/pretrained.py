@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from jax.sharding import Mesh
 
 from leapjax import checkpoints
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.batching import CompiledPlanner, compile_planner
+from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
 from leapjax.domain import Domain
 from leapjax.domains import find_domain
 from leapjax.errors import UserError, check_at_least
@@ -127,12 +128,17 @@ def read_specification(folder: Path) -> Specification:
         raise UserError(f"{path}: {error}") from None
 
 
-def load(path: str | os.PathLike[str], planner: PlannerConfig | None = None) -> Pretrained:
+def load(
+    path: str | os.PathLike[str],
+    planner: PlannerConfig | None = None,
+    chunk_sizes: Sequence[int] = CHUNK_SIZES,
+) -> Pretrained:
     """A trained planner from the folder of its run.
 
     Args:
         path: the folder that a run printed.
         planner: search settings, of the same horizon; None for those it was trained with.
+        chunk_sizes: see `leapjax.compile_planner`.
 
     Raises:
         UserError: no such run, one that cannot be read, or another horizon.
@@ -149,5 +155,5 @@ def load(path: str | os.PathLike[str], planner: PlannerConfig | None = None) -> 
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = checkpoints.restore_params(folder / CHECKPOINTS, like, identity(specification))
-    plan = compile_planner(agent.energy, planner or specification.planner)
+    plan = compile_planner(agent.energy, planner or specification.planner, chunk_sizes)
     return Pretrained(specification, agent.energy, params, plan)

@@ -148,6 +148,13 @@ def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
     return jax.tree.unflatten(structure, parts)
 
 
+def quick(mesh: Mesh) -> dict[str, Any] | None:
+    """Options for a program that is compiled for one call, on the devices of a mesh."""
+    if mesh.devices.flat[0].platform != "cpu":
+        return None
+    return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+
 def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     """Jits `(static, params, *batches) -> batch` so that each device does its own rows."""
 

@@ -1,5 +1,6 @@
 """The training loop: a jitted pure step, and everything that has side effects around it."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -28,30 +29,80 @@ def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, ja
 
     state, _ = jax.eval_shape(begin, 0)
     places = sharding.parameter_shardings(state, mesh), NamedSharding(mesh, sharding.REPLICATED)
-    return jax.jit(begin, out_shardings=places)
+    # It runs once, so that what optimisation takes is never won back.
+    return jax.jit(begin, out_shardings=places, compiler_options=sharding.quick(mesh))
 
 
-def make_train_step(
-    agent: Agent,
-) -> Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]:
-    """The jitted step `(state, data, key) -> (state, metrics)`; it consumes `state`.
+@dataclasses.dataclass(frozen=True)
+class TrainStep:
+    """One step `(state, data, key) -> (state, metrics)`, as two jitted programs.
 
     Batch k and its noise are functions of (key, k) alone, k being the state's own step, so
     a run that is stopped and continued is the run that was not.
-
-    Args:
-        agent: what is trained. If it was made with a mesh, the state and the key come from
-            `make_begin` with that mesh, and the data from `sharding.replicate`.
     """
 
-    def step(
-        state: TrainState, data: PyTree, key: jax.Array
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
-        batch_key = jax.random.fold_in(jax.random.fold_in(key, BATCH_STREAM), state.step)
-        update_key = jax.random.fold_in(jax.random.fold_in(key, UPDATE_STREAM), state.step)
-        return agent.update(state, agent.batch(batch_key, data), update_key)
+    draw: Callable[[jax.Array, jax.Array, PyTree], PyTree]  # (key, step, data) -> batch
+    update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
+    # (state, batch, key) -> (state, metrics); it consumes the state
 
-    return jax.jit(step, donate_argnums=0)
+    def __call__(
+        self, state: TrainState, data: PyTree, key: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """Makes one step; it consumes `state`."""
+        return self.update(state, self.draw(key, state.step, data), key)
+
+
+def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
+    """The programs of a step. The long one to compile, `update`, is the same whatever the data.
+
+    Args:
+        agent: what is trained.
+        mesh: that the agent was made with. The state and the key then come from `make_begin`,
+            and the data from `sharding.replicate`.
+    """
+
+    def draw(key: jax.Array, step: jax.Array, data: PyTree) -> PyTree:
+        return agent.batch(jax.random.fold_in(jax.random.fold_in(key, BATCH_STREAM), step), data)
+
+    def update(
+        state: TrainState, batch: PyTree, key: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        key = jax.random.fold_in(jax.random.fold_in(key, UPDATE_STREAM), state.step)
+        return agent.update(state, batch, key)
+
+    whole = None if mesh is None else NamedSharding(mesh, sharding.REPLICATED)
+    return TrainStep(jax.jit(draw, out_shardings=whole), jax.jit(update, donate_argnums=0))
+
+
+def compile_ahead(
+    agent: Agent, mesh: Mesh, like: PyTree
+) -> tuple[Callable[[int], tuple[TrainState, jax.Array]], TrainStep]:
+    """`make_begin` and `make_train_step` with all that is long to compile compiled.
+
+    Args:
+        agent: that was made with the mesh.
+        mesh: to train on.
+        like: data of the right structure; how much of them there is does not matter.
+    """
+    begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
+    begun = begin.lower(0)  # type: ignore[attr-defined]
+    whole = NamedSharding(mesh, sharding.REPLICATED)
+
+    def placed(tree: PyTree, places: PyTree) -> PyTree:
+        return jax.tree.map(
+            lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place),
+            tree, places,
+        )  # fmt: skip
+
+    state, key = jax.eval_shape(begin, 0)
+    batch = jax.eval_shape(step.draw, key, state.step, like)
+    arguments = (
+        placed(state, sharding.parameter_shardings(state, mesh)),
+        placed(batch, jax.tree.map(lambda _: whole, batch)),
+        placed(key, whole),
+    )
+    update = step.update.lower(*arguments)  # type: ignore[attr-defined]
+    return begun.compile(), dataclasses.replace(step, update=update.compile())
 
 
 def train(
@@ -66,7 +117,7 @@ def train(
     """Runs until the state has seen `steps` steps, or `report` says stop.
 
     Args:
-        train_step: from `make_train_step`, or anything of that signature.
+        train_step: a `TrainStep`, or anything of its signature.
         state: to start from; consumed.
         data: on device.
         key: of the run.

@@ -70,7 +70,7 @@ def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
     mesh = sharding.make_mesh(learning.batch)
     agent = leap.make_agent(Setup(DOMAIN, 1, 4, model, learning, leap.Settings()), mesh)
     begin = training.make_begin(agent, mesh)
-    step = training.make_train_step(agent)
+    step = training.make_train_step(agent, mesh)
     plan = batching.compile_planner(agent.energy, planners.GibbsConfig(4, 4))
     demonstrations = DOMAIN.collect(5, 0, lambda done: None).demonstrations
     data = sharding.replicate(windows.concatenate(demonstrations, DOMAIN.extras), mesh)

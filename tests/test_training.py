@@ -389,8 +389,9 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     mesh = sharding.make_mesh(TRAINING.batch, fsdp=fsdp)
     assert mesh.size == 8
     agent = leap.make_agent(setup(), mesh)
-    begun, data = training.make_begin(agent, mesh)(0), sharding.replicate(data, mesh)
-    step = training.make_train_step(agent)
+    data = sharding.replicate(data, mesh)
+    begin, step = training.compile_ahead(agent, mesh, windows.of_blank(toy.DOMAIN))
+    begun = begin(0)
     (actual, metrics), params = gradient_step(step, begun[0], data, begun[1])
     largest = max(jax.tree.leaves(params), key=lambda leaf: leaf.size)
     assert largest.size >= sharding.SMALLEST_SPLIT
@@ -497,7 +498,7 @@ def test_extra_state_follows_the_parameters_and_not_the_gradient(fsdp, tmp_path)
         begin = lambda seed: (agent.init(jax.random.key(seed)), jax.random.key(seed))  # noqa: E731
     else:
         begin, data = training.make_begin(agent, mesh), sharding.replicate(data, mesh)
-    step = training.make_train_step(agent)
+    step = training.make_train_step(agent, mesh)
 
     state, key = begin(0)
     w = np.asarray(state.params["w"], np.float64)

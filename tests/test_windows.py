@@ -279,6 +279,19 @@ def test_by_step_every_step_counts_the_same():
     assert not is_uniform([c.sum() for c in found])
 
 
+def test_padding_changes_no_window():
+    steps = laid_out(toy_demonstrations())
+    padded = windows.padded(steps)
+    assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
+    assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
+    for by in ("step", "episode"):
+        draw = functools.partial(
+            windows.sample_windows, batch=64, context=2, horizon=5, end=END, by=by
+        )
+        same = [jax.jit(draw)(jax.random.key(0), on_device(data)) for data in (steps, padded)]
+        jax.tree.map(np.testing.assert_array_equal, *same)
+
+
 def test_another_way_to_draw_is_refused():
     with pytest.raises(ValueError, match="unknown sampling 'window'"):
         sample(0, 4, "window")

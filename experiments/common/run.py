@@ -4,6 +4,7 @@ All experiments share them, whatever the domain and the method. With several pro
 them go through all steps; the first one writes.
 """
 
+import concurrent.futures
 import contextlib
 import csv
 import dataclasses
@@ -12,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,16 +25,20 @@ from experiments.common.config import Config
 from experiments.common.interruption import Interruption
 from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
-from leapjax.batching import compile_planner
+from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError, first_line
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
-from leapjax.types import Demonstration, TrainState
+from leapjax.training import TrainStep
+from leapjax.types import Agent, Demonstration, TrainState
 
 Metrics = list[dict[str, float]]
+# One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
+# evaluation would rather have smaller ones.
+CHUNK_SIZES = (32,)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,15 +62,69 @@ class Run:
         return self.specification.origin.seed
 
 
+class Programs(NamedTuple):
+    """What is compiled for a run."""
+
+    agent: Agent
+    mesh: Mesh
+    begin: Callable[[int], tuple[TrainState, jax.Array]]
+    step: TrainStep
+    plan: CompiledPlanner
+
+
+def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
+    """Begins to compile, in the background; what is returned waits for the end of it."""
+    config, domain = run.config, run.domain
+    agent = pretrained.make_agent(run.specification, domain, mesh)
+    plan = compile_planner(agent.energy, config.planner, CHUNK_SIZES)
+    like = windows.of_blank(domain) if config.demos else ()
+
+    def learning() -> tuple[Any, TrainStep]:
+        if config.training.steps:
+            return training.compile_ahead(agent, mesh, like)
+        return training.make_begin(agent, mesh), training.make_train_step(agent, mesh)
+
+    def planning() -> None:
+        shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
+        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), shapes)
+        blank = Pretrained(run.specification, agent.energy, params, plan)
+        warm_up(blank, domain, config.episodes)
+
+    pool = concurrent.futures.ThreadPoolExecutor(2)
+    compiled, warm = pool.submit(learning), pool.submit(planning)
+    pool.shutdown(wait=False)
+
+    def wait() -> Programs:
+        begun = time.perf_counter()
+        begin, step = compiled.result()
+        warm.result()
+        run.seconds["compile"] += time.perf_counter() - begun
+        return Programs(agent, mesh, begin, step, plan)
+
+    return wait
+
+
+def dataset(run: Run) -> str:
+    """The id of the demonstrations to train on."""
+    config = run.config
+    return config.demonstrations or storage.dataset_id(run.domain, config.demos, run.seed)
+
+
+def must_collect(run: Run) -> bool:
+    """Whether there are no demonstrations yet, so that `gather` will take its time."""
+    wanted = run.config.demos and run.config.demonstrations is None
+    return bool(wanted) and processes.first_does(lambda: not storage.exists(dataset(run)))
+
+
 def gather(run: Run) -> list[Demonstration]:
     """The demonstrations to train on: the user's, the cached ones, or new ones."""
     config, domain = run.config, run.domain
     if not config.demos:
         return []
     begun = time.perf_counter()
-    name = config.demonstrations or storage.dataset_id(domain, config.demos, run.seed)
-    if config.demonstrations is None:
-        processes.first_does(lambda: None if storage.exists(name) else _collect(run, name))
+    name = dataset(run)
+    if must_collect(run):
+        processes.first_does(lambda: _collect(run, name))
     # Each process reads for itself: the data need not be on one shared disk.
     data = processes.together(lambda: storage.load(name, domain))
     if len(data) < config.demos:
@@ -87,16 +146,17 @@ def _collect(run: Run, name: str) -> None:
     storage.save(name, collection, run.domain, summary)
 
 
-def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained, Metrics]:
-    """Trains, or continues; what was learned and how it went."""
+def fit(
+    run: Run, data: Sequence[Demonstration], wait: Callable[[], Programs]
+) -> tuple[Pretrained, Metrics]:
+    """Trains, or continues; what was learned and how it went. `wait`: from `compile_ahead`."""
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
-    examples = windows.concatenate(data, run.domain.extras) if data else ()
+    examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
     check_data(folder, windows.fingerprint(examples))
     processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
-    begun = time.perf_counter()
-    agent = pretrained.make_agent(run.specification, run.domain, mesh)
-    state, key = training.make_begin(agent, mesh)(run.seed)
-    steps = sharding.replicate(examples, mesh)
+    agent, mesh, begin, step, plan = wait()
+    state, key = begin(run.seed)
+    steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
     processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
@@ -106,12 +166,8 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
         state = restored
         metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
         console.print(f"continuing at step {int(state.step)} of {total}")
-    step = training.make_train_step(agent)
-    if total:
-        step = step.lower(state, steps, key).compile()  # type: ignore[attr-defined]
-    elif restored is None:
+    if not total and restored is None:
         saved.save(state)  # there is nothing to learn: what a method begins with is all of it
-    run.seconds["compile"] = time.perf_counter() - begun
 
     before = metrics[-1]["seconds"] if metrics else 0.0
     begun = last_saved = time.perf_counter()
@@ -139,7 +195,6 @@ def fit(run: Run, data: Sequence[Demonstration], mesh: Mesh) -> tuple[Pretrained
 
         state = training.train(step, state, steps, key, total, report)
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
-    plan = compile_planner(agent.energy, config.planner)
     # Planning is each process's own business, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
     return Pretrained(run.specification, agent.energy, params, plan), metrics
@@ -200,7 +255,7 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
                 f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
                 f"not {wanted[name]}"
             )
-    return pretrained.load(checkpoint, run.config.planner)
+    return pretrained.load(checkpoint, run.config.planner, CHUNK_SIZES)
 
 
 def _training_settings(specification: Specification) -> dict[str, Any]:

@@ -13,11 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.domain import Domain
 from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
 
 
 class Steps(NamedTuple):
-    """All steps of all demonstrations, one after the other: M steps of E episodes."""
+    """All steps of all demonstrations, one after the other: M steps of E episodes.
+
+    Behind them the arrays may be padded (see `padded`).
+    """
 
     observations: PyTree  # [M + E, ...] the states of each episode, its last one included
     state: Array  # [M] int32: where in them the state before each action is; after it: + 1
@@ -30,6 +34,7 @@ class Steps(NamedTuple):
     remaining: Array  # [M] int32: actions of the episode from here on, this one included
     starts: Array  # [E] int32: the index of each episode's first step
     lengths: Array  # [E] int32: its number of actions
+    count: Array  # [] int32: M
     extras: PyTree  # [M, ...] what the domain's augmentation must know; no model sees it
 
 
@@ -76,8 +81,32 @@ def concatenate(
         remaining=lengths[episode] - step,
         starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
         lengths=lengths,
+        count=np.int32(len(step)),
         extras=join([extras(d) for d in demonstrations]),
     )
+
+
+def padded(steps: Steps) -> Steps:
+    """The same steps, in arrays whose lengths are powers of two.
+
+    Programs are compiled for lengths: those for one training seed then serve most others.
+    """
+
+    def lengthen(leaf: Array) -> Array:
+        more = (1 << (len(leaf) - 1).bit_length()) - len(leaf)
+        return np.concatenate([leaf, np.zeros((more, *leaf.shape[1:]), leaf.dtype)])
+
+    kept = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
+    lengthened = jax.tree.map(lengthen, steps._replace(**dict.fromkeys(kept, ())))
+    return lengthened._replace(**kept)
+
+
+def of_blank(domain: Domain) -> Steps:
+    """One step of a domain in which there is nothing: the structure of all `Steps`."""
+    states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
+    actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
+    blank = Demonstration(states, actions, rewards, True, False, 0)
+    return concatenate([blank], domain.extras)
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
@@ -129,7 +158,7 @@ def sample_windows(
         ValueError: another `by`.
     """
     if by == "step":
-        index = jax.random.randint(key, (batch,), 0, steps.actions.shape[0])
+        index = jax.random.randint(key, (batch,), 0, steps.count)
     elif by == "episode":
         episode_key, step_key = jax.random.split(key)
         episode = jax.random.randint(episode_key, (batch,), 0, steps.starts.shape[0])
