@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 MASKINGS = ("one", "each", "random")
+SINGLE = ("one", "each")  # those that mask one action in every copy
 
 
 def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:

@@ -77,24 +77,26 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             rngs={"dropout": encode_key},
         )  # fmt: skip
 
-        def score(masked: jax.Array, drop_key: jax.Array) -> jax.Array:
+        def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
+            # Only what is masked is predicted: where that is one action, only it is computed.
+            single = masking in schedules.SINGLE
+            positions = jnp.argmax(masked)[None] if single else jnp.arange(sizes.horizon)
             tokens = jnp.where(masked, mask, window.actions)
-            positions = jnp.arange(sizes.horizon)
             logits = module.apply(
                 params, memory, tokens, positions, deterministic=False, method="logits",
                 rngs={"dropout": drop_key},
             )  # fmt: skip
             assert isinstance(logits, jax.Array)
-            return jax.nn.log_softmax(logits)
+            targets = window.actions[positions]
+            likelihoods = jnp.take_along_axis(jax.nn.log_softmax(logits), targets[:, None], axis=1)
+            return likelihoods[:, 0], jnp.argmax(logits, axis=1) == targets, masked[positions]
 
-        likelihoods = jax.vmap(score)(masks, keys[2 : 2 + masks.shape[0]])  # [C, T, A]
-        chosen = jnp.take_along_axis(likelihoods, window.actions[None, :, None], axis=2)[..., 0]
-        hits = jnp.argmax(likelihoods, axis=-1) == window.actions
+        likelihoods, hits, counted = jax.vmap(score)(masks, keys[2 : 2 + masks.shape[0]])  # [C, P]
         # Unmasked positions are not predicted: their terms are left out, not zeroed after
         # the fact, so that a -inf there cannot become NaN.
-        count = masks.sum()
-        accuracy = jnp.where(masks, hits, 0).sum() / count
-        return -jnp.where(masks, chosen, 0).sum() / count, {"accuracy": accuracy}
+        count = counted.sum()
+        accuracy = jnp.where(counted, hits, 0).sum() / count
+        return -jnp.where(counted, likelihoods, 0).sum() / count, {"accuracy": accuracy}
 
     update = learning.make_update(window_loss, optimizer, mesh)
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
