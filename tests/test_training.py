@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from leapjax import sharding, training
+from leapjax import schedules, sharding, training
 from leapjax.agents import leap, learning
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.babyai.adapter import NUM_ACTIONS
@@ -26,6 +26,7 @@ from leapjax.types import Agent, TrainState
 from tests import toy
 
 MODEL = ModelConfig(layers=1, heads=2, width=16)
+EXACT = dataclasses.replace(MODEL, dropout=0.0)
 TRAINING = TrainingConfig(steps=250, batch=16, warmup=20, learning_rate=1e-2)
 LEVEL = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
 
@@ -150,6 +151,46 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
     assert len(np.unique(np.stack(first.extras))) == 2 * TRAINING.batch
 
 
+@pytest.mark.parametrize("masking", ["each", "random"])
+def test_the_loss_is_the_energy_of_what_is_masked(masking, data, monkeypatch):
+    """Equation 1; with each action masked in turn it is the energy of a plan over T."""
+    made = setup(model=EXACT)._replace(settings=leap.Settings(masking))
+    agent, horizon = leap.make_agent(made), made.horizon
+    compiled, step = tiny()
+    state = compiled.init(jax.random.key(0))
+    batch = step.draw(jax.random.key(1), 0, data)
+    masks, sample = [], schedules.sample_masks
+
+    def remember(key, *rest):
+        found = sample(key, *rest)
+        jax.debug.callback(lambda mask: masks.append(np.asarray(mask)), found, ordered=False)
+        return found
+
+    energy = agent.energy
+    if masking == "each":
+        totals = jax.vmap(
+            lambda c, a: energy.total(state.params, energy.encode(state.params, c), a)
+        )(batch.context, batch.actions)
+        expected = float(totals.mean() / horizon)
+        _, metrics = jax.jit(agent.update)(state, batch, jax.random.key(2))
+        assert metrics["loss"] == pytest.approx(expected, rel=1e-5)
+        return
+    # What is masked is drawn inside: one window at a time, so that it is known which it was of.
+    monkeypatch.setattr(schedules, "sample_masks", remember)
+    update = jax.jit(agent.update)
+    for row in range(3):
+        one = jax.tree.map(lambda leaf, r=row: leaf[r : r + 1], batch)
+        _, metrics = update(state, one, jax.random.key(row))
+        jax.effects_barrier()
+        chosen = np.flatnonzero(masks[-1])
+        memory = energy.encode(state.params, jax.tree.map(lambda leaf: leaf[0], one.context))
+        # The conditional masks all the positions that it is asked for.
+        energies = energy.conditional(state.params, memory, one.actions[0], jnp.asarray(chosen))
+        taken = energies[np.arange(len(chosen)), one.actions[0][chosen]]
+        normalised = taken + jax.nn.logsumexp(-energies, axis=1)
+        assert metrics["loss"] == pytest.approx(float(normalised.mean()), rel=1e-4)
+
+
 def entropy_of_positions(data) -> float:
     """The least loss of a model that looks at nothing but the position in the plan."""
     many = dataclasses.replace(TRAINING, batch=1000)
@@ -160,7 +201,7 @@ def entropy_of_positions(data) -> float:
 
 
 def test_it_learns_a_few_demonstrations_by_heart(local_demonstrations):
-    agent = leap.make_agent(setup(LEVEL, dataclasses.replace(MODEL, dropout=0.0)))
+    agent = leap.make_agent(setup(LEVEL, EXACT))
     step = training.make_train_step(agent)
     data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
     losses, accuracies = [], []
