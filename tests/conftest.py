@@ -21,6 +21,7 @@ from experiments import babyai
 from leapjax.babyai import demonstrations, levels
 from leapjax.types import Demonstration
 from tests import OURS
+from tests.programs import TOY_RUN
 
 
 def pytest_unconfigure():
@@ -47,19 +48,13 @@ def local_demonstrations() -> list[Demonstration]:
     return collected
 
 
-TOY = (
-    "--demos 4 --episodes 3 --steps 2 --batch 4 --width 16 --heads 2 --layers 1 --channels 4 "
-    "--rounds 1 --fields 2 --sweeps 2 --iterations 2 --no-pictures"
-).split()
-
-
 @pytest.fixture(scope="session")
 def toy_run(tmp_path_factory) -> Path:
-    """The folder of a run of two steps; not to be changed."""
+    """The folder of a run of four steps; not to be changed."""
     folder = tmp_path_factory.mktemp("toy")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
-        assert babyai.main(TOY) == 0
+        assert babyai.main(TOY_RUN) == 0
     (run,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
     return run

@@ -27,6 +27,7 @@ SMALL = (
     "--episodes 3 --batch 4 --width 16 --heads 2 --layers 1 --iterations 2 --no-pictures".split()
 )
 TOY = [*SMALL, *"--demos 6 --channels 4 --rounds 1 --fields 2 --sweeps 2".split()]
+TOY_RUN = [*TOY, "--steps", "4", "--iterations", "3"]  # what most tests look at
 RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
 
 # What processes of their own run. The short form trains in another domain, which compiles in a

@@ -21,12 +21,10 @@ from leapjax.babyai.levels import LEVELS
 from leapjax.babyai.settings import Settings
 from leapjax.data import seeds, storage
 from leapjax.planners import GibbsConfig
-from tests import programs
-from tests.programs import RANDOM, only_long, untrained_run
+from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
 DOMAIN = BABYAI.make(LEVEL, Settings())
-TOY = [*programs.TOY, "--steps", "4", "--iterations", "3"]
 SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
 FIELDS = (
     "experiment domain level method preset seed demos episodes successes mean_return mean_length "
@@ -42,7 +40,7 @@ def workplace(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "datasets"))
-        assert babyai.main(TOY) == 0
+        assert babyai.main(TOY_RUN) == 0
         yield folder
 
 
@@ -106,7 +104,7 @@ def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
     for name in ("successes", "mean_length", "mean_return", "demos", "configuration"):
         assert after[name] == before[name], name
     assert after["hash"] != before["hash"]  # to train and to play are two rows
-    assert parse("babyai", [*TOY, *arguments]) == parse("babyai", arguments)
+    assert parse("babyai", [*TOY_RUN, *arguments]) == parse("babyai", arguments)
     assert [path.name for path in (workplace / "again").iterdir() if path.is_dir()] == []
 
 
@@ -150,7 +148,7 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
 
 def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
     shutil.copytree(workplace / "runs", workplace / "both")
-    assert babyai.main([*TOY, *SIMPLE, "--method", "classifier", "--runs", "both"]) == 0
+    assert babyai.main([*TOY_RUN, *SIMPLE, "--method", "classifier", "--runs", "both"]) == 0
     before, after = results.read(workplace / "both" / "babyai.jsonl")
     assert (before["method"], after["method"]) == ("leap", "classifier")
     assert before["hash"] != after["hash"] and after["params"] > 0
@@ -240,7 +238,8 @@ def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
 def test_both_presets_run_on_any_level_with_context(workplace, name, level):
     runs = f"{name} {level}"
     arguments = ["--preset", name, "--level", level, "--context", "2", "--runs", runs]
-    assert babyai.main([*TOY, *SIMPLE, *arguments]) == 0
+    arguments += [] if LONG else ["--steps", "0"]  # the gradient takes long to compile
+    assert babyai.main([*TOY_RUN, *SIMPLE, *arguments]) == 0
     (row,) = results.read(workplace / runs / "babyai.jsonl")
     assert (row["preset"], row["level"]) == (name, level)
     assert row["configuration"]["context"] == 2
@@ -266,7 +265,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level):
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):
-    assert babyai.main([*TOY, *arguments]) == 2
+    assert babyai.main([*TOY_RUN, *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1 and error.startswith("error: ")
@@ -317,13 +316,13 @@ def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_
     folder = tmp_path / "runs" / run_folder(workplace).name
     shutil.copytree(run_folder(workplace), folder)
     (folder / "data.json").write_text('{"fingerprint": "0123456789abcdef"}')
-    assert babyai.main([*TOY, "--runs", str(tmp_path / "runs")]) == 2
+    assert babyai.main([*TOY_RUN, "--runs", str(tmp_path / "runs")]) == 2
     assert "was begun on other demonstrations (0123456789abcdef" in capsys.readouterr().err
 
 
 def test_a_folder_in_use_is_refused(workplace, capsys):
     with files.only_process_in(run_folder(workplace)):
-        assert babyai.main(TOY) == 2
+        assert babyai.main(TOY_RUN) == 2
     error = capsys.readouterr().err
     assert f"in use by another process ({os.getpid()})" in error and error.count("\n") == 1
 
@@ -341,7 +340,7 @@ def test_a_data_set_of_the_users_own_is_trained_on(workplace):
 
 def test_too_few_demonstrations_in_a_data_set(workplace, capsys):
     mine = storage.dataset_id(DOMAIN, 6, 0)
-    assert babyai.main([*TOY, "--demonstrations", mine, "--demos", "7"]) == 2
+    assert babyai.main([*TOY_RUN, "--demonstrations", mine, "--demos", "7"]) == 2
     assert "fewer than --demos 7" in capsys.readouterr().err
 
 

@@ -14,7 +14,7 @@ from tests import frozen_lake
 
 LAKE = Experiment("lake", "frozen_lake")
 TOY = (
-    "--steps 600 --temperature 0 --batch 16 --demos 3 --episodes 5 --layers 1 --width 32 "
+    "--steps 600 --temperature 0 --batch 13 --demos 3 --episodes 5 --layers 1 --width 32 "
     "--heads 2 --learning-rate 0.01 --warmup 5 --no-pictures"
 ).split()
 

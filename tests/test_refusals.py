@@ -20,7 +20,7 @@ from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.conftest import TOY
+from tests.programs import TOY_RUN
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ def workplace(tmp_path, monkeypatch):
 
 def one_line(capsys, *arguments) -> str:
     """The line with which a command is refused."""
-    assert babyai.main([*TOY, *map(str, arguments)]) == 2
+    assert babyai.main([*TOY_RUN, *map(str, arguments)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1
     return error

@@ -21,7 +21,7 @@ from leapjax.models.trajectory import ModelConfig
 from tests import frozen_lake
 from tests.programs import LONG, TOY, only_long
 
-CYCLES, RUNS = 300 if LONG else 8, 20
+CYCLES, RUNS = 300 if LONG else 5, 20
 DOMAIN = (
     BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
     if LONG

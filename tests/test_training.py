@@ -431,7 +431,7 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     assert mesh.size == 8
     agent = leap.make_agent(setup(), mesh)
     data = sharding.replicate(data, mesh)
-    begin, step = training.compile_ahead(agent, mesh, windows.of_blank(toy.DOMAIN))
+    begin, step = training.compile_ahead(agent, mesh, learning.blank_steps(toy.DOMAIN))
     begun = begin(0)
     (actual, metrics), params = gradient_step(step, begun[0], data, begun[1])
     largest = max(jax.tree.leaves(params), key=lambda leaf: leaf.size)

@@ -25,6 +25,7 @@ from experiments.common.config import Config
 from experiments.common.interruption import Interruption
 from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
+from leapjax.agents import learning
 from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
@@ -77,21 +78,21 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
     config, domain = run.config, run.domain
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, CHUNK_SIZES)
-    like = windows.of_blank(domain) if config.demos else ()
+    like = learning.blank_steps(domain) if config.demos else ()
 
-    def learning() -> tuple[Any, TrainStep]:
+    def training_programs() -> tuple[Any, TrainStep]:
         if config.training.steps:
             return training.compile_ahead(agent, mesh, like)
         return training.make_begin(agent, mesh), training.make_train_step(agent, mesh)
 
-    def planning() -> None:
+    def warm_planner() -> None:
         shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
         params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), shapes)
         blank = Pretrained(run.specification, agent.energy, params, plan)
         warm_up(blank, domain, config.episodes)
 
     pool = concurrent.futures.ThreadPoolExecutor(2)
-    compiled, warm = pool.submit(learning), pool.submit(planning)
+    compiled, warm = pool.submit(training_programs), pool.submit(warm_planner)
     pool.shutdown(wait=False)
 
     def wait() -> Programs:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
@@ -17,7 +18,7 @@ from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.types import Agent, Context, Params, PyTree, TrainState, Window
+from leapjax.types import Agent, Context, Demonstration, Params, PyTree, TrainState, Window
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
 UNDECAYED = ("bias", "scale", "embedding")
@@ -201,6 +202,14 @@ def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
         return drawn
 
     return batch
+
+
+def blank_steps(domain: Domain) -> Steps:
+    """One step of a domain in which there is nothing: the structure of all its `Steps`."""
+    states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
+    actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
+    blank = Demonstration(states, actions, rewards, True, False, 0)
+    return windows.concatenate([blank], domain.extras)
 
 
 def context_encoder(

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.domain import Domain
 from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
 
 
@@ -99,14 +98,6 @@ def padded(steps: Steps) -> Steps:
     kept = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
     lengthened = jax.tree.map(lengthen, steps._replace(**dict.fromkeys(kept, ())))
     return lengthened._replace(**kept)
-
-
-def of_blank(domain: Domain) -> Steps:
-    """One step of a domain in which there is nothing: the structure of all `Steps`."""
-    states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
-    actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
-    blank = Demonstration(states, actions, rewards, True, False, 0)
-    return concatenate([blank], domain.extras)
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
