@@ -151,44 +151,66 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
     assert len(np.unique(np.stack(first.extras))) == 2 * TRAINING.batch
 
 
-@pytest.mark.parametrize("masking", ["each", "random"])
-def test_the_loss_is_the_energy_of_what_is_masked(masking, data, monkeypatch):
-    """Equation 1; with each action masked in turn it is the energy of a plan over T."""
-    made = setup(model=EXACT)._replace(settings=leap.Settings(masking))
+@pytest.mark.parametrize(("masking", "end"), [("each", True), ("each", False), ("random", True)])
+def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatch):
+    """Equation 1, one position at a time; without an end action PAD is seen, not predicted."""
+    made = setup(model=EXACT)._replace(settings=leap.Settings(masking, end))
     agent, horizon = leap.make_agent(made), made.horizon
     compiled, step = tiny()
     state = compiled.init(jax.random.key(0))
-    batch = step.draw(jax.random.key(1), 0, data)
     masks, sample = [], schedules.sample_masks
 
     def remember(key, *rest):
         found = sample(key, *rest)
-        jax.debug.callback(lambda mask: masks.append(np.asarray(mask)), found, ordered=False)
+        jax.debug.callback(lambda mask: masks.append(np.asarray(mask)), found)
         return found
 
-    energy = agent.energy
-    if masking == "each":
-        totals = jax.vmap(
-            lambda c, a: energy.total(state.params, energy.encode(state.params, c), a)
-        )(batch.context, batch.actions)
-        expected = float(totals.mean() / horizon)
-        _, metrics = jax.jit(agent.update)(state, batch, jax.random.key(2))
-        assert metrics["loss"] == pytest.approx(expected, rel=1e-5)
-        return
-    # What is masked is drawn inside: one window at a time, so that it is known which it was of.
     monkeypatch.setattr(schedules, "sample_masks", remember)
     update = jax.jit(agent.update)
+    energy, pad = agent.energy, toy.DOMAIN.num_actions + 1
+
+    @jax.jit
+    def negative_log_likelihoods(context, actions, masked):
+        memory = energy.encode(state.params, context)
+
+        def at(position):  # the others that are masked too, and what is known
+            tokens = jnp.where(masked, pad - 1, actions)
+            energies = energy.conditional(state.params, memory, tokens, position[None])[0]
+            return energies[actions[position]] + jax.nn.logsumexp(-energies)
+
+        return jax.lax.map(at, jnp.arange(horizon))
+
+    batch = step.draw(jax.random.key(1), 0, data)
+    ended = 0
     for row in range(3):
         one = jax.tree.map(lambda leaf, r=row: leaf[r : r + 1], batch)
         _, metrics = update(state, one, jax.random.key(row))
         jax.effects_barrier()
-        chosen = np.flatnonzero(masks[-1])
-        memory = energy.encode(state.params, jax.tree.map(lambda leaf: leaf[0], one.context))
-        # The conditional masks all the positions that it is asked for.
-        energies = energy.conditional(state.params, memory, one.actions[0], jnp.asarray(chosen))
-        taken = energies[np.arange(len(chosen)), one.actions[0][chosen]]
-        normalised = taken + jax.nn.logsumexp(-energies, axis=1)
-        assert metrics["loss"] == pytest.approx(float(normalised.mean()), rel=1e-4)
+        (drawn,) = masks[-1:]
+        beyond = np.asarray(one.actions[0] == toy.END) & (not end)
+        ended += beyond.sum()
+        tokens = jnp.where(beyond, pad, one.actions[0])
+        context = jax.tree.map(lambda leaf: leaf[0], one.context)
+        total = 0.0
+        for masked in drawn.reshape(-1, horizon):
+            each = negative_log_likelihoods(context, tokens, masked)
+            total += float(jnp.where(masked & ~beyond, each, 0).sum())
+        assert float(metrics["loss"]) == pytest.approx(total / drawn.sum(), rel=1e-4)
+        if (masking, end) == ("each", True):  # the energy of a plan, over T
+            memory = energy.encode(state.params, context)
+            whole = float(energy.total(state.params, memory, one.actions[0]))
+            assert whole == pytest.approx(total, rel=1e-4)
+    assert ended > 0 or end
+
+
+def test_without_an_end_action_no_plan_ends():
+    made = setup()._replace(settings=leap.Settings("each", end=False))
+    energy, params = leap.make_agent(made).energy, tiny()[0].init(jax.random.key(0)).params
+    memory = energy.encode(params, blank_context(toy.DOMAIN, 0))
+    mask = jnp.full(4, toy.DOMAIN.num_actions)
+    energies = energy.conditional(params, memory, mask, jnp.arange(4))
+    assert (energies[:, toy.END] == jnp.inf).all()
+    assert jnp.isfinite(energies[:, : toy.END]).all()
 
 
 def entropy_of_positions(data) -> float:

@@ -12,7 +12,7 @@ from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
 from leapjax.models.trajectory import Model
-from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token
+from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
 PRESETS: Presets = {
     # The appendix: one masked action per window, one window per demonstration and epoch.
@@ -33,6 +33,7 @@ class Settings:
     """The options of LEAP alone."""
 
     masking: str = "one"  # "one", "each" or "random": see leapjax.schedules
+    end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
 
     def __post_init__(self) -> None:
         if self.masking not in schedules.MASKINGS:
@@ -51,7 +52,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     sizes, masking = setup.sizes, setup.settings.masking
     module = trajectory.build(setup.model, sizes, setup.encoder())
     optimizer = learning.make_optimizer(setup.training)
-    mask = mask_token(sizes.num_actions)
+    mask, pad = mask_token(sizes.num_actions), pad_token(sizes.num_actions)
+    last = sizes.num_actions - 1  # the end action
+
+    def allowed(logits: jax.Array) -> jax.Array:
+        return logits if setup.settings.end else logits.at[:, last].set(-jnp.inf)
 
     def encode(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="encode")
@@ -61,7 +66,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> jax.Array:
         result = module.apply(params, memory, actions, positions, method="logits")
         assert isinstance(result, jax.Array)
-        return result
+        return allowed(result)
 
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 
@@ -81,22 +86,23 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             # Only what is masked is predicted: where that is one action, only it is computed.
             single = masking in schedules.SINGLE
             positions = jnp.argmax(masked)[None] if single else jnp.arange(sizes.horizon)
-            tokens = jnp.where(masked, mask, window.actions)
+            beyond = (window.actions == last) & (not setup.settings.end)
+            tokens = jnp.where(masked, mask, jnp.where(beyond, pad, window.actions))
             logits = module.apply(
                 params, memory, tokens, positions, deterministic=False, method="logits",
                 rngs={"dropout": drop_key},
             )  # fmt: skip
             assert isinstance(logits, jax.Array)
-            targets = window.actions[positions]
+            logits, targets = allowed(logits), window.actions[positions]
             likelihoods = jnp.take_along_axis(jax.nn.log_softmax(logits), targets[:, None], axis=1)
-            return likelihoods[:, 0], jnp.argmax(logits, axis=1) == targets, masked[positions]
+            hits = jnp.argmax(logits, axis=1) == targets
+            return likelihoods[:, 0], hits, (masked & ~beyond)[positions]
 
         likelihoods, hits, counted = jax.vmap(score)(masks, keys[2 : 2 + masks.shape[0]])  # [C, P]
-        # Unmasked positions are not predicted: their terms are left out, not zeroed after
-        # the fact, so that a -inf there cannot become NaN.
-        count = counted.sum()
-        accuracy = jnp.where(counted, hits, 0).sum() / count
-        return -jnp.where(counted, likelihoods, 0).sum() / count, {"accuracy": accuracy}
+        # What is not masked is not predicted: its terms are left out, not zeroed after the
+        # fact, so that a -inf there cannot become NaN. Every action that is has the same weight.
+        accuracy = jnp.where(counted, hits, 0).sum() / jnp.maximum(counted.sum(), 1)
+        return -jnp.where(counted, likelihoods, 0).sum() / masks.sum(), {"accuracy": accuracy}
 
     update = learning.make_update(window_loss, optimizer, mesh)
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
