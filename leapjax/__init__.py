@@ -26,7 +26,7 @@ from leapjax.planners import (
 )
 from leapjax.pretrained import Pretrained, load
 from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import wilson_interval
+from leapjax.scores import interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
 
 __all__ = [
@@ -52,6 +52,7 @@ __all__ = [
     "evaluate",
     "from_total",
     "gibbs",
+    "interval_over_seeds",
     "load",
     "plan_keys",
     "pseudo_likelihood",

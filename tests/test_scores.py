@@ -1,10 +1,11 @@
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leapjax.scores import wilson_interval
+from leapjax.scores import interval_over_seeds, wilson_interval
 
 counts = st.integers(1, 100_000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -62,3 +63,46 @@ def test_more_episodes_narrow_the_interval():
 def test_impossible_counts_are_refused(successes, episodes):
     with pytest.raises(ValueError, match=f"{successes} successes of {episodes} episodes"):
         wilson_interval(successes, episodes)
+
+
+def test_one_seed_has_the_interval_of_its_episodes():
+    for successes in (0, 3, 100, 190, 200):
+        expected = wilson_interval(successes, 200)
+        assert interval_over_seeds([successes], [200]) == pytest.approx(expected, abs=0.01)
+    low, high = interval_over_seeds([200, 200, 200], [200, 200, 200])
+    assert 0.98 < low < high == 1.0
+
+
+def test_seeds_that_differ_widen_the_interval():
+    def width(*successes):
+        low, high = interval_over_seeds(successes, [500] * len(successes))
+        return high - low
+
+    alike, apart = width(450, 450, 450), width(400, 450, 500)
+    low, high = wilson_interval(1350, 1500)
+    assert alike == pytest.approx(high - low, rel=0.05)
+    assert apart > 3 * alike
+
+
+def test_where_episodes_are_many_it_is_the_bootstrap_over_seeds():
+    rates = np.array([0.2, 0.5, 0.9])
+    low, high = interval_over_seeds((rates * 10**9).astype(int), [10**9] * 3)
+    # Three of three seeds are the least, or the best, one time in 27: more often than 2.5%.
+    assert (low, high) == pytest.approx((0.2, 0.9), abs=1e-3)
+
+
+def test_the_interval_over_seeds_holds_the_truth_as_often_as_it_says():
+    """Up to what three seeds can say: a bootstrap of few is known to be too narrow."""
+    rng = np.random.default_rng(1)
+    held = 0
+    for _ in range(100):
+        rates = np.clip(rng.normal(0.8, 0.03, 8), 0, 1)
+        low, high = interval_over_seeds(rng.binomial(200, rates), [200] * 8)
+        held += low <= 0.8 <= high
+    assert 85 <= held <= 100
+
+
+@pytest.mark.parametrize(("successes", "episodes"), [([], []), ([1], [0]), ([3, 6], [5, 5])])
+def test_impossible_seeds_are_refused(successes, episodes):
+    with pytest.raises(ValueError, match="successes of"):
+        interval_over_seeds(successes, episodes)

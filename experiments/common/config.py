@@ -16,6 +16,7 @@ from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.data import seeds
+from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
@@ -49,7 +50,7 @@ class Config(Generic[M, D]):
     """Id of a Minari data set to train on instead of those that the domain makes."""
     episodes: int = 200
     """Held-out episodes to measure success on."""
-    test_seed: int = 0
+    test_seed: int = UNSEEN
     """Level seed of the first of them."""
     validation: bool = False
     """Measure on validation levels instead: for choosing settings."""

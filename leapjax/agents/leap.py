@@ -23,7 +23,7 @@ PRESETS: Presets = {
     # that lead nowhere.
     "leapjax": {
         "architecture": "leapjax", "dropout": 0.0, "masking": "random", "windows": "step",
-        "learning_rate": 1.5e-3, "temperature": 0.5,
+        "learning_rate": 3e-3, "temperature": 0.5,
     },
 }  # fmt: skip
 

@@ -5,7 +5,9 @@ from collections.abc import Iterator
 
 from leapjax.errors import UserError
 
-# Test levels come first so that anyone's `--test-seed 1000` is a fresh test episode.
+# Test levels come first, so that anyone's `--test-seed 1000` is a test episode. The first
+# thousands were played while methods were developed; results are measured from here on.
+UNSEEN = 10_000_000
 VALIDATION_START = 100_000_000
 TRAINING_START = 200_000_000
 TRAINING_STRIDE = 1_000_000  # level seeds of one training seed
