@@ -10,7 +10,7 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from leapjax import checkpoints
+from leapjax import checkpoints, weights
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
 from leapjax.domain import Domain
@@ -24,6 +24,8 @@ from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
 CHECKPOINTS = "checkpoints"
+WEIGHTS = "weights.npz"  # in place of checkpoints, in the folder of a published planner
+PUBLISHED = Path(__file__).parent / "published"
 GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")  # of settings
 
 
@@ -128,15 +130,39 @@ def read_specification(folder: Path) -> Specification:
         raise UserError(f"{path}: {error}") from None
 
 
+def published(name: str) -> Path:
+    """The folder of a planner that comes with the library.
+
+    Raises:
+        UserError: there is none of this name.
+    """
+    names = sorted(path.name for path in PUBLISHED.glob("*") if path.is_dir())
+    if name not in names:
+        raise UserError(f"no planner is published for {name!r}: only for {', '.join(names)}")
+    return PUBLISHED / name
+
+
+def publish(folder: Path, target: Path) -> None:
+    """Makes a published planner of a run: its parameters in half precision.
+
+    Raises:
+        UserError: the run cannot be read, or the target not be written.
+    """
+    planner = load(folder)
+    weights.write(target / WEIGHTS, planner.params, identity(planner.specification))
+    save_specification(target, planner.specification)
+
+
 def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
     chunk_sizes: Sequence[int] = CHUNK_SIZES,
 ) -> Pretrained:
-    """A trained planner from the folder of its run.
+    """A trained planner from the folder of its run, or one that comes with the library.
 
     Args:
-        path: the folder that a run printed.
+        path: the folder that a run printed; or the name of a level, where there is no such
+            folder: the published planner, trained on it with seed 0 (README, "Results").
         planner: search settings, of the same horizon; None for those it was trained with.
         chunk_sizes: see `leapjax.compile_planner`.
 
@@ -144,6 +170,8 @@ def load(
         UserError: no such run, one that cannot be read, or another horizon.
     """
     folder = Path(path)
+    if not folder.exists() and (PUBLISHED / folder).is_dir():
+        folder = PUBLISHED / folder
     specification = read_specification(folder)
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:
@@ -154,6 +182,10 @@ def load(
             raise UserError(f"{folder}: trained with another {name}; train it again")
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
-    params = checkpoints.restore_params(folder / CHECKPOINTS, like, identity(specification))
+    whose = identity(specification)
+    if (folder / WEIGHTS).exists():
+        params = weights.read(folder / WEIGHTS, like, whose)
+    else:
+        params = checkpoints.restore_params(folder / CHECKPOINTS, like, whose)
     plan = compile_planner(agent.energy, planner or specification.planner, chunk_sizes)
     return Pretrained(specification, agent.energy, params, plan)

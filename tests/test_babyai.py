@@ -131,7 +131,7 @@ def test_a_checkpoint_brings_its_seed_and_leaves_only_pictures(workplace, tmp_pa
         ("--horizon", "4", "horizon is 5, not 4"),
         ("--heads", "4", "heads is 2, not 4"),
         ("--masking", "one", "masking is random, not one"),
-        ("--learning-rate", "0.01", "learning_rate is 0.0015, not 0.01"),
+        ("--learning-rate", "0.01", "learning_rate is 0.003, not 0.01"),
         ("--channels", "8", "channels is 4, not 8"),
         ("--steps", "5", "steps is 4, not 5"),
     ],

@@ -60,6 +60,8 @@ class Config(Generic[M, D]):
     """Actions to execute before replanning; None: the whole plan, as in the paper."""
     checkpoint: Path | None = None
     """Folder of an earlier run to evaluate instead of training; brings its settings along."""
+    pretrained: bool = False
+    """Evaluate the planner that comes with the library for each level; trains nothing."""
     record: bool = False
     """Append the row to results/, which is committed, and skip what is recorded already."""
     force: bool = False
@@ -78,7 +80,8 @@ class Config(Generic[M, D]):
 
 # What a result does not depend on, or what its row holds on its own.
 _NOT_HASHED = (
-    "seeds", "checkpoint", "record", "force", "runs", "pictures", "checkpoint_seconds", "cluster",
+    "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
+    "checkpoint_seconds", "cluster",
 )  # fmt: skip
 
 
@@ -128,30 +131,40 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--level", "--method", "--preset", "--checkpoint"):
         first.add_argument(name)
+    first.add_argument("--pretrained", action="store_true")
     chosen, _ = first.parse_known_args(list(arguments))
-    trained = None
-    if chosen.checkpoint is not None:
-        trained = pretrained.read_specification(Path(chosen.checkpoint))
+    folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
+    if folder is not None and chosen.pretrained:
+        raise UserError("--checkpoint and --pretrained: give one of them")
+    trained = None if folder is None else pretrained.read_specification(folder)
     levels = find_domain(domain).levels
     level = chosen.level or (trained.level if trained else levels[0])
-    method = chosen.method or (trained.method if trained else Config.method)
-    name = chosen.preset or (trained.origin.preset if trained else Config.preset)
     configs = []
     for each in levels if level == "all" else [level]:
+        if chosen.pretrained:
+            folder = pretrained.published(each)
+            trained = pretrained.read_specification(folder)
+        method = chosen.method or (trained.method if trained else Config.method)
+        name = chosen.preset or (trained.origin.preset if trained else Config.preset)
         default = preset(domain, each, method, name)
-        if trained and trained.method == method and trained.domain == domain:
-            default = dataclasses.replace(
-                default,
-                **{group: getattr(trained, group) for group in GROUPS},
-                context=trained.context,
-                seeds=(trained.origin.seed,),
-                demos=trained.origin.demos,
-                demonstrations=trained.origin.demonstrations,
-            )
-        config = dataclasses.replace(_parse(arguments, default), level=each)
+        if trained and (trained.domain, trained.method) == (domain, method):
+            default = _as_trained(default, trained)
+        config = dataclasses.replace(_parse(arguments, default), level=each, checkpoint=folder)
         check(config)
         configs.append(config)
     return configs
+
+
+def _as_trained(default: Config[Any, Any], trained: Specification) -> Config[Any, Any]:
+    """Defaults that are what an earlier run has."""
+    return dataclasses.replace(
+        default,
+        **{group: getattr(trained, group) for group in GROUPS},
+        context=trained.context,
+        seeds=(trained.origin.seed,),
+        demos=trained.origin.demos,
+        demonstrations=trained.origin.demonstrations,
+    )
 
 
 def _parse(arguments: Sequence[str], default: Config[Any, Any]) -> Config[Any, Any]:

@@ -44,7 +44,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     familiar = bool(level.task)
     ours = {
         "iterations": level.horizon,  # more than there are positions give nothing
-        "steps": 1000 if familiar and level.rows * level.columns == 1 else 2000,
+        "steps": 1000 if level.task == "GoToLocal" else 2000,
         "episodes": 500,  # a rate near 100% wants more of them than the paper's 200
         "augment": True,
         "exchange_objects": familiar,

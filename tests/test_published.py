@@ -1,0 +1,129 @@
+"""Planners that come with the library, and the files that they are."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import leapjax as leap
+from experiments import babyai
+from experiments.common import results
+from experiments.common.config import parse
+from leapjax import pretrained, weights
+from leapjax.babyai.levels import LEVELS
+from leapjax.errors import UserError
+from tests.programs import ROOT, only_long, untrained_run
+
+PARAMS = {"a": {"kernel": jnp.linspace(-3, 3, 12).reshape(3, 4)}, "b": jnp.ones(2)}
+
+
+def test_parameters_come_back_in_half_precision(tmp_path):
+    path = tmp_path / "new" / "weights.npz"
+    weights.write(path, PARAMS, "mine")
+    found = weights.read(path, PARAMS, "mine")
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), found, PARAMS)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
+    again = tmp_path / "again.npz"
+    weights.write(again, found, "mine")  # what is rounded once is not rounded again
+    jax.tree.map(np.testing.assert_array_equal, weights.read(again, PARAMS, "mine"), found)
+    with pytest.raises(ValueError, match="b does not fit half precision"):
+        weights.write(path, {"b": jnp.full(2, 1e6)}, "mine")
+
+
+def test_parameters_of_something_else_are_refused(tmp_path):
+    path = tmp_path / "weights.npz"
+    weights.write(path, PARAMS, "mine")
+    reshaped = {**PARAMS, "b": jnp.ones(3)}
+    missing = {"b": PARAMS["b"]}
+    for like, identity in ((PARAMS, "yours"), (reshaped, "mine"), (missing, "mine")):
+        with pytest.raises(UserError, match="another configuration"):
+            weights.read(path, like, identity)
+
+
+def test_a_damaged_file_is_one_line(tmp_path):
+    path = tmp_path / "weights.npz"
+    weights.write(path, PARAMS, "mine")
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] ^= 1 << rng.integers(8)
+        path.write_bytes(bytes(damaged))
+        try:  # a bit that nobody reads may change
+            found = weights.read(path, PARAMS, "mine")
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), found, PARAMS)
+        except UserError as error:
+            assert "\n" not in str(error)
+    for size in (0, 1, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(UserError, match="cannot read"):
+            weights.read(path, PARAMS, "mine")
+    np.savez(path, a=np.array([object()]))  # never unpickled
+    with pytest.raises(UserError, match="cannot read"):
+        weights.read(path, PARAMS, "mine")
+
+
+@pytest.fixture
+def published(tmp_path, monkeypatch):
+    """A planner that has learned nothing, published for one level."""
+    run = untrained_run(tmp_path / "run", "--seeds", "3")
+    monkeypatch.setattr(pretrained, "PUBLISHED", tmp_path / "published")
+    pretrained.publish(run, tmp_path / "published" / "GoToLocalS7N5")
+    monkeypatch.chdir(tmp_path)
+    return run
+
+
+def test_a_published_planner_is_the_run_that_it_was_made_of(published, tmp_path):
+    run, copy = leap.load(published), leap.load("GoToLocalS7N5")
+    assert run.specification == copy.specification
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), run.params, copy.params
+    )
+    specification = tmp_path / "published" / "GoToLocalS7N5" / "specification.json"
+    values = json.loads(specification.read_text())
+    values["model"]["heads"] = 1
+    specification.write_text(json.dumps(values))
+    with pytest.raises(UserError, match="another configuration"):
+        leap.load("GoToLocalS7N5")
+    shutil.rmtree(tmp_path / "published")
+    with pytest.raises(UserError, match="is not a checkpoint"):
+        leap.load("GoToLocalS7N5")
+
+
+def test_the_command_line_plays_published_planners(published, tmp_path, capsys):
+    options = ["--pretrained", "--episodes", "2", "--no-pictures"]
+    assert babyai.main(options) == 0
+    (row,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    assert (row["seed"], row["train_steps"], row["episodes"]) == (3, 0, 2)
+    capsys.readouterr()
+    for more, said in (
+        (["--level", "PickUpLoc"], "no planner is published for 'PickUpLoc': only for GoToLocal"),
+        (["--checkpoint", str(published)], "give one of them"),
+        (["--seeds", "0"], "seed is 3, not 0"),
+    ):
+        assert babyai.main([*options, *more]) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_level_of_the_paper_has_a_planner(level):
+    (config,) = parse("babyai", ["--level", level, "--pretrained"])
+    (preset,) = parse("babyai", ["--level", level])
+    assert config.training == preset.training and config.planner == preset.planner
+    assert config.domain_settings == preset.domain_settings and config.seeds == (0,)
+    leap.load(level)
+
+
+@only_long
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_published_planner_has_the_successes_of_its_row(level, tmp_path, monkeypatch):
+    """On the machine that the rows are from; on another one bits may differ."""
+    rows = results.read(ROOT / "results" / "babyai.jsonl")
+    monkeypatch.chdir(tmp_path)
+    assert babyai.main(["--level", level, "--pretrained", "--no-pictures"]) == 0
+    (found,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    (row,) = (row for row in rows if row["hash"] == found["hash"])
+    assert found["successes"] == row["successes"]
