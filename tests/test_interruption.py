@@ -91,7 +91,10 @@ def test_a_signal_at_any_moment(tmp_path, trial):
     rng = np.random.default_rng(trial)
     number, code = ((signal.SIGTERM, 0), (signal.SIGINT, 130))[trial % 2]
     run = Place(tmp_path).start("runs", cache="off")
-    time.sleep(rng.uniform(1.5, 12))  # JAX takes a second to import: before, Python answers
+    while not (tmp_path / "datasets").exists():  # still importing: Python itself would answer
+        assert run.poll() is None, run.stderr.read()[-2000:]
+        time.sleep(0.01)
+    time.sleep(rng.uniform(0, 15))
     over = run.poll() is not None
     run.send_signal(number)
     assert run.wait(60) == (0 if over else code), run.stderr.read()[-2000:]

@@ -111,14 +111,13 @@ def run_one(
             planner = run.reuse(this, config.checkpoint)
         else:
             mesh = run.training_mesh(config)
-            # While demonstrations are collected, programs compile; one that is refused for its
-            # demonstrations should not have to wait for a compiler.
-            found = None if run.must_collect(this) else run.gather(this)
-            wait = run.compile_ahead(this, mesh)
-            data = run.gather(this) if found is None else found
+            # Where demonstrations must be collected, programs compile meanwhile; where there are
+            # some, what can be refused comes first.
+            wait = run.compile_ahead(this, mesh) if run.must_collect(this) else None
+            data = run.gather(this)
             seeds.check_disjoint([d.seed for d in data], played)
             processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
-            planner, metrics = run.fit(this, data, wait)
+            planner, metrics = run.fit(this, data, mesh, wait)
         episodes = run.measure(planner, this, played)
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
 

@@ -67,7 +67,6 @@ class Programs(NamedTuple):
     """What is compiled for a run."""
 
     agent: Agent
-    mesh: Mesh
     begin: Callable[[int], tuple[TrainState, jax.Array]]
     step: TrainStep
     plan: CompiledPlanner
@@ -100,7 +99,7 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
         begin, step = compiled.result()
         warm.result()
         run.seconds["compile"] += time.perf_counter() - begun
-        return Programs(agent, mesh, begin, step, plan)
+        return Programs(agent, begin, step, plan)
 
     return wait
 
@@ -148,16 +147,30 @@ def _collect(run: Run, name: str) -> None:
 
 
 def fit(
-    run: Run, data: Sequence[Demonstration], wait: Callable[[], Programs]
+    run: Run,
+    data: Sequence[Demonstration],
+    mesh: Mesh,
+    wait: Callable[[], Programs] | None = None,
 ) -> tuple[Pretrained, Metrics]:
-    """Trains, or continues; what was learned and how it went. `wait`: from `compile_ahead`."""
+    """Trains, or continues; what was learned and how it went.
+
+    Args:
+        run: to do.
+        data: to train on.
+        mesh: to train on.
+        wait: from `compile_ahead`, where that was called already.
+    """
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
     check_data(folder, windows.fingerprint(examples))
     processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
-    agent, mesh, begin, step, plan = wait()
+    agent, begin, step, plan = (wait or compile_ahead(run, mesh))()
     state, key = begin(run.seed)
     steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
+    compiling = time.perf_counter()
+    if total:  # the one program that depends on how many demonstrations there are
+        jax.block_until_ready(step.draw(key, state.step, steps))
+    run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
     processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
