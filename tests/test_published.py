@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from experiments import babyai
+from experiments import babyai, publish
 from experiments.common import results
 from experiments.common.config import parse
 from leapjax import pretrained, weights
@@ -68,10 +68,10 @@ def test_a_damaged_file_is_one_line(tmp_path):
 
 @pytest.fixture
 def published(tmp_path, monkeypatch):
-    """A planner that has learned nothing, published for one level."""
+    """A planner that has learned nothing, published for its level."""
     run = untrained_run(tmp_path / "run", "--seeds", "3")
     monkeypatch.setattr(pretrained, "PUBLISHED", tmp_path / "published")
-    pretrained.publish(run, tmp_path / "published" / "GoToLocalS7N5")
+    assert publish.main([str(run)]) == 0
     monkeypatch.chdir(tmp_path)
     return run
 
@@ -91,6 +91,11 @@ def test_a_published_planner_is_the_run_that_it_was_made_of(published, tmp_path)
     shutil.rmtree(tmp_path / "published")
     with pytest.raises(UserError, match="is not a checkpoint"):
         leap.load("GoToLocalS7N5")
+
+
+def test_nothing_is_published_of_what_is_no_run(tmp_path, capsys):
+    assert publish.main([str(tmp_path)]) == 2
+    assert "is not a checkpoint" in capsys.readouterr().err
 
 
 def test_the_command_line_plays_published_planners(published, tmp_path, capsys):

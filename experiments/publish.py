@@ -1,0 +1,44 @@
+"""Puts trained planners into the library: `python -m experiments.publish runs/NAME ...`.
+
+What is published is what `leapjax.load` finds by the name of its level. It is committed.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from experiments.common import program, runtime
+from leapjax import pretrained
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Publish trained planners, each for its level."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Publishes every run that is named."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("experiments.publish", given, lambda: publish(options.runs))
+
+
+def publish(runs: Sequence[Path]) -> None:
+    """Publishes runs, the later one where two are of one level."""
+    runtime.start()
+    for folder in runs:
+        target = pretrained.PUBLISHED / pretrained.read_specification(folder).level
+        pretrained.publish(folder, target)
+        size = sum(path.stat().st_size for path in target.iterdir())
+        print(f"{folder}: {target}, {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
