@@ -28,6 +28,17 @@ def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_paper
     assert found[5].startswith("95.0% [") and found[5].endswith("2 seeds")
 
 
+def test_fresh_levels_go_before_those_of_development():
+    earlier = [
+        {**row(seed=seed), "first_episode_seed": 0, "episodes": 200, "successes": 100}
+        for seed in (0, 1, 2)
+    ]
+    (cell,) = cells(report.success(earlier), "S8N7")[5:6]
+    assert cell.startswith("50.0% [") and cell.endswith(", 3 seeds \\*")
+    (cell,) = cells(report.success([*earlier, row()]), "S8N7")[5:6]
+    assert cell.startswith("90.0% [") and cell.endswith(", 1 seed")
+
+
 def cells(table, level):
     (line,) = (line for line in table.splitlines() if level in line)
     return [cell.strip() for cell in line.strip("|").split("|")]

@@ -44,7 +44,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     familiar = bool(level.task)
     ours = {
         "iterations": level.horizon,  # more than there are positions give nothing
-        "steps": 1000 if level.task == "GoToLocal" else 2000,
+        "steps": 4000 if _is_large(level) else 1000 if level.task == "GoToLocal" else 2000,
         "episodes": 500,  # a rate near 100% wants more of them than the paper's 200
         "augment": True,
         "exchange_objects": familiar,
@@ -57,15 +57,30 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
-    # Where much must be done in one episode, more noise leads out of more dead ends.
-    noisy = find_level(name).sequence and (method, preset) == ("leap", "leapjax")
-    return {"temperature": 1.0} if noisy else {}
+    if (method, preset) != ("leap", "leapjax"):
+        return {}
+    level = find_level(name)
+    options: dict[str, Any] = {}
+    if level.sequence:  # much must be done in one episode: noise leads out of dead ends
+        options["temperature"] = 1.0
+    if _is_large(level):  # a rate that halves the steps elsewhere is too high here
+        options["learning_rate"] = 1.5e-3
+    return options
+
+
+def _side(level: Level) -> int:
+    """Of the grid of a level of the paper."""
+    return max(level.rows, level.columns) * (level.room_size - 1) + 1
+
+
+def _is_large(level: Level) -> bool:
+    """Whether ways through a level are so long that they are hard to learn."""
+    return bool(level.task) and _side(level) > 15
 
 
 def _sweeps(level: Level) -> int:
     """As many rounds of value iteration as a long way through the level has cells."""
     if not level.task:
         return 48
-    rooms = max(level.rows, level.columns)
-    side = rooms * (level.room_size - 1) + 1
-    return (2 if rooms == 1 else 4) * side  # ways wind from room to room
+    alone = level.rows * level.columns == 1
+    return (2 if alone else 4) * _side(level)  # ways wind from room to room
