@@ -11,7 +11,7 @@ READY := .venv/ready
 babyai: $(READY)
 	$(BIN)/python -m experiments.babyai $(ARGS)
 
-# Two files at a time, in the order of their names: most of a test is compilation, on one core.
+# Two files at a time, in the order of tests/conftest.py: most of a test is compilation, on one core.
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -23,6 +23,15 @@ from leapjax.types import Demonstration
 from tests import OURS
 from tests.programs import TOY_RUN
 
+# The longest files first, so that two workers end at the same time. (Those of processes and of
+# interruption want the same run: the second should not wait for the first to make it.)
+FIRST = ["babyai", "training", "processes", "benchmarks", "interruption", "planners", "models"]
+
+
+def pytest_collection_modifyitems(items):
+    names = [f"test_{name}.py" for name in FIRST]
+    items.sort(key=lambda item: ([*names, item.path.name]).index(item.path.name))
+
 
 def pytest_unconfigure():
     """The last thing that pytest does."""
