@@ -78,6 +78,7 @@ class Stepper:
         self._data = sharding.replicate(random_steps(self._domain), mesh)
         begin, self._step = training.compile_ahead(agent, mesh, self._data)
         self.state, self._key = begin(0)
+        jax.block_until_ready(self())  # the draw of a batch is compiled on first use
 
     def __call__(self) -> jax.Array:
         """Makes one step; its loss."""
