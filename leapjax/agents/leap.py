@@ -104,7 +104,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         accuracy = jnp.where(counted, hits, 0).sum() / jnp.maximum(counted.sum(), 1)
         return -jnp.where(counted, likelihoods, 0).sum() / masks.sum(), {"accuracy": accuracy}
 
-    update = learning.make_update(window_loss, optimizer, mesh)
+    update = learning.make_update(
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
+    )
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
     return Agent(init, learning.window_batches(setup), update, energy)
 

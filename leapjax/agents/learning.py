@@ -37,9 +37,10 @@ class TrainingConfig:
     weight_decay: float = 0.1  # not on embeddings, norms and biases
     clip: float = 1.0  # global norm of the gradient
     windows: str = "episode"  # drawn by "episode" or by "step"
+    microbatch: int = 0  # examples a device takes the gradient of at a time; 0: all of its own
 
     def __post_init__(self) -> None:
-        check_at_least(self, 0, "steps")
+        check_at_least(self, 0, "steps", "microbatch")
         check_at_least(self, 1, "batch")
         ranges = {
             "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
@@ -104,6 +105,7 @@ def make_update(
     optimizer: optax.GradientTransformation,
     mesh: Mesh | None = None,
     next_extra: Callable[[PyTree, Params], PyTree] = lambda extra, params: extra,
+    microbatch: int = 0,
 ) -> Update:
     """An agent's `update`: the loss and the metrics are means over the batch.
 
@@ -113,6 +115,7 @@ def make_update(
         mesh: splits every batch, and the state as `sharding.parameter_specs` says; None for
             one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
+        microbatch: see `TrainingConfig`.
     """
 
     def batch_loss(
@@ -125,7 +128,7 @@ def make_update(
         losses, metrics = each(params, extra, batch, keys)
         return losses.mean(), jax.tree.map(jnp.mean, metrics)
 
-    differentiate = jax.value_and_grad(batch_loss, has_aux=True)
+    differentiate = _in_parts(jax.value_and_grad(batch_loss, has_aux=True), microbatch)
 
     def mean_gradient(params: Params, extra: PyTree, batch: PyTree, key: jax.Array) -> PyTree:
         """((loss, metrics), gradients) of a batch."""
@@ -161,6 +164,37 @@ def make_update(
         return state, {"loss": loss, **metrics, "gradient_norm": norm}
 
     return update
+
+
+def _in_parts(differentiate: Callable[..., PyTree], rows: int) -> Callable[..., PyTree]:
+    """`differentiate`, whose results are means over examples, for a few examples at a time.
+
+    Args:
+        differentiate: (params, extra, batch, key, place of its first example) -> means.
+        rows: at most so many; 0 for the whole batch at once.
+    """
+
+    def accumulated(
+        params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
+    ) -> PyTree:
+        size = jax.tree.leaves(batch)[0].shape[0]
+        if rows == 0 or size <= rows:
+            return differentiate(params, extra, batch, key, first)
+        count = next(count for count in range(-(-size // rows), size + 1) if size % count == 0)
+        parts = jax.tree.map(lambda x: x.reshape(count, size // count, *x.shape[1:]), batch)
+        places = first + jnp.arange(count) * (size // count)
+
+        def add(total: PyTree, part: PyTree) -> tuple[PyTree, None]:
+            means = differentiate(params, extra, part[0], key, part[1])
+            return jax.tree.map(jnp.add, total, means), None
+
+        one = jax.tree.map(lambda x: x[0], parts)
+        shapes = jax.eval_shape(differentiate, params, extra, one, key, first)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        total, _ = jax.lax.scan(add, zeros, (parts, places))
+        return jax.tree.map(lambda x: x / count, total)
+
+    return accumulated
 
 
 def make_init(

@@ -19,6 +19,7 @@ from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
+from leapjax.models.linear import linear
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, pad_token
 
@@ -51,9 +52,8 @@ class Convolution(nn.Module):
     def __call__(self, image: jax.Array) -> jax.Array:
         """`[X, Y, C]` to `[X', Y', features]`."""
         kernel_init = nn.initializers.he_normal()
-        return nn.Dense(self.features, dtype=self.dtype, kernel_init=kernel_init)(
-            patches(image, self.side, self.padding)
-        )
+        product = linear(self.features, kernel_init, dtype=self.dtype)
+        return product(patches(image, self.side, self.padding))
 
 
 class Instruction(NamedTuple):

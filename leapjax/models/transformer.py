@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
+from leapjax.models.linear import linear
+
 WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
 
 
@@ -32,7 +34,7 @@ def dense(
 ) -> nn.Dense:
     """A linear layer with the initialisation of this transformer."""
     init = nn.initializers.normal(scale)
-    return nn.Dense(features, use_bias, dtype=dtype, kernel_init=init, name=name)
+    return linear(features, init, use_bias, name, dtype)
 
 
 def embed(count: int, width: int, name: str | None = None) -> nn.Embed:
