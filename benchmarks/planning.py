@@ -1,9 +1,9 @@
 """Plans per second against this machine's limit: `python -m benchmarks.planning --quick`.
 
 Speed does not depend on what a model has learned, so parameters are random. Compilation is
-timed apart; every figure is the best of several runs. FLOPs are those that N passes of the
-token transformer need (see `needed_flops`), set against the matrix-multiply peak measured
-in the same run on the same layer shapes.
+timed apart; every figure is the best of several runs. FLOPs are those of all matrix products of
+a plan, the encoders' included, set against the matrix-multiply peak measured in the same run on
+the shapes of a transformer layer.
 """
 
 import dataclasses
@@ -23,18 +23,17 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments.common import runtime
 from experiments.common.config import make_domain, preset, specify
 from leapjax import pretrained
 from leapjax.babyai import levels
-from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.levels import Level
-from leapjax.batching import CompiledPlanner, compile_planner, plan_keys, split_batch
+from leapjax.batching import compile_planner, plan_keys, split_batch
 from leapjax.domain import Domain, blank_context
-from leapjax.models.trajectory import ModelConfig
-from leapjax.planners import GibbsConfig
-from leapjax.types import Params
+from leapjax.planners import GibbsConfig, bind
+from leapjax.types import Energy, Params
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -43,7 +42,6 @@ import matplotlib.pyplot as plt
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
 COMPARED = ("paper", "leapjax")
 BATCHES = (1, 4, 16, 64, 256, 1024)
-PREFIX_TOKENS = 4  # of the leapjax model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +86,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> list[Row]:
     """One preset and level at every batch size."""
     model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon
-    planner, params, domain = make_planner(name, level)
-    flops = needed_flops(model, horizon, level.iterations)
+    search = GibbsConfig(horizon, level.iterations)
+    energy, params, domain = make_energy(name, level)
+    planner = compile_planner(energy, search)
+    one = jax.random.key(0), blank_context(domain, level.context)
+    flops = matmul_flops(bind(energy, search), params, *one)
     rows: list[Row] = []
     compiled: set[int] = set()
     for batch in batches:
@@ -116,7 +117,7 @@ def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> 
                 "compile_seconds": first - best if new else 0.0,
                 "seconds": best,
                 "plans_per_second": batch / best,
-                "needed_flops_per_plan": flops,
+                "flops_per_plan": flops,
                 "tokens": tokens,
                 "gflops": batch * flops / best / 1e9,
                 "peak_gflops": matmul_peak(tokens, model.width, seconds),
@@ -135,19 +136,18 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
         row["fraction_of_peak"] = row["gflops"] / row["peak_gflops"]
 
 
-def make_planner(name: str, level: Level) -> tuple[CompiledPlanner, Params, Domain]:
-    """A preset's planner with the paper's N and random parameters."""
+def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
+    """A preset's energy with random parameters."""
     config = preset("babyai", level.name, "leap", name)
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
-    params = jax.jit(agent.init)(jax.random.key(0)).params
-    search = GibbsConfig(level.horizon, level.iterations)
-    return compile_planner(agent.energy, search), params, domain
+    return agent.energy, jax.jit(agent.init)(jax.random.key(0)).params, domain
 
 
 def plan_many(name: str, level: Level, count: int) -> str:
     """Plans for very many contexts at once, and says what it took."""
-    planner, params, domain = make_planner(name, level)
+    energy, params, domain = make_energy(name, level)
+    planner = compile_planner(energy, GibbsConfig(level.horizon, level.iterations))
     contexts = jax.tree.map(np.asarray, random_contexts(domain, level.context, count))
     keys = plan_keys(0, np.arange(count), np.zeros(count, int))
     begun = time.perf_counter()
@@ -158,31 +158,6 @@ def plan_many(name: str, level: Level, count: int) -> str:
         f"{name}: {count} plans of ({level.horizon}, {level.iterations}) in {taken:.0f} s, "
         f"compilation included; at most {most:.2f} GiB of memory in the whole process"
     )
-
-
-def needed_flops(model: ModelConfig, horizon: int, iterations: int) -> float:
-    """Floating-point operations of the N passes of one plan, without the encoders.
-
-    A matrix product of `[n, k]` and `[k, m]` counts 2 n k m. The last layer is counted at
-    the queried positions only: all T in the first pass, one in every later pass.
-    """
-    width = model.width
-    if model.architecture == "paper":
-        tokens, seen = 2 * horizon, 2 * horizon
-    else:
-        tokens, seen = horizon, horizon + PREFIX_TOKENS
-
-    def layer(queries: int) -> float:
-        projections = 2 * width**2 * (2 * tokens + 2 * queries)  # keys, values; query, output
-        attention = 4 * queries * seen * width
-        perceptron = 16 * queries * width**2
-        return projections + attention + perceptron
-
-    def one_pass(queried: int) -> float:
-        head = 2 * queried * width * NUM_ACTIONS
-        return (model.layers - 1) * layer(tokens) + layer(queried) + head
-
-    return one_pass(horizon) + (iterations - 1) * one_pass(1)
 
 
 def random_contexts(domain: Domain, length: int, batch: int) -> Any:

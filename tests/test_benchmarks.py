@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks import planning, scaling, training
-from experiments.common.config import make_domain, preset, with_options
+from benchmarks.flops import matmul_flops
+from experiments.common.config import make_domain, preset, specify, with_options
 from experiments.common.runtime import Cluster
-from leapjax.agents.learning import Setup
+from leapjax import pretrained
 from leapjax.domain import blank_context
-from leapjax.models import trajectory
+from leapjax.models.linear import rows_times_matrix
 from tests.programs import only_long
 
 HORIZON = 5
@@ -27,29 +28,31 @@ def tiny_preset(*names):
 
 
 @pytest.mark.parametrize("name", ["paper", "leapjax"])
-def test_needed_flops_are_what_xla_counts(name):
+def test_flops_are_what_xla_counts(name):
     config = preset("babyai", "GoToLocalS7N5", "leap", name)
-    model, domain = config.model, make_domain(config)
-    setup = Setup(domain, 0, HORIZON, model, config.training, config.method_settings)
-    module = trajectory.build(model, setup.sizes, setup.encoder())
-    context = jax.tree.map(jnp.asarray, blank_context(domain, 0))
-    actions = jnp.zeros(HORIZON, jnp.int32)
-
-    def everything(module, context):
-        return module.logits(module.encode(context), actions, jnp.arange(HORIZON))
-
-    params = jax.eval_shape(
-        lambda key: module.init(key, context, method=everything), jax.random.key(0)
-    )
-    memory = jax.eval_shape(lambda p: module.apply(p, context, method="encode"), params)
-
-    def one_pass(params, memory):
-        return module.apply(params, memory, actions, jnp.arange(HORIZON), method="logits")
-
-    counted = jax.jit(one_pass).lower(params, memory).compile().cost_analysis()["flops"]
-    needed = planning.needed_flops(model, HORIZON, iterations=1)
+    domain = make_domain(config)
+    agent = pretrained.make_agent(specify(config, 0, domain), domain)
+    energy = agent.energy
+    params = jax.eval_shape(agent.init, jax.random.key(0)).params
+    memory = jax.eval_shape(energy.encode, params, blank_context(domain, 0))
+    arguments = params, memory, jnp.zeros(HORIZON, jnp.int32), jnp.arange(HORIZON)
+    counted = jax.jit(energy.conditional).lower(*arguments).compile().cost_analysis()["flops"]
+    needed = matmul_flops(energy.conditional, *arguments)
     # XLA also counts norms, softmax and activations.
     assert needed < counted < 1.15 * needed
+
+
+def test_flops_of_what_is_repeated_and_what_is_convolved():
+    square, image = jnp.ones((4, 4)), jnp.ones((1, 3, 8, 8))
+
+    def power(x):
+        return jax.lax.fori_loop(0, 5, lambda _, y: jax.jit(jnp.dot)(y, x), x)
+
+    assert matmul_flops(power, square) == 5 * 2 * 4**3
+    assert matmul_flops(jax.vmap(power), jnp.ones((7, 4, 4))) == 7 * 5 * 2 * 4**3
+    assert matmul_flops(rows_times_matrix, square, square) == 2 * 4**3
+    convolve = functools.partial(jax.lax.conv, window_strides=(1, 1), padding="VALID")
+    assert matmul_flops(convolve, image, jnp.ones((2, 3, 3, 3))) == 2 * (2 * 6 * 6) * (3 * 3 * 3)
 
 
 def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
@@ -57,7 +60,7 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "COMPARED", ("leapjax",))
     monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
     monkeypatch.setattr(planning, "BATCHES", (1, 9))
-    monkeypatch.setattr(planning, "make_planner", functools.cache(planning.make_planner))
+    monkeypatch.setattr(planning, "make_energy", functools.cache(planning.make_energy))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
     written = ["--json", str(rows), "--plot", str(plot)]
     assert planning.main([*written, "--seconds", "0.01", "--large", "9"]) == 0

@@ -130,7 +130,7 @@ def test_to_train_and_to_play_again_are_two_rows(toy_run):
 
 
 def test_a_damaged_file_of_rows_is_found_before_the_run(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(run, "gather", lambda *rest: pytest.fail("the run began"))
+    monkeypatch.setattr(run, "collect", lambda *rest: pytest.fail("the run began"))
     (workplace / "runs").mkdir()
     for line in ("{oops", json.dumps({"successes": 10**400})):
         (workplace / "runs" / "babyai.jsonl").write_text(line + "\n")

@@ -111,10 +111,11 @@ def run_one(
             planner = run.reuse(this, config.checkpoint)
         else:
             mesh = run.training_mesh(config)
-            # Where demonstrations must be collected, programs compile meanwhile; where there are
-            # some, what can be refused comes first.
-            wait = run.compile_ahead(this, mesh) if run.must_collect(this) else None
-            data = run.gather(this)
+            wait = None
+            if run.must_collect(this):
+                wait = run.compile_ahead(this, mesh)  # programs compile meanwhile
+                run.collect(this)
+            data = run.load(this)
             seeds.check_disjoint([d.seed for d in data], played)
             processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
             planner, metrics = run.fit(this, data, mesh, wait)

@@ -111,39 +111,46 @@ def dataset(run: Run) -> str:
 
 
 def must_collect(run: Run) -> bool:
-    """Whether there are no demonstrations yet, so that `gather` will take its time."""
+    """Whether the demonstrations to train on do not exist yet."""
     wanted = run.config.demos and run.config.demonstrations is None
     return bool(wanted) and processes.first_does(lambda: not storage.exists(dataset(run)))
 
 
-def gather(run: Run) -> list[Demonstration]:
-    """The demonstrations to train on: the user's, the cached ones, or new ones."""
-    config, domain = run.config, run.domain
+def collect(run: Run) -> None:
+    """Makes the demonstrations to train on."""
+
+    def save() -> None:
+        storage.check_writable()
+        count = run.config.demos
+        with Meter(run.console, "demonstrations", count) as meter:
+            collection = run.domain.collect(count, run.seed, meter.update)
+        reasons = ", ".join(f"{number} {reason}" for reason, number in collection.dropped.items())
+        dropped = f"; dropped: {reasons}" if reasons else ""
+        summary = f"{count} demonstrations of {run.domain.level}{dropped}"
+        run.console.print(summary)
+        storage.save(dataset(run), collection, run.domain, summary)
+
+    begun = time.perf_counter()
+    processes.first_does(save)
+    run.seconds["demos"] += time.perf_counter() - begun
+
+
+def load(run: Run) -> list[Demonstration]:
+    """The demonstrations to train on: the user's, or those that were collected.
+
+    Raises:
+        UserError: they cannot be read, or are fewer than asked for.
+    """
+    config, name = run.config, dataset(run)
     if not config.demos:
         return []
     begun = time.perf_counter()
-    name = dataset(run)
-    if must_collect(run):
-        processes.first_does(lambda: _collect(run, name))
     # Each process reads for itself: the data need not be on one shared disk.
-    data = processes.together(lambda: storage.load(name, domain))
+    data = processes.together(lambda: storage.load(name, run.domain))
     if len(data) < config.demos:
         raise UserError(f"{name} has {len(data)} episodes, fewer than --demos {config.demos}")
-    run.seconds["demos"] = time.perf_counter() - begun
+    run.seconds["demos"] += time.perf_counter() - begun
     return data[: config.demos]
-
-
-def _collect(run: Run, name: str) -> None:
-    storage.check_writable()
-    count = run.config.demos
-    with Meter(run.console, "demonstrations", count) as meter:
-        collection = run.domain.collect(count, run.seed, meter.update)
-    reasons = ", ".join(f"{number} {reason}" for reason, number in collection.dropped.items())
-    summary = f"{count} demonstrations of {run.domain.level}" + f"; dropped: {reasons}" * bool(
-        reasons
-    )
-    run.console.print(summary)
-    storage.save(name, collection, run.domain, summary)
 
 
 def fit(

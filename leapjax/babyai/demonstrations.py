@@ -52,6 +52,9 @@ class FullViewBot(BabyAIBot):
         super().__init__(env)
         self.vis_mask[:] = True
 
+    def _process_obs(self) -> None:
+        """What the view adds to what has been seen: nothing, all of it has."""
+
     def _breadth_first_search(self, initial_states, accept_fn, ignore_blockers):  # noqa: ANN001, ANN202
         """The bot's search, in which a closed door is on the way like an open one."""
         grid = self.mission.unwrapped.grid

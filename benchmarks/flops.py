@@ -1,0 +1,52 @@
+"""The floating-point operations that a function needs: those of its matrix products."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+
+def matmul_flops(function: Callable[..., Any], *arguments: Any) -> float:
+    """Of one call; what a scan repeats counts as often as it is repeated.
+
+    A product of `[n, k]` and `[k, m]` counts 2 n k m, a convolution what it would be as one.
+
+    Args:
+        function: to count; it is traced, not run.
+        arguments: arrays, or their shapes.
+    """
+    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _count(jaxpr: Jaxpr) -> float:
+    total = 0.0
+    for equation in jaxpr.eqns:
+        name, params = equation.primitive.name, equation.params
+        shapes: list[Any] = [getattr(operand.aval, "shape", ()) for operand in equation.invars]
+        results = sum(math.prod(getattr(out.aval, "shape", ())) for out in equation.outvars)
+        if name == "dot_general":
+            (axes, _), _ = params["dimension_numbers"]
+            total += 2 * results * math.prod(shapes[0][axis] for axis in axes)
+        elif name == "rows_times_matrix":  # leapjax.models.linear
+            total += 2 * results * shapes[1][0]
+        elif name == "conv_general_dilated":
+            out = params["dimension_numbers"].rhs_spec[0]
+            total += 2 * results * math.prod(shapes[1]) / shapes[1][out]
+        times = params["length"] if name == "scan" else 1
+        total += times * sum(map(_count, _inner(list(params.values()))))
+    return total
+
+
+def _inner(values: list[Any]) -> list[Jaxpr]:
+    """The programs among the parameters of an operation."""
+    found = []
+    for value in values:
+        if isinstance(value, ClosedJaxpr):
+            found.append(value.jaxpr)
+        elif isinstance(value, Jaxpr):
+            found.append(value)
+        elif isinstance(value, (tuple, list)):
+            found += _inner(list(value))
+    return found
