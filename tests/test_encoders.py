@@ -89,15 +89,18 @@ def test_the_gradient_is_autodiffs(field):
         np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("side", "padding"), [(3, (1, 1)), (2, (1, 1)), (2, (0, 0))])
-def test_a_convolution_is_xlas(side, padding):
+@pytest.mark.parametrize(
+    ("side", "padding", "stride"), [(3, (1, 1), 1), (2, (1, 1), 1), (2, (0, 0), 1), (3, (1, 1), 2)]
+)
+def test_a_convolution_is_xlas(side, padding, stride):
     image = jax.random.normal(jax.random.key(0), (5, 7, 3))
-    layer = encoders.Convolution(4, side, padding)
+    layer = encoders.Convolution(4, side, padding, stride)
     params = layer.init(jax.random.key(1), image)
     kernel = params["params"]["Dense_0"]["kernel"].reshape(side, side, 3, 4)
     expected = jax.lax.conv_general_dilated(
-        image[None], kernel, (1, 1), (padding, padding), dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )[0]
+        image[None], kernel, (stride, stride), (padding, padding),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )[0]  # fmt: skip
     np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
 
 

@@ -41,11 +41,12 @@ def patches(image: jax.Array, side: int, padding: tuple[int, int]) -> jax.Array:
 
 
 class Convolution(nn.Module):
-    """A convolution of stride 1 as one matrix product, for small maps of many channels."""
+    """A convolution as one matrix product, for small maps of many channels."""
 
     features: int
     side: int = 3
     padding: tuple[int, int] = (1, 1)
+    stride: int = 1
     dtype: Dtype = jnp.float32  # of the matrix product; parameters are float32
 
     @nn.compact
@@ -53,7 +54,8 @@ class Convolution(nn.Module):
         """`[X, Y, C]` to `[X', Y', features]`."""
         kernel_init = nn.initializers.he_normal()
         product = linear(self.features, kernel_init, dtype=self.dtype)
-        return product(patches(image, self.side, self.padding))
+        near = patches(image, self.side, self.padding)
+        return product(near[:: self.stride, :: self.stride])
 
 
 class Instruction(NamedTuple):
@@ -145,6 +147,21 @@ class FiLMBlock(nn.Module):
         return nn.relu(channel_norm(self.dtype)(h * scale + shift))
 
 
+class HalvingBlock(nn.Module):
+    """A residual block of stride 2: half of a map, rounded up."""
+
+    width: int
+    dtype: Dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        """`[X, Y, C]` to `[ceil(X / 2), ceil(Y / 2), width]`."""
+        h = Convolution(self.width, stride=2, dtype=self.dtype)(image)
+        h = Convolution(self.width, dtype=self.dtype)(nn.relu(channel_norm(self.dtype)(h)))
+        aside = Convolution(self.width, 1, (0, 0), 2, self.dtype)(image)
+        return nn.relu(channel_norm(self.dtype)(h) + aside)
+
+
 def channel_norm(dtype: Dtype) -> nn.GroupNorm:
     """Normalisation that needs no batch, where the authors' code has batch norm."""
     return nn.GroupNorm(num_groups=NORM_GROUPS, dtype=dtype)
@@ -171,7 +188,7 @@ class PaperStateEncoder(nn.Module):
         if self.side >= 7:  # of a smaller grid no map would be left
             h = nn.max_pool(h, (2, 2), (2, 2))
         if self.side >= 16:  # "may vary a little depending on the environment size"
-            h = nn.max_pool(layer(h, 3), (2, 2), (2, 2))
+            h = HalvingBlock(self.width, self.dtype)(h)
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, instruction)
         state = StateEncoder(self.side, self.width)(observation)
