@@ -104,6 +104,24 @@ def test_a_convolution_is_xlas(side, padding, stride):
     np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
 
 
+def test_without_distance_fields_a_goal_is_only_known_nearby():
+    """Convolutions alone carry what is in a cell as many cells as there are rounds of them."""
+    encoder = encoders.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
+    cells = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
+    agent, near, far = jnp.array([0, 0]), jnp.array([2, 2]), jnp.array([3, 0])
+    params = jax.jit(encoder.init)(jax.random.key(1), cells, agent, near)
+    features, distances = encoder.apply(params, cells, agent, near)
+    assert features.shape == (SIDE, SIDE, 8)
+    assert distances.shape == (0,)
+    assert {"source", "step"} == params["params"].keys()
+
+    def read(changed):
+        return encoder.apply(params, cells.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
+
+    assert not np.allclose(read(near), features[0, 0])
+    np.testing.assert_array_equal(read(far), features[0, 0])
+
+
 def test_reading_around_and_at_a_cell():
     image = jnp.arange(SIDE * SIDE * 2, dtype=jnp.float32).reshape(SIDE, SIDE, 2)
     padded = np.pad(np.asarray(image), ((2, 2), (2, 2), (0, 0)))

@@ -235,7 +235,7 @@ class GridEncoder(nn.Module):
     """
 
     channels: int
-    fields: int  # distance fields
+    fields: int  # distance fields; 0: convolutions alone
     sweeps: int  # rounds of distances: how far a way can lead
     rounds: int  # rounds of convolutions, which share their weights
     dtype: Dtype = jnp.float32  # of the convolutions; distances are float32
@@ -251,6 +251,22 @@ class GridEncoder(nn.Module):
             agent: `[2]` its cell.
             goal: `[2]` its cell; (-1, -1) where it is not available.
         """
+        distance = jnp.zeros((*cells.shape[:2], 0))
+        if self.fields:
+            distance = self._distances(cells, goal)
+        # Locally only differences matter: measured from the agent, and squashed.
+        here = feature_at(distance, agent)
+        relative = jnp.tanh((distance - here) / 4)
+        both = jnp.concatenate([cells, relative], axis=-1)
+        source = _convolution(self.channels, "source", self.dtype)(both)
+        step = _convolution(self.channels, "step", self.dtype)
+        h = nn.relu(source)
+        for _ in range(self.rounds):
+            h = nn.relu(step(h) + source)
+        return h, jnp.tanh(here / 16)
+
+    def _distances(self, cells: jax.Array, goal: jax.Array) -> jax.Array:
+        """`[S, S, fields]`."""
         local = nn.relu(_convolution(self.channels, "local", self.dtype)(cells))
         free = nn.initializers.constant(-3.0)
         cost = entering_cost(nn.Dense(self.fields, bias_init=free, name="blocked")(local))
@@ -262,17 +278,7 @@ class GridEncoder(nn.Module):
         start = jnp.concatenate(
             [jnp.broadcast_to(from_goal, (*cells.shape[:2], self.fields // 2)), learned], axis=-1
         )
-        distance = jnp.minimum(min_plus(start, cost, self.sweeps), FAR)
-        # Locally only differences matter: measured from the agent, and squashed.
-        here = feature_at(distance, agent)
-        relative = jnp.tanh((distance - here) / 4)
-        both = jnp.concatenate([cells, relative], axis=-1)
-        source = _convolution(self.channels, "source", self.dtype)(both)
-        step = _convolution(self.channels, "step", self.dtype)
-        h = nn.relu(source)
-        for _ in range(self.rounds):
-            h = nn.relu(step(h) + source)
-        return h, jnp.tanh(here / 16)
+        return jnp.minimum(min_plus(start, cost, self.sweeps), FAR)
 
 
 def entering_cost(blocked: jax.Array) -> jax.Array:
@@ -419,7 +425,9 @@ class ContextTokens(nn.Module):
         # The agent's neighbourhood holds what the first steps depend on.
         around = neighbourhood(grid, observation.pose[:2], c.radius)
         kind, colour = observation.carried
-        agent = read(around, "read_agent") + read(distances, "read_distances")
+        agent = read(around, "read_agent")
+        if c.fields:
+            agent += read(distances, "read_distances")
         agent += embed(OBJECTS, self.width, "carried")(kind)
         agent += embed(COLOURS, self.width, "carried_colour")(colour)
         goal = read(feature_at(grid, observation.goal), "read_goal")

@@ -17,14 +17,14 @@ class Settings:
     clutter: float = 0.0  # fill up to this share of the cells that nobody needs
     channels: int = 32  # features per grid cell
     rounds: int = 2  # rounds of convolution over the grid
-    fields: int = 8  # learned distance fields
+    fields: int = 8  # learned distance fields; 0: convolutions alone
     sweeps: int = 16  # rounds of value iteration that make them
     word_heads: int = 0  # attention heads from cells to words; 0: none
     radius: int = 3  # how far around the agent its cells are read one by one
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "channels", "fields", "sweeps")
-        check_at_least(self, 0, "rounds", "radius", "word_heads")
+        check_at_least(self, 1, "channels", "sweeps")
+        check_at_least(self, 0, "rounds", "fields", "radius", "word_heads")
         if not 0 <= self.clutter <= 1:  # false for NaN too
             raise ValueError(f"clutter must be in 0 .. 1, got {self.clutter}")
 
