@@ -2,59 +2,56 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from experiments.common import program, results
+from experiments.common import plots, program, results
+from experiments.common.config import configuration_hash, with_options
+from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS
 from leapjax.checkpoints import read_json
-from leapjax.data.seeds import UNSEEN
 from leapjax.files import read_text, write_text
 
-PAPER_DEMOS = 500
-FRESH = (UNSEEN, 500)  # test levels: the first one's seed, and how many
-EARLIER = (0, 200)  # those that results were played on before
+EARLIER = {"test_seed": 0, "episodes": 200}  # test levels that were played during development
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A column of the tables: which rows belong in it."""
+    """What a column of the tables holds: a method with a preset, and what differs from that."""
 
     title: str
     preset: str
     method: str = "leap"
-    masking: str | None = None  # None: a method that has no such option
-    executed: int | None = None  # actions executed before replanning; None: the whole plan
-    demos: int = PAPER_DEMOS
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
-    def has(self, row: Row) -> bool:
-        """Whether a row is a result of this setting, on its test levels."""
-        return (
-            not row["validation"]
-            and _levels(row) in (FRESH, EARLIER)
-            and (row["method"], row["preset"]) == (self.method, self.preset)
-            and row["configuration"]["method_settings"].get("masking") == self.masking
-            and row["executed"] == (self.executed or row["horizon"])
-        )
+    def has(self, row: Row, **options: Any) -> bool:
+        """Whether a row is of this setting as it is today, trained or played again."""
+        if (row["method"], row["preset"]) != (self.method, self.preset):
+            return False
+        config = config_of_preset(row["domain"], row["level"], self.method, self.preset)
+        config = with_options(config, {**self.options, **options})
+        again = dataclasses.replace(config, checkpoint=Path())
+        return row["hash"] in (configuration_hash(c, row["seed"]) for c in (config, again))
 
 
-def _levels(row: Row) -> tuple[int, int]:
-    return row["first_episode_seed"], row["episodes"]
-
-
-OURS = Setting("preset `leapjax`", "leapjax", masking="random")
+OURS = Setting("preset `leapjax`", "leapjax")
+PAPER = Setting("preset `paper`", "paper")
 SETTINGS = (
-    Setting("random", "leapjax", "random", demos=0),
-    Setting("preset `paper`", "paper", masking="one"),
-    Setting("`paper`, `--masking each`", "paper", masking="each"),
+    Setting("random", "leapjax", "random"),
+    PAPER,
     OURS,
     # Chosen on validation levels: docs/tried.md.
-    Setting("`leapjax`, `--executed 3`", "leapjax", masking="random", executed=3),
+    Setting("`leapjax`, `--executed 3`", "leapjax", options={"executed": 3}),
 )
 TITLES = " | ".join(setting.title for setting in SETTINGS)
+WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fields": 0})
+ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
+ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
+FIGURE = Path("docs/iterations.png")
 
 
 def main() -> int:
@@ -66,6 +63,8 @@ def rewrite() -> None:
     """Rewrites every table here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
+    iterated = success_by_iterations(results.read(Path("results/babyai.jsonl")))
+    plots.iterations_by_level(iterated, FIGURE)
 
 
 def documents(root: Path) -> dict[Path, str]:
@@ -79,6 +78,7 @@ def documents(root: Path) -> dict[Path, str]:
         "planning": (planning, "planning"),
         "training": (training, "training"),
         "steps": (steps, "babyai"),
+        "iterations": (iterations, "babyai"),
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -118,25 +118,58 @@ def steps(rows: Sequence[Row]) -> str:
 
 def _by_setting(rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> list[list[str]]:
     """For each level what `cell` makes of its rows, setting by setting."""
-    columns = [(setting, _by_level_and_demos(rows, setting)) for setting in SETTINGS]
+    by_level = {level: [row for row in rows if row["level"] == level] for level in LEVELS}
     return [
-        [cell(column.get((level, setting.demos), [])) for setting, column in columns]
-        for level in LEVELS
+        [cell(_of_setting(by_level[level], setting)) for setting in SETTINGS] for level in LEVELS
     ]
 
 
-def _by_level_and_demos(rows: Sequence[Row], setting: Setting) -> dict[tuple[str, int], list[Row]]:
-    """The rows of a setting by level and number of demonstrations.
+def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[Row]:
+    """The rows of a setting, one for each seed.
 
     Those on fresh test levels, where there are some. Of two of one seed the one of the training,
     not the one of its checkpoint played again.
     """
-    found: dict[tuple[str, int], dict[tuple[int, int], dict[int, Row]]] = {}
-    for row in sorted(filter(setting.has, rows), key=lambda row: row["train_steps"] > 0):
-        by_levels = found.setdefault((row["level"], row["demos"]), {})
-        by_levels.setdefault(_levels(row), {})[row["seed"]] = row
-    chosen = {key: by_levels.get(FRESH) or by_levels[EARLIER] for key, by_levels in found.items()}
-    return {key: list(by_seed.values()) for key, by_seed in chosen.items()}
+    ordered = sorted(rows, key=lambda row: row["train_steps"] > 0)
+    for levels in ({}, EARLIER):
+        found = [row for row in ordered if setting.has(row, **levels, **options)]
+        if found:
+            return list({row["seed"]: row for row in found}.values())
+    return []
+
+
+def is_used(row: Row) -> bool:
+    """Whether a row of results/babyai.jsonl is in a table; one that is in none is stale."""
+    changes = ({}, EARLIER, *({"iterations": n} for n in ITERATIONS))
+    settings = (*SETTINGS, *ITERATED)
+    return any(setting.has(row, **change) for setting in settings for change in changes)
+
+
+def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+    """Rows of training seed 0 by level, title of the setting, and N."""
+    found: dict[str, dict[str, dict[int, Row]]] = {}
+    for level in LEVELS:
+        mine = [row for row in rows if row["level"] == level and row["seed"] == 0]
+        for setting in ITERATED:
+            counts = {n: _of_setting(mine, setting, iterations=n) for n in ITERATIONS}
+            by_count = {n: played[0] for n, played in counts.items() if played}
+            if len(by_count) > 1:  # one alone says nothing of iterating
+                found.setdefault(level, {})[setting.title] = by_count
+    return found
+
+
+def iterations(rows: Sequence[Row]) -> str:
+    """Success rates against the number of iterations, of training seed 0."""
+
+    def rate(row: Row | None) -> str:
+        return f"{100 * row['successes'] / row['episodes']:.1f}%" if row else ""
+
+    lines = [
+        [level, title, *(rate(by_count.get(n)) for n in ITERATIONS)]
+        for level, by_title in success_by_iterations(rows).items()
+        for title, by_count in by_title.items()
+    ]
+    return _table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
 
 
 def speed(rows: Sequence[Row]) -> str:
@@ -205,7 +238,7 @@ def _rate(rows: Sequence[Row]) -> str:
     episodes = [row["episodes"] for row in rows]
     low, high = scores.interval_over_seeds(successes, episodes)
     rate = f"{100 * sum(successes) / sum(episodes):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
-    earlier = " \\*" if _levels(rows[0]) == EARLIER else ""
+    earlier = " \\*" if rows[0]["first_episode_seed"] == EARLIER["test_seed"] else ""
     return f"{rate}, {len(rows)} seed{'s' if len(rows) > 1 else ''}{earlier}"
 
 

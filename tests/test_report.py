@@ -1,42 +1,37 @@
 """Tables and plots say what the rows say."""
 
+import dataclasses
+from pathlib import Path
+
 from experiments import report
-from leapjax.data.seeds import UNSEEN
+from experiments.common import plots
+from experiments.common.config import configuration_hash, preset, with_options
+
+EARLIER = report.EARLIER
 
 
-def row(level="GoToLocalS8N7", demos=500, seed=0, successes=9, **others):
+def row(
+    level="GoToLocalS8N7", method="leap", name="leapjax", seed=0, rate=0.9, played=False,
+    mean_length=6.0, **options,
+):  # fmt: skip
+    """The row of a run, or of its checkpoint played again, with the parts that tables read."""
+    config = with_options(preset("babyai", level, method, name), options)
+    config = dataclasses.replace(config, checkpoint=Path("runs/name") if played else None)
     return {
-        "level": level, "method": "leap", "preset": "leapjax", "demos": demos, "seed": seed,
-        "first_episode_seed": UNSEEN, "episodes": 500, "successes": 50 * successes,
-        "validation": False, "train_steps": 3000, "paper_success": 95.0, "horizon": 5,
-        "executed": 5, "mean_length": 6.0,
-        "configuration": {"method_settings": {"masking": "random"}}, **others,
+        "domain": "babyai", "level": level, "method": method, "preset": name, "seed": seed,
+        "first_episode_seed": config.test_seed, "episodes": config.episodes,
+        "successes": round(rate * config.episodes), "mean_length": mean_length,
+        "train_steps": 0 if played else config.training.steps,
+        "hash": configuration_hash(config, seed),
     }  # fmt: skip
 
 
 ROWS = [
-    row(), row(seed=1, successes=10), row(demos=50, successes=5), row(demos=50, successes=7),
-    row(demos=100, validation=True), row(demos=100, preset="paper"), row("PickUpLoc", successes=3),
-    # Other levels than all others are measured on, and a checkpoint played again.
-    row(first_episode_seed=0, successes=0), row(episodes=600), row(train_steps=0, successes=0),
+    row(), row(seed=1, rate=1.0), row("PickUpLoc", rate=0.3),
+    # Of other settings, on other levels than all others, and a checkpoint played again.
+    row(demos=50, rate=0), row(steps=1, rate=0), row(validation=True, rate=0),
+    row(test_seed=5, rate=0), row(episodes=600, rate=0), row(played=True, rate=0),
 ]  # fmt: skip
-
-
-def test_a_later_row_of_a_seed_counts_and_fewer_demonstrations_are_not_the_papers():
-    found = cells(report.success(ROWS), "S8N7")
-    assert found[:5] == ["GoToLocalS8N7", "95.0%", "-", "-", "-"]
-    assert found[5].startswith("95.0% [") and found[5].endswith("2 seeds")
-
-
-def test_fresh_levels_go_before_those_of_development():
-    earlier = [
-        {**row(seed=seed), "first_episode_seed": 0, "episodes": 200, "successes": 100}
-        for seed in (0, 1, 2)
-    ]
-    (cell,) = cells(report.success(earlier), "S8N7")[5:6]
-    assert cell.startswith("50.0% [") and cell.endswith(", 3 seeds \\*")
-    (cell,) = cells(report.success([*earlier, row()]), "S8N7")[5:6]
-    assert cell.startswith("90.0% [") and cell.endswith(", 1 seed")
 
 
 def cells(table, level):
@@ -44,21 +39,54 @@ def cells(table, level):
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
+def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_again():
+    found = cells(report.success(ROWS), "S8N7")
+    assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
+    assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
+    assert found[5] == "-"
+
+
+def test_fresh_levels_go_before_those_of_development():
+    earlier = [row(seed=seed, rate=0.5, **EARLIER) for seed in (0, 1, 2)]
+    cell = cells(report.success(earlier), "S8N7")[4]
+    assert cell.startswith("50.0% [") and cell.endswith(", 3 seeds \\*")
+    cell = cells(report.success([*earlier, row()]), "S8N7")[4]
+    assert cell.startswith("90.0% [") and cell.endswith(", 1 seed")
+
+
 def test_settings_are_kept_apart():
-    earlier = {"first_episode_seed": 0, "episodes": 200}  # what these were played on
-    paper = [
-        {**row(preset="paper", configuration={"method_settings": {"masking": masking}}), **found}
-        for masking, rate in (("one", 0.7), ("each", 0.8), ("random", 0))
-        for found in [{**earlier, "successes": int(200 * rate)}]
-    ]
-    nothing = {"configuration": {"method_settings": {}}}
     others = [
-        row(method="random", demos=0, train_steps=0, successes=1, **nothing),
-        row(method="classifier", successes=0, **nothing),
+        row(name="paper", rate=0.8),
+        row(name="paper", rate=0, masking="one"),
+        row(method="random", rate=0.1),
+        row(method="classifier", rate=0),
+        row(played=True, executed=3, rate=1.0, mean_length=4.0),
+        row(played=True, executed=1, rate=0),
+        row(fields=0, rate=0),
+        row(played=True, iterations=1, rate=0),
     ]
-    sooner = [row(executed=3, successes=10, mean_length=4.0), row(executed=1, successes=0)]
-    found = cells(report.success([*ROWS, *paper, *others, *sooner]), "S8N7")
-    rates = ["95.0", "10.0", "70.0", "80.0", "95.0", "100.0"]
-    assert [cell.split("%")[0] for cell in found[1:]] == rates
-    found = cells(report.steps([*ROWS, *sooner]), "S8N7")
-    assert found[1:] == ["-", "-", "-", "6.0", "4.0"]
+    found = cells(report.success([*ROWS, *others]), "S8N7")
+    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
+    found = cells(report.steps([*ROWS, others[4]]), "S8N7")
+    assert found[1:] == ["-", "-", "6.0", "4.0"]
+
+
+def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path):
+    rows = [
+        *(row(played=True, iterations=n, rate=n / 50) for n in (1, 10)),
+        row(rate=0.9),  # N = T = 5
+        row(played=True, iterations=2, rate=0, seed=1),
+        *(row(name="paper", played=True, iterations=n, rate=n / 10) for n in (1, 2, 5)),
+        row(name="paper", rate=1.0),  # N = 10
+        row("PickUpLoc"),  # of one N alone there is nothing to see
+    ]
+    found = report.success_by_iterations(rows)
+    assert list(found) == ["GoToLocalS8N7"]
+    counts = {title: list(by_count) for title, by_count in found["GoToLocalS8N7"].items()}
+    assert counts == {"preset `paper`": [1, 2, 5, 10], "preset `leapjax`": [1, 5, 10]}
+    lines = [line.strip("| ").split("|") for line in report.iterations(rows).splitlines()[2:]]
+    rates = [[cell.strip() for cell in line] for line in lines]
+    assert rates[0][2:6] == ["10.0%", "20.0%", "50.0%", "100.0%"]
+    assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
+    plots.iterations_by_level(found, tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 1000

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import leapjax
 from experiments import report
+from experiments.common import results
 
 ROOT = Path(__file__).parent.parent
 LIBRARY = sorted((ROOT / "leapjax").rglob("*.py"))
@@ -129,6 +130,11 @@ def test_the_tables_are_what_the_rows_say():
     assert len(documents) == len(report.DOCUMENTS)
     for path, text in documents.items():
         assert path.read_text() == text, f"{path}: run python -m experiments.report"
+
+
+def test_no_row_is_stale():
+    stale = [row for row in results.read(ROOT / "results/babyai.jsonl") if not report.is_used(row)]
+    assert not [(row["level"], row["preset"], row["hash"]) for row in stale]
 
 
 def test_the_readme_names_files_that_exist():

@@ -1,6 +1,6 @@
 """Plots of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -8,7 +8,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
+from experiments.common.results import Row
 from leapjax import files, scores
 
 
@@ -47,6 +49,38 @@ def success_by_iteration(
     axis.errorbar(iterations, rates, yerr=(low, high), marker="o", capsize=3)
     axis.set(xlabel="iterations", ylabel="success (%), 95% interval", title=title)
     axis.set_ylim(0, 101)
+    _save(figure, path)
+
+
+def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
+    """Success rate against planning iterations, a panel for each level.
+
+    Args:
+        rows: by level, label of the line, and number of iterations.
+        path: to write.
+    """
+    columns = min(4, max(1, len(rows)))
+    lines = max(1, -(-len(rows) // columns))
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(2.7 * columns, 2.6 * lines), sharey=True, layout="constrained",
+        squeeze=False,
+    )  # fmt: skip
+    drawn: dict[str, Line2D] = {}  # one of each label, for the legend
+    for axis, (level, by_label) in zip(axes.flat, rows.items(), strict=False):
+        for label, by_count in by_label.items():
+            rates = [100 * row["successes"] / row["episodes"] for row in by_count.values()]
+            colour = drawn[label].get_color() if label in drawn else f"C{len(drawn)}"
+            (drawn[label],) = axis.plot(list(by_count), rates, "o-", color=colour)
+        axis.set_title(level, fontsize=9)
+        axis.set(xscale="log", ylim=(0, 102), xlabel="iterations N")
+        axis.set_xticks([1, 2, 5, 10, 30], ["1", "2", "5", "10", "30"])
+        axis.minorticks_off()
+    for axis in axes.flat[len(rows) :]:
+        axis.set_axis_off()
+    for axis in axes[:, 0]:
+        axis.set_ylabel("success (%)")
+    labels = [label.replace("`", "") for label in drawn]
+    figure.legend(drawn.values(), labels, loc="outside lower center", ncols=max(1, len(drawn)))
     _save(figure, path)
 
 
