@@ -9,15 +9,16 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 
 
 def matmul_flops(function: Callable[..., Any], *arguments: Any) -> float:
-    """Of one call; what a scan repeats counts as often as it is repeated.
+    """Of one call on all its devices; what a scan repeats counts as often as it is repeated.
 
     A product of `[n, k]` and `[k, m]` counts 2 n k m, a convolution what it would be as one.
 
     Args:
-        function: to count; it is traced, not run.
+        function: to count, jitted or not; it is traced, not run.
         arguments: arrays, or their shapes.
     """
-    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
+    jitted = function if hasattr(function, "trace") else jax.jit(function)
+    return _count(jitted.trace(*arguments).jaxpr.jaxpr)
 
 
 def _count(jaxpr: Jaxpr) -> float:
@@ -34,7 +35,11 @@ def _count(jaxpr: Jaxpr) -> float:
         elif name == "conv_general_dilated":
             out = params["dimension_numbers"].rhs_spec[0]
             total += 2 * results * math.prod(shapes[1]) / shapes[1][out]
-        times = params["length"] if name == "scan" else 1
+        times = 1
+        if name == "scan":
+            times = params["length"]
+        elif name == "shard_map":
+            times = params["mesh"].size
         total += times * sum(map(_count, _inner(list(params.values()))))
     return total
 

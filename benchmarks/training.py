@@ -2,13 +2,14 @@
 
 The steps are those of the main job: a batch is drawn and augmented, the gradient taken, the
 parameters updated. What is in the grids does not change the speed, so they are random.
-Compilation is timed apart. FLOPs are XLA's count for one step, set against the
-matrix-multiply peak measured in the same run.
+Compilation is timed apart. FLOPs are those of the matrix products of one step, set against the
+matrix-multiply peak measured in the same run. The parts of a step are compiled alone: what
+they leave of it is the exchange between devices, and what they cost each other.
 """
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import Config, make_domain, preset, specify
 from leapjax import pretrained, sharding, training
+from leapjax.agents import learning
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
 from leapjax.types import Agent, Demonstration, PyTree
@@ -86,32 +89,82 @@ class Stepper:
         return metrics["loss"]
 
     def flops(self) -> float:
-        """Of one update, counted by XLA for the whole batch on one device."""
-        step = training.make_train_step(self._agent(None))
-        arguments = self.state, jax.eval_shape(step.draw, self._key, 0, self._data), self._key
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments)
-        return step.update.lower(*shapes).cost_analysis()["flops"]  # type: ignore[attr-defined]
+        """Of the matrix products of one update of the whole batch."""
+        update = training.make_train_step(self._agent(None)).update
+        return matmul_flops(update, self.state, self._draw(), self._key)
 
-    def encoder_seconds(self, mesh: Mesh, seconds: float) -> float:
-        """Seconds for the encoder of a batch and its gradient, on as many devices."""
-
-        def gradient(_: None, params: PyTree, contexts: PyTree) -> PyTree:
-            def total(params: PyTree) -> jax.Array:
-                memory = jax.vmap(self.energy.encode, in_axes=(None, 0))(params, contexts)
-                return jax.tree.reduce(jnp.add, jax.tree.map(jnp.sum, memory))
-
-            # One row per device, so that the result is split as the batch is.
-            return jax.tree.map(lambda leaf: leaf[None], jax.grad(total)(params))
-
-        run = partial(sharding.split_batches(gradient, mesh), None)
-        config = self._config
+    def parts(self, mesh: Mesh, seconds: float) -> list[Row]:
+        """Where a step's time goes: its parts, each compiled alone, on as many devices."""
+        config, params = self._config, self.state.params
+        tokens = jnp.zeros((config.training.batch, config.planner.horizon), jnp.int32)
         contexts = random_contexts(self._domain, config.context, config.training.batch)
-        contexts = jax.tree.map(np.asarray, contexts)
-        jax.block_until_ready(run(self.state.params, contexts))
-        return fastest(partial(run, self.state.params, contexts), seconds)
+        split = NamedSharding(mesh, sharding.SPLIT)
+        contexts, tokens = jax.device_put((contexts, tokens), split)
+        encode = sharding.split_batches(lambda _, *given: self._encode(*given), mesh)
+        memory = encode(None, params, contexts)
+        optimizer = learning.make_optimizer(config.training)
+        optimize = jax.jit(
+            lambda state: optimizer.update(state.params, state.optimizer, state.params)
+        )
+        return [
+            _part("drawing and augmenting a batch", self._draw, (), seconds),
+            _gradient("context to memory", self._encode, params, (contexts,), mesh, seconds),
+            _gradient("actions to loss", self._loss, params, (memory, tokens), mesh, seconds),
+            _part("optimizer", optimize, (self.state,), seconds),
+        ]
+
+    def _draw(self) -> PyTree:
+        return self._step.draw(self._key, self.state.step, self._data)
+
+    def _encode(self, params: PyTree, contexts: PyTree) -> PyTree:
+        return jax.vmap(self.energy.encode, in_axes=(None, 0))(params, contexts)
+
+    def _loss(self, params: PyTree, memory: PyTree, tokens: jax.Array) -> jax.Array:
+        """One pass over each window, or one for each of its actions."""
+
+        def one(memory: PyTree, actions: jax.Array) -> jax.Array:
+            if self._config.method_settings.masking == "each":
+                return self.energy.total(params, memory, actions)
+            positions = jnp.arange(actions.shape[0])
+            return self.energy.conditional(params, memory, actions, positions)[:, 0].sum()
+
+        return jax.vmap(one)(memory, tokens)
 
     def _agent(self, mesh: Mesh | None) -> Agent:
         return pretrained.make_agent(specify(self._config, 0, self._domain), self._domain, mesh)
+
+
+def _part(name: str, run: Callable[..., Any], arguments: tuple[Any, ...], seconds: float) -> Row:
+    jax.block_until_ready(run(*arguments))
+    taken = fastest(partial(run, *arguments), seconds)
+    return {"part": name, "ms": 1e3 * taken, "gflop": matmul_flops(run, *arguments) / 1e9}
+
+
+def _gradient(
+    name: str,
+    function: Callable[..., PyTree],
+    params: PyTree,
+    batches: tuple[PyTree, ...],
+    mesh: Mesh,
+    seconds: float,
+) -> Row:
+    """`function(params, *batches)` and its gradient, each device for its own rows."""
+
+    def gradient(_: None, params: PyTree, *batches: PyTree) -> PyTree:
+        def total(params: PyTree, inputs: PyTree) -> jax.Array:
+            given = jax.tree.map(lambda x, y: y if _is_float(x) else x, batches, inputs)
+            return jax.tree.reduce(jnp.add, jax.tree.map(jnp.sum, function(params, *given)))
+
+        inputs = jax.tree.map(lambda x: x if _is_float(x) else jnp.zeros(()), batches)
+        # One row per device, so that the result is split as the batch is.
+        found = jax.grad(total, argnums=(0, 1))(params, inputs)
+        return jax.tree.map(lambda leaf: leaf[None], found)
+
+    return _part(name, sharding.split_batches(gradient, mesh), (None, params, *batches), seconds)
+
+
+def _is_float(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
 def measure(config: Config[Any, Any], seconds: float) -> Row:
@@ -120,7 +173,6 @@ def measure(config: Config[Any, Any], seconds: float) -> Row:
     mesh = sharding.make_mesh(batch)
     step = Stepper(config, mesh)
     taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
-    encoder = step.encoder_seconds(mesh, seconds)
     flops = step.flops()
     tokens = batch * config.planner.horizon
     peak = matmul_peak(tokens, config.model.width, seconds)
@@ -132,7 +184,7 @@ def measure(config: Config[Any, Any], seconds: float) -> Row:
         "batch": batch,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
-        "encoder_share": encoder / taken,
+        "parts": step.parts(mesh, seconds),
         "flops_per_step": flops,
         "gflops": flops / taken / 1e9,
         "peak_gflops": peak,
@@ -159,16 +211,13 @@ def random_steps(domain: Domain) -> Steps:
 
 def table(rows: Sequence[Row]) -> Table:
     """The rows for a terminal."""
-    result = Table(
-        "level", "preset", "steps/s", "ms/step", "encoder", "GFLOP/s", "peak", "fraction", "run"
-    )
+    result = Table("level", "preset", "steps/s", "ms/step", "GFLOP/s", "peak", "fraction", "run")
     for row in rows:
         result.add_row(
             row["level"],
             row["preset"],
             f"{row['steps_per_second']:.1f}",
             f"{1e3 / row['steps_per_second']:.1f}",
-            f"{row['encoder_share']:.0%}",
             f"{row['gflops']:.0f}",
             f"{row['peak_gflops']:.0f}",
             f"{row['fraction_of_peak']:.0%}",

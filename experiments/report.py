@@ -77,6 +77,7 @@ def documents(root: Path) -> dict[Path, str]:
         "speed": (speed, "planning"),
         "planning": (planning, "planning"),
         "training": (training, "training"),
+        "parts": (parts, "training"),
         "steps": (steps, "babyai"),
         "iterations": (iterations, "babyai"),
     }
@@ -218,7 +219,6 @@ def training(rows: Sequence[Row]) -> str:
             row["level"],
             f"`{row['preset']}`",
             f"{1e3 / row['steps_per_second']:.0f}",
-            f"{row['encoder_share']:.0%}",
             f"{row['flops_per_step'] / 1e9:.1f}",
             f"{row['gflops']:.0f}",
             f"{row['fraction_of_peak']:.0%}",
@@ -226,8 +226,24 @@ def training(rows: Sequence[Row]) -> str:
         ]
         for row in rows
     ]
-    header = "level | preset | ms/step | encoder | GFLOP/step | GFLOP/s | of the peak | a run"
+    header = "level | preset | ms/step | GFLOP/step | GFLOP/s | of the peak | a run"
     return _table(header, lines)
+
+
+def parts(rows: Sequence[Row]) -> str:
+    """Where the time of a step goes, of every measurement of training."""
+    lines = []
+    for row in rows:
+        step = 1e3 / row["steps_per_second"]
+        found = [f"{part['ms']:.1f}" for part in row["parts"]]
+        rates = [
+            f" ({part['gflop'] / part['ms'] * 1e3:.0f})" if part["gflop"] else ""
+            for part in row["parts"]
+        ]
+        cells = [ms + rate for ms, rate in zip(found, rates, strict=True)]
+        lines.append([row["level"], f"`{row['preset']}`", f"{step:.1f}", *cells])
+    names = [part["part"] for part in rows[0]["parts"]] if rows else []
+    return _table(" | ".join(["level", "preset", "step", *names]), lines)
 
 
 def _rate(rows: Sequence[Row]) -> str:

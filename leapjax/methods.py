@@ -1,12 +1,18 @@
 """The table of methods: what `leapjax.load` and the experiments find by name."""
 
+from leapjax.agents.bc import BC
 from leapjax.agents.classifier import CLASSIFIER
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
 from leapjax.agents.random import RANDOM
 from leapjax.errors import UserError
 
-METHODS: dict[str, Method] = {"leap": LEAP, "classifier": CLASSIFIER, "random": RANDOM}
+METHODS: dict[str, Method] = {
+    "leap": LEAP,
+    "classifier": CLASSIFIER,
+    "bc": BC,
+    "random": RANDOM,
+}
 
 
 def find_method(name: str) -> Method:

@@ -12,7 +12,7 @@ from benchmarks import planning, scaling, training
 from benchmarks.flops import matmul_flops
 from experiments.common.config import make_domain, preset, specify, with_options
 from experiments.common.runtime import Cluster
-from leapjax import pretrained
+from leapjax import pretrained, sharding
 from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
 from tests.programs import only_long
@@ -51,6 +51,8 @@ def test_flops_of_what_is_repeated_and_what_is_convolved():
     assert matmul_flops(power, square) == 5 * 2 * 4**3
     assert matmul_flops(jax.vmap(power), jnp.ones((7, 4, 4))) == 7 * 5 * 2 * 4**3
     assert matmul_flops(rows_times_matrix, square, square) == 2 * 4**3
+    split = sharding.split_batches(lambda _, x, rows: rows @ x, sharding.make_mesh(8))
+    assert matmul_flops(split, None, square, jnp.ones((8, 4))) == 2 * 8 * 4**2
     convolve = functools.partial(jax.lax.conv, window_strides=(1, 1), padding="VALID")
     assert matmul_flops(convolve, image, jnp.ones((2, 3, 3, 3))) == 2 * (2 * 6 * 6) * (3 * 3 * 3)
 
@@ -88,7 +90,14 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
     for field in ("steps_per_second", "flops_per_step", "fraction_of_peak", "training_seconds"):
         assert row[field] > 0
     assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"])
-    assert row["encoder_share"] > 0
+    names = [part["part"] for part in row["parts"]]
+    assert names == [
+        "drawing and augmenting a batch", "context to memory", "actions to loss", "optimizer",
+    ]  # fmt: skip
+    assert all(part["ms"] > 0 for part in row["parts"])
+    # The products of a step are those of encoder and transformer, values and gradients.
+    products = 1e9 * sum(part["gflop"] for part in row["parts"])
+    assert 0.9 * products < row["flops_per_step"] < 1.1 * products
 
 
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):

@@ -21,6 +21,7 @@ from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Agent, Context, Demonstration, Params, PyTree, TrainState, Window
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
+SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
 UNDECAYED = ("bias", "scale", "embedding")
 
 

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.agents.learning import SINGLE_ACTION, Method, Presets, Setup
 from leapjax.energy import single_action
 from leapjax.types import Agent, Context, Params, PyTree, TrainState
 
 # There is nothing to learn and nothing to learn it from; at temperature 1 all actions are alike.
-NOTHING = {"steps": 0, "demos": 0, "horizon": 1, "iterations": 1, "temperature": 1.0}
+NOTHING = {**SINGLE_ACTION, "steps": 0, "demos": 0, "temperature": 1.0}
 PRESETS: Presets = {"paper": NOTHING, "leapjax": NOTHING}
 
 

@@ -30,6 +30,9 @@ class Level:
     context: int = 0  # K, past steps in the context
     horizon: int = 5  # T
     iterations: int = 10  # N
+    states: int = (
+        5  # in the context of methods that choose one action at a time, the current one too
+    )
     words: int = vocabulary.LONGEST  # the longest instruction, in tokens
     sequence: bool = True  # an instruction may join several tasks, with "and" and "then"
     paper_success: float | None = None  # percent (paper, table 1)
@@ -51,11 +54,11 @@ LEVELS = {
         ),
         Level(
             "GoToObjMazeS4", "GoTo", 4, 3, 3, 1, "open",
-            horizon=10, iterations=30, words=_GO_TO, sequence=False, paper_success=62.5,
+            horizon=10, iterations=30, states=10, words=_GO_TO, sequence=False, paper_success=62.5,
         ),
         Level(
             "GoToObjMazeS7", "GoTo", 7, 3, 3, 1, "open",
-            horizon=15, iterations=50, words=_GO_TO, sequence=False, paper_success=42.5,
+            horizon=15, iterations=50, states=15, words=_GO_TO, sequence=False, paper_success=42.5,
         ),
         Level(
             "GoToObjMazeS4R2Close", "GoTo", 4, 2, 2, 1, "closed",
@@ -67,7 +70,7 @@ LEVELS = {
         ),
         Level(
             "GoToSeqS5R2", "GoToSeq", 5, 2, 2, 4, "closed",
-            context=20, words=_SEQUENCE, paper_success=33.0,
+            context=20, states=20, words=_SEQUENCE, paper_success=33.0,
         ),
     )
 }  # fmt: skip

@@ -57,9 +57,11 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
+    level = find_level(name)
+    if preset == "paper" and method not in ("leap", "classifier", "random"):
+        return {"context": level.states - 1}  # the past ones
     if (method, preset) != ("leap", "leapjax"):
         return {}
-    level = find_level(name)
     options: dict[str, Any] = {}
     if level.sequence:  # much must be done in one episode: noise leads out of dead ends
         options["temperature"] = 1.0

@@ -1,0 +1,97 @@
+"""The network of methods that choose one action at a time."""
+
+import functools
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.models.policy import PolicyModel, past_and_present
+from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.types import Context, pad_token
+
+PAST, ACTIONS = 3, 4
+HEADS = (("logits", ACTIONS - 1), ("value", 1))
+
+
+class States(nn.Module):
+    """A token for each state of a context."""
+
+    @nn.compact
+    def __call__(self, context):
+        states = jnp.concatenate([context.past, context.observation[None]])
+        return nn.Dense(16)(states)
+
+
+def context(key, past=PAST):
+    keys = jax.random.split(key, 3)
+    return Context(
+        observation=jax.random.normal(keys[0], (2,)),
+        past=jax.random.normal(keys[1], (past, 2)),
+        actions=jax.random.randint(keys[2], (past,), 0, ACTIONS - 1),
+        rewards=jnp.zeros(past), step=jnp.int32(5), return_so_far=jnp.float32(0),
+    )  # fmt: skip
+
+
+@functools.cache
+def model(architecture, past=PAST):
+    """A network and its parameters, every one of them random."""
+    config = ModelConfig(architecture, layers=2, heads=2, width=16)
+    module = PolicyModel(config, Sizes(ACTIONS, past, 1, 20), States(), HEADS)
+    params = module.init(jax.random.key(0), context(jax.random.key(1), past))
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(2), len(leaves))
+    noise = [jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    return jax.jit(module.apply), jax.tree.unflatten(structure, noise)
+
+
+@pytest.mark.parametrize(("architecture", "states"), [("paper", PAST + 1), ("leapjax", 1)])
+def test_each_head_speaks_of_each_state(architecture, states):
+    apply, params = model(architecture)
+    said = apply(params, context(jax.random.key(3)))
+    shapes = {name: values.shape for name, values in said.items()}
+    assert shapes == {"logits": (states, ACTIONS - 1), "value": (states, 1)}
+    assert all(np.isfinite(values).all() for values in said.values())
+
+
+def test_what_is_said_of_a_state_depends_on_what_came_before_it_alone():
+    apply, params = model("paper")
+    given = context(jax.random.key(3))
+    before = apply(params, given)["logits"]
+    # In the order of the tokens: s_0 a_0 s_1 a_1 s_2 a_2 s_3.
+    for place in range(2 * PAST + 1):
+        state, is_action = divmod(place, 2)
+        if is_action:
+            other = (given.actions[state] + 1) % (ACTIONS - 1)
+            changed = given._replace(actions=given.actions.at[state].set(other))
+        elif state < PAST:
+            changed = given._replace(past=given.past.at[state].add(1))
+        else:
+            changed = given._replace(observation=given.observation + 1)
+        differs = np.abs(apply(params, changed)["logits"] - before).max(axis=1) > 1e-5
+        first = state + is_action  # an action is seen from the next state on
+        assert differs.tolist() == [s >= first for s in range(PAST + 1)], place
+
+
+@pytest.mark.parametrize("architecture", ["paper", "leapjax"])
+def test_without_a_past_only_the_present_counts(architecture):
+    apply, params = model(architecture, past=0)
+    said = apply(params, context(jax.random.key(3), past=0))
+    assert said["logits"].shape == (1, ACTIONS - 1)
+
+
+def test_padded_actions_are_tokens_of_their_own():
+    apply, params = model("paper")
+    given = context(jax.random.key(3))
+    padded = given._replace(actions=given.actions.at[0].set(pad_token(ACTIONS)))
+    assert not np.allclose(apply(params, padded)["logits"][-1], apply(params, given)["logits"][-1])
+
+
+def test_what_belongs_to_the_last_states():
+    past, present = jnp.array([1, 2, 3]), jnp.array(4)
+    for count in (1, 2, 4):
+        expected = [1, 2, 3, 4][-count:]
+        assert past_and_present(past, present, count).tolist() == expected
+    assert past_and_present(jnp.zeros(0, int), present, 1).tolist() == [4]
