@@ -251,7 +251,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level):
     [
         (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
         (["--preset", "papr"], "unknown preset 'papr'"),
-        (["--method", "bc"], "unknown method 'bc': expected one of leap, classifier"),
+        (["--method", "bcx"], "unknown method 'bcx': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--horizon", "50", "--resampled", "1"], "longer than an episode"),
