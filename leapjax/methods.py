@@ -1,7 +1,10 @@
 """The table of methods: what `leapjax.load` and the experiments find by name."""
 
 from leapjax.agents.bc import BC
+from leapjax.agents.bcq import BCQ
 from leapjax.agents.classifier import CLASSIFIER
+from leapjax.agents.dt import DT
+from leapjax.agents.iql import IQL
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
 from leapjax.agents.random import RANDOM
@@ -11,6 +14,9 @@ METHODS: dict[str, Method] = {
     "leap": LEAP,
     "classifier": CLASSIFIER,
     "bc": BC,
+    "dt": DT,
+    "bcq": BCQ,
+    "iql": IQL,
     "random": RANDOM,
 }
 

@@ -43,7 +43,15 @@ class Window(NamedTuple):
 
     context: Context
     actions: Array  # [T] int32: what to predict
+    return_to_go: Array  # [] float32: the demonstration's rewards from this step on
     extras: PyTree  # what the domain's augmentation must know of this step; no model sees it
+
+
+class Transition(NamedTuple):
+    """A step that was taken, and what came of it: for methods that learn from rewards."""
+
+    context: Context  # after it, one step longer than a network's: it holds the step as its last
+    terminated: Array  # [] bool: the episode came to its end with it
 
 
 class Plan(NamedTuple):

@@ -22,7 +22,7 @@ DOMAIN = BABYAI.make("GoToLocalS7N5", Settings())
 
 
 def window(actions):
-    return Window(None, jnp.array(actions, jnp.int32), ())  # the model looks at no context
+    return Window(None, jnp.array(actions, jnp.int32), 0.0, ())  # the model looks at no context
 
 
 def counting_model():

@@ -72,6 +72,7 @@ def slow_window(demonstration: Demonstration, start: int, context: int, horizon:
             np.float32(sum(demonstration.rewards[:start].tolist())),
         ),
         np.array(planned, np.int32),
+        np.float32(sum(demonstration.rewards[start:].tolist())),
         slow_way(demonstration, start),
     )
 
@@ -101,6 +102,7 @@ def assert_same_window(actual: Window, expected: Window) -> None:
         values = (getattr(w.context, field) for w in (actual, expected))
         np.testing.assert_array_equal(*values, field)
     np.testing.assert_array_equal(actual.actions, expected.actions)
+    np.testing.assert_array_equal(actual.return_to_go, expected.return_to_go)
     np.testing.assert_array_equal(actual.extras, expected.extras)
     types = jax.tree.map(lambda x: x.dtype, actual)
     assert types == jax.tree.map(lambda x: x.dtype, expected)
@@ -162,6 +164,39 @@ def test_every_window_against_the_slow_one(context, horizon):
     assert index == steps.actions.shape[0] == sum(LENGTHS)
 
 
+@pytest.mark.parametrize("context", [0, 2, 5])
+def test_transitions_are_what_was_before_and_after_every_step(context):
+    demonstrations = toy_demonstrations()
+    steps = on_device(laid_out(demonstrations))
+    find = jax.jit(lambda steps, i: windows.transition_window(steps, i, context, END))
+    index = 0
+    for demonstration in demonstrations:
+        # One step longer, so that the state after the last step is one that windows start at.
+        longer = demonstration._replace(
+            observations=jax.tree.map(
+                lambda x: np.concatenate([x, x[-1:]]), demonstration.observations
+            ),
+            actions=np.append(demonstration.actions, 0),
+            rewards=np.append(demonstration.rewards, 0),
+        )
+        for step, action in enumerate(demonstration.actions):
+            found = find(steps, index)
+            assert found.actions.shape == (0,)
+            assert found.context.actions[-1] == action
+            assert found.context.rewards[-1] == demonstration.rewards[step]
+            np.testing.assert_array_equal(found.extras, slow_way(demonstration, step))
+            for part, start in ((windows.before, step), (windows.after, step + 1)):
+                expected = slow_window(longer, start, context, 0)
+                assert_same_window(
+                    found._replace(
+                        context=part(found.context),
+                        return_to_go=expected.return_to_go, extras=expected.extras,
+                    ),
+                    expected,
+                )  # fmt: skip
+            index += 1
+
+
 def test_real_demonstrations_against_the_slow_window(local_demonstrations):
     steps = on_device(laid_out(local_demonstrations))
     index = 0
@@ -203,7 +238,9 @@ def test_a_window_knows_nothing_but_itself(context, horizon):
             )
             assert not np.array_equal(altered.observations.grid, steps.observations.grid)
             actual = window_at(context, horizon)(on_device(altered), index)
-            assert_same_window(actual, window_at(context, horizon)(on_device(steps), index))
+            expected = window_at(context, horizon)(on_device(steps), index)
+            # What is to come is in its return to go, for methods that ask for one.
+            assert_same_window(actual._replace(return_to_go=expected.return_to_go), expected)
             index += 1
 
 
@@ -226,12 +263,16 @@ def test_a_window_depends_on_each_action_and_state_that_it_holds():
         assert added.tolist() == [offset == -2, offset == -1]  # none of what is to come
 
 
-draw = jax.jit(windows.sample_windows, static_argnums=(2, 3, 4, 5, 6))
+@functools.partial(jax.jit, static_argnums=(2, 3, 4, 5))
+def draw(key, steps, batch: int, context: int, horizon: int, by: str) -> Window:
+    """A batch, as an agent draws it."""
+    indices = windows.sample_steps(key, steps, batch, by)
+    return jax.vmap(lambda i: windows.window(steps, i, context, horizon, END))(indices)
 
 
 def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) -> Window:
     steps = on_device(laid_out(toy_demonstrations()))
-    return draw(jax.random.key(key), steps, batch, context, horizon, END, by)
+    return draw(jax.random.key(key), steps, batch, context, horizon, by)
 
 
 @pytest.mark.parametrize("by", ["episode", "step"])
@@ -285,10 +326,7 @@ def test_padding_changes_no_window():
     assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
     assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
     for by in ("step", "episode"):
-        draw = functools.partial(
-            windows.sample_windows, batch=64, context=2, horizon=5, end=END, by=by
-        )
-        same = [jax.jit(draw)(jax.random.key(0), on_device(data)) for data in (steps, padded)]
+        same = [draw(jax.random.key(0), on_device(data), 64, 2, 5, by) for data in (steps, padded)]
         jax.tree.map(np.testing.assert_array_equal, *same)
 
 

@@ -20,7 +20,7 @@ from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
-from leapjax.methods import find_method
+from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
@@ -39,7 +39,7 @@ class Config(Generic[M, D]):
     level: str
     """A level of the domain by its name or id, or "all" for those of the paper."""
     method: str = "leap"
-    """How to learn and to act: a line of the table in leapjax/methods.py."""
+    """How to learn and to act: a line of the table in leapjax/methods.py, or "all" of them."""
     preset: str = "leapjax"
     """"leapjax": ours; "paper": the paper's appendix. Sets the defaults of all the rest."""
     seeds: tuple[int, ...] = (0,)
@@ -122,7 +122,7 @@ def with_options(config: Config[Any, Any], options: Mapping[str, Any]) -> Config
 
 
 def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
-    """One configuration per level from a command line; exits with 2 and a reason if it is bad.
+    """One configuration per level and method from a command line; exits with 2 if it is bad.
 
     Raises:
         UserError: an unknown level, method or preset, or options that cannot be.
@@ -139,6 +139,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
     trained = None if folder is None else pretrained.read_specification(folder)
     levels = find_domain(domain).levels
     level = chosen.level or (trained.level if trained else levels[0])
+    if chosen.method == "all" and (folder is not None or chosen.pretrained):
+        raise UserError("--method all: a planner that is trained already is of one method")
     configs = []
     for each in levels if level == "all" else [level]:
         if chosen.pretrained:
@@ -146,12 +148,14 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
             trained = pretrained.read_specification(folder)
         method = chosen.method or (trained.method if trained else Config.method)
         name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        default = preset(domain, each, method, name)
-        if trained and (trained.domain, trained.method) == (domain, method):
-            default = _as_trained(default, trained)
-        config = dataclasses.replace(_parse(arguments, default), level=each, checkpoint=folder)
-        check(config)
-        configs.append(config)
+        for one in METHODS if method == "all" else [method]:
+            default = preset(domain, each, one, name)
+            if trained and (trained.domain, trained.method) == (domain, one):
+                default = _as_trained(default, trained)
+            given = _parse(arguments, default)
+            config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
+            check(config)
+            configs.append(config)
     return configs
 
 

@@ -32,6 +32,7 @@ from leapjax.data import storage, windows
 from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError, first_line
 from leapjax.pretrained import Pretrained, Specification
+from leapjax.methods import find_method
 from leapjax.rollouts import Episodes
 from leapjax.training import TrainStep
 from leapjax.types import Agent, Demonstration, TrainState
@@ -139,7 +140,8 @@ def load(run: Run) -> list[Demonstration]:
     """The demonstrations to train on: the user's, or those that were collected.
 
     Raises:
-        UserError: they cannot be read, or are fewer than asked for.
+        UserError: they cannot be read, are fewer than asked for, or hold no rewards where the
+            method learns from them.
     """
     config, name = run.config, dataset(run)
     if not config.demos:
@@ -150,7 +152,13 @@ def load(run: Run) -> list[Demonstration]:
     if len(data) < config.demos:
         raise UserError(f"{name} has {len(data)} episodes, fewer than --demos {config.demos}")
     run.seconds["demos"] += time.perf_counter() - begun
-    return data[: config.demos]
+    data = data[: config.demos]
+    if find_method(config.method).rewards and not any(d.rewards.any() for d in data):
+        raise UserError(
+            f"{name} holds no rewards, from which --method {config.method} learns: give it data "
+            "with rewards, or another method"
+        )
+    return data
 
 
 def fit(

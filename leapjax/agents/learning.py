@@ -17,11 +17,28 @@ from leapjax.data import windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
 from leapjax.errors import UserError, check_at_least
+from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.types import Agent, Context, Demonstration, Params, PyTree, TrainState, Window
+from leapjax.types import (
+    Agent,
+    Context,
+    Demonstration,
+    Params,
+    PyTree,
+    TrainState,
+    Transition,
+    Window,
+)
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
 SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
+SINGLE_ACTION_PRESETS: Presets = {
+    "paper": {**SINGLE_ACTION, "architecture": "paper", "dropout": 0.1, "windows": "episode"},
+    "leapjax": {
+        **SINGLE_ACTION, "architecture": "leapjax", "dropout": 0.0, "windows": "step",
+        "learning_rate": 3e-3,
+    },
+}  # fmt: skip
 UNDECAYED = ("bias", "scale", "embedding")
 
 
@@ -86,6 +103,23 @@ class Setup(NamedTuple):
             )
         return self.domain.encoders[name](self.model, self.context)
 
+    def policy(self, *heads: tuple[str, int], conditioned: bool = False) -> PolicyModel:
+        """The network of a method that chooses one action at a time.
+
+        Args:
+            heads: what it says: a name, and how many numbers.
+            conditioned: on returns to go.
+
+        Raises:
+            UserError: plans are not of one action.
+        """
+        if self.horizon != 1:
+            raise UserError(
+                f"--horizon {self.horizon}: this method chooses one action at a time, so its "
+                "horizon is 1"
+            )
+        return PolicyModel(self.model, self.sizes, self.encoder(), heads, conditioned)
+
 
 class Method(NamedTuple):
     """A way to learn and to act, as the table of methods has it."""
@@ -94,6 +128,7 @@ class Method(NamedTuple):
     make_agent: Callable[[Setup, Mesh | None], Agent]
     # mesh: of devices to train on (see leapjax.sharding); None for one device
     presets: Presets  # whatever the level; what that asks for is in its domain's presets
+    rewards: bool = False  # it learns from them: data without any are refused
 
 
 ExampleLoss = Callable[[Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
@@ -201,8 +236,9 @@ def _in_parts(differentiate: Callable[..., PyTree], rows: int) -> Callable[..., 
 def make_init(
     setup: Setup,
     module: nn.Module,
-    touch: Callable[..., jax.Array],
+    touch: Callable[..., PyTree],
     optimizer: optax.GradientTransformation,
+    target: Callable[[Params], PyTree] = lambda params: (),
 ) -> Callable[[jax.Array], TrainState]:
     """An agent's `init`: the parameters that a network has before it has seen anything.
 
@@ -211,32 +247,85 @@ def make_init(
         module: the network.
         touch: (module, context, actions `[T]`) -> anything that uses every parameter.
         optimizer: that will train them.
+        target: which of them a target network begins with.
     """
 
     def init(key: jax.Array) -> TrainState:
         context = jax.tree.map(jnp.asarray, blank_context(setup.domain, setup.context))
         actions = jnp.zeros(setup.horizon, jnp.int32)
         params = module.init(key, context, actions, method=touch)
-        return TrainState(params, optimizer.init(params), jnp.int32(0))
+        # A copy: a state that is updated in place must hold each array once.
+        extra = jax.tree.map(jnp.copy, target(params))
+        return TrainState(params, optimizer.init(params), jnp.int32(0), extra)
 
     return init
 
 
+def follow(
+    rate: float, part: Callable[[Params], PyTree] = lambda params: params
+) -> Callable[[PyTree, Params], PyTree]:
+    """A target network's step towards a part of the parameters (Lillicrap et al., 2016).
+
+    Args:
+        rate: in 0 .. 1, how far.
+        part: of all parameters, those that it has.
+    """
+
+    def step(target: PyTree, params: Params) -> PyTree:
+        return optax.incremental_update(part(params), target, rate)
+
+    return step
+
+
+def check_shares(settings: object, *names: str) -> None:
+    """Refuses settings that are shares and not in 0 .. 1.
+
+    Raises:
+        ValueError: says which.
+    """
+    for name in names:
+        if not 0 <= getattr(settings, name) <= 1:  # false for NaN too
+            raise ValueError(f"{name} must be in 0 .. 1, got {getattr(settings, name)}")
+
+
 def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
     """An agent's `batch` of windows `[B, ...]`, augmented as the domain says."""
-    domain, training = setup.domain, setup.training
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.window(steps, index, setup.context, setup.horizon, end)
 
     def batch(key: jax.Array, steps: Steps) -> Window:
-        window_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
-        drawn = windows.sample_windows(
-            window_key, steps, training.batch, setup.context, setup.horizon,
-            domain.num_actions - 1, training.windows,
-        )  # fmt: skip
-        for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
-            drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
-        return drawn
+        return _draw(setup, window, key, steps)[0]
 
     return batch
+
+
+def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], Transition]:
+    """An agent's `batch` of transitions `[B, ...]`, augmented as the domain says."""
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.transition_window(steps, index, setup.context, end)
+
+    def batch(key: jax.Array, steps: Steps) -> Transition:
+        drawn, indices = _draw(setup, window, key, steps)
+        return Transition(drawn.context, steps.terminated[indices])
+
+    return batch
+
+
+def _draw(
+    setup: Setup, window: Callable[[Steps, jax.Array], Window], key: jax.Array, steps: Steps
+) -> tuple[Window, jax.Array]:
+    """Windows `[B, ...]`, augmented, and the indices `[B]` of their steps."""
+    domain, training = setup.domain, setup.training
+    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+    indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
+    drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
+    for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+        drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
+    return drawn, indices
 
 
 def blank_steps(domain: Domain) -> Steps:

@@ -111,36 +111,81 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
         end: the end action, `A - 1`.
     """
     ahead = jnp.arange(horizon)
-    last = steps.actions.shape[0] - 1
-    actions = steps.actions[jnp.minimum(index + ahead, last)]
-    actions = jnp.where(ahead < steps.remaining[index], actions, end)
-    back = jnp.arange(-context, 0)
+    rest = steps.remaining[index]
+    actions = steps.actions[jnp.minimum(index + ahead, steps.actions.shape[0] - 1)]
+    final = index + rest - 1
+    return Window(
+        _context(steps, index, context, end),
+        jnp.where(ahead < rest, actions, end),
+        steps.return_so_far[final] + steps.rewards[final] - steps.return_so_far[index],
+        _at(steps.extras, index),
+    )
+
+
+def transition_window(steps: Steps, index: jax.Array, context: int, end: int) -> Window:
+    """What is known after step `index []`, as a window of K + 1 past steps and no actions.
+
+    So whatever can be done to a window can be done to a transition; see `Transition`.
+
+    Args:
+        steps: the data.
+        index: of the step that is taken, in 0 .. M - 1.
+        context: K.
+        end: the end action, `A - 1`.
+    """
+    start = window(steps, index, context, 0, end)  # what augmentations must know is of its start
+    return start._replace(context=_context(steps, index, context + 1, end, after=1))
+
+
+def before(context: Context) -> Context:
+    """The context of a transition (K + 1 past steps) as it was before its step (K of them)."""
+    reward = context.rewards[-1]
+    return Context(
+        observation=_at(context.past, -1),
+        past=jax.tree.map(lambda leaf: leaf[:-1], context.past),
+        actions=context.actions[:-1],
+        rewards=context.rewards[:-1],
+        step=context.step - 1,
+        return_so_far=context.return_so_far - reward,
+    )
+
+
+def after(context: Context) -> Context:
+    """The context of a transition (K + 1 past steps) as it is after its step (K of them)."""
+    return context._replace(
+        past=jax.tree.map(lambda leaf: leaf[1:], context.past),
+        actions=context.actions[1:],
+        rewards=context.rewards[1:],
+    )
+
+
+def _at(tree: PyTree, index: jax.Array | int) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _context(steps: Steps, index: jax.Array, length: int, end: int, after: int = 0) -> Context:
+    """What is known before step `index []`, or after it: `length` past steps."""
+    back = jnp.arange(-length, 0) + after
     known = -back <= steps.step[index]
     earlier = jnp.where(known, index + back, 0)
 
     def take_past(leaf: jax.Array, rows: jax.Array) -> jax.Array:
-        shape = (context,) + (1,) * (leaf.ndim - 1)
+        shape = (length,) + (1,) * (leaf.ndim - 1)
         return jnp.where(known.reshape(shape), leaf[rows], 0)
 
     states = steps.state[earlier]
-    return Window(
-        Context(
-            observation=jax.tree.map(lambda leaf: leaf[steps.state[index]], steps.observations),
-            past=jax.tree.map(lambda leaf: take_past(leaf, states), steps.observations),
-            actions=jnp.where(known, steps.actions[earlier], pad_token(end + 1)),
-            rewards=take_past(steps.rewards, earlier),
-            step=steps.step[index],
-            return_so_far=steps.return_so_far[index],
-        ),
-        actions,
-        jax.tree.map(lambda leaf: leaf[index], steps.extras),
+    return Context(
+        observation=_at(steps.observations, steps.state[index] + after),
+        past=jax.tree.map(lambda leaf: take_past(leaf, states), steps.observations),
+        actions=jnp.where(known, steps.actions[earlier], pad_token(end + 1)),
+        rewards=take_past(steps.rewards, earlier),
+        step=steps.step[index] + after,
+        return_so_far=steps.return_so_far[index] + after * steps.rewards[index],
     )
 
 
-def sample_windows(
-    key: jax.Array, steps: Steps, batch: int, context: int, horizon: int, end: int, by: str
-) -> Window:
-    """A batch `[B, ...]` of windows: a function of `key` and the data alone.
+def sample_steps(key: jax.Array, steps: Steps, batch: int, by: str) -> jax.Array:
+    """Indices `[B]` of steps: a function of `key` and the data alone.
 
     `by` is "episode" (a uniform demonstration, then a uniform step of it, as in the
     authors' code) or "step" (a uniform step, so that long demonstrations count for more).
@@ -149,12 +194,10 @@ def sample_windows(
         ValueError: another `by`.
     """
     if by == "step":
-        index = jax.random.randint(key, (batch,), 0, steps.count)
-    elif by == "episode":
+        return jax.random.randint(key, (batch,), 0, steps.count)
+    if by == "episode":
         episode_key, step_key = jax.random.split(key)
         episode = jax.random.randint(episode_key, (batch,), 0, steps.starts.shape[0])
         offset = jax.random.uniform(step_key, (batch,)) * steps.lengths[episode]
-        index = steps.starts[episode] + offset.astype(jnp.int32)
-    else:
-        raise ValueError(f"unknown sampling {by!r}: expected episode or step")
-    return jax.vmap(lambda i: window(steps, i, context, horizon, end))(index)
+        return steps.starts[episode] + offset.astype(jnp.int32)
+    raise ValueError(f"unknown sampling {by!r}: expected episode or step")

@@ -1,0 +1,102 @@
+"""Batch-constrained Q-learning for discrete actions (Fujimoto et al., 2019).
+
+A Q-function is learned from transitions, whose best next action is sought only among those that
+the data make likely: the ones it knows the value of. It acts the same way.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from leapjax.agents import learning, losses
+from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.data import windows
+from leapjax.energy import single_action
+from leapjax.models.policy import PolicyModel, Said
+from leapjax.types import Agent, Context, Params, PyTree, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The options of BCQ alone. The defaults are the original's, but for the target network."""
+
+    threshold: float = 0.3  # an action less likely than so much of the likeliest is excluded
+    discount: float = 0.99
+    target_rate: float = 0.005  # how far the target network follows at each step
+    logit_penalty: float = 0.01  # on the squares of the behaviour's logits
+
+    def __post_init__(self) -> None:
+        learning.check_shares(self, "threshold", "discount", "target_rate")
+
+
+def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
+    """BCQ as an `Agent`; its energy is minus the Q-values of the actions that are likely."""
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    module = setup.policy(("q", choices), ("behaviour", choices))
+    optimizer = learning.make_optimizer(setup.training)
+
+    def encode(params: Params, context: Context) -> PyTree:
+        return module.apply(params, context)
+
+    def scores(params: Params, memory: PyTree) -> jax.Array:
+        del params
+        return likely_values(memory, settings.threshold)[-1]
+
+    energy = single_action(
+        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
+    )
+
+    def transition_loss(
+        params: Params, target: PyTree, transition: Transition, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The temporal difference of Q, and the cross-entropy of the behaviour."""
+        context = transition.context
+        now, later = _both(module, params, context, key)
+        held: Any = module.apply(target, windows.after(context))
+        # Chosen by the one network and valued by the other, as in double Q-learning.
+        best = jnp.argmax(likely_values(later, settings.threshold), axis=1)
+        values = losses.of_action(held["q"], best)  # [P]
+        taken, known = losses.last_actions(context, len(values), choices)
+        targets = losses.bellman(transition, values, settings.discount)
+        errors = optax.losses.huber_loss(losses.of_action(now["q"], taken), targets)
+        cloning, accuracy = losses.imitation(now["behaviour"], taken, known)
+        squares = (now["behaviour"] ** 2).mean(axis=1)
+        loss = losses.mean_where(errors + settings.logit_penalty * squares, known) + cloning
+        value = losses.mean_where(losses.of_action(now["q"], taken), known)
+        return loss, {"accuracy": accuracy, "value": value}
+
+    init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
+    update = learning.make_update(
+        transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
+        setup.training.microbatch,
+    )  # fmt: skip
+    return Agent(init, learning.transition_batches(setup), update, energy)
+
+
+def likely_values(said: Said, threshold: float) -> jax.Array:
+    """`[P, A - 1]` Q-values, -inf where an action is less likely than it may be."""
+    likelihoods = jax.nn.softmax(said["behaviour"])
+    likely = likelihoods >= threshold * likelihoods.max(axis=1, keepdims=True)
+    return jnp.where(likely, said["q"], -jnp.inf)
+
+
+def _both(
+    module: PolicyModel, params: Params, context: Context, key: jax.Array
+) -> tuple[Said, Said]:
+    found: Any = module.apply(
+        params, context, deterministic=False, rngs={"dropout": key}, method="transition"
+    )
+    return found
+
+
+def _say(module: PolicyModel, context: Context, actions: jax.Array) -> Said:
+    """Touches every parameter, to initialise them."""
+    del actions
+    return module(context)
+
+
+BCQ = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)

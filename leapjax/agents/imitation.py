@@ -1,0 +1,69 @@
+"""What BC and DT share: an agent that learns which action was taken, of every state."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.sharding import Mesh
+
+from leapjax.agents import learning, losses
+from leapjax.agents.learning import Setup
+from leapjax.energy import single_action
+from leapjax.models.policy import PolicyModel
+from leapjax.types import Agent, Context, Params, PyTree, Window
+
+
+def make_imitator(
+    setup: Setup,
+    mesh: Mesh | None,
+    returns: Callable[[Context, jax.Array | None], jax.Array] | None = None,
+) -> Agent:
+    """An agent whose energy is minus the logits of the next action.
+
+    Args:
+        setup: what it is made from.
+        mesh: of devices to train on; None for one device.
+        returns: (context, return to go of a demonstration, or None while acting) -> `[K + 1]`
+            the returns to go that the action is conditioned on; None: on nothing else.
+    """
+    choices = setup.domain.num_actions - 1  # the end action is not chosen
+    module = setup.policy(("logits", choices), conditioned=returns is not None)
+    optimizer = learning.make_optimizer(setup.training)
+
+    def wanted(context: Context, return_to_go: jax.Array | None = None) -> jax.Array | None:
+        return None if returns is None else returns(context, return_to_go)
+
+    def encode(params: Params, context: Context) -> PyTree:
+        return module.apply(params, context, returns=wanted(context))
+
+    def scores(params: Params, memory: PyTree) -> jax.Array:
+        del params
+        return memory["logits"][-1]
+
+    energy = single_action(
+        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
+    )
+
+    def window_loss(
+        params: Params, extra: PyTree, window: Window, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Cross-entropy of the actions of one context and of the one that followed."""
+        del extra
+        said: Any = module.apply(
+            params, window.context, deterministic=False, rngs={"dropout": key},
+            returns=wanted(window.context, window.return_to_go),
+        )  # fmt: skip
+        logits = said["logits"]  # [P, A - 1]
+        taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)
+        loss, accuracy = losses.imitation(logits, *taken)
+        return loss, {"accuracy": accuracy}
+
+    def touch(module: PolicyModel, context: Context, actions: jax.Array) -> jax.Array:
+        del actions
+        return module(context, returns=wanted(context))["logits"]
+
+    update = learning.make_update(
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
+    )
+    init = learning.make_init(setup, module, touch, optimizer)
+    return Agent(init, learning.window_batches(setup), update, energy)

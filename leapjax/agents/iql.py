@@ -1,0 +1,128 @@
+"""Implicit Q-learning for discrete actions (Kostrikov et al., 2022).
+
+The value of a state is a high expectile of the Q-values of what was done there, so that no action
+is ever tried that the data do not hold; the policy is behaviour cloning, weighted by the advantage
+of what was done.
+"""
+
+import dataclasses
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from leapjax.agents import learning, losses
+from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.data import windows
+from leapjax.energy import single_action
+from leapjax.models.policy import PolicyModel, Said
+from leapjax.types import Agent, Context, Params, PyTree, Transition
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The options of IQL alone. The defaults are the paper's (appendix)."""
+
+    expectile: float = 0.9
+    inverse_temperature: float = 3.0  # of the advantages that weigh what is cloned
+    largest_weight: float = 100.0  # of an action that is cloned
+    discount: float = 0.99
+    target_rate: float = 0.005  # how far the target network follows at each step
+
+    def __post_init__(self) -> None:
+        learning.check_shares(self, "expectile", "discount", "target_rate")
+        for name in ("inverse_temperature", "largest_weight"):
+            if not 0 <= getattr(self, name) < float("inf"):  # false for NaN too
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+
+
+class Networks(nn.Module):
+    """A policy and its critic: two networks, of which neither sees the other's gradients."""
+
+    policy: PolicyModel  # says logits
+    critic: PolicyModel  # says the value, and two Q-values
+
+    def __call__(self, context: Context) -> tuple[Said, Said]:
+        """What both say of a context."""
+        return self.policy(context), self.critic(context)
+
+    def act(self, context: Context, deterministic: bool = True) -> Said:
+        """What the policy says of a context."""
+        return self.policy(context, deterministic)
+
+    def judge(self, context: Context, deterministic: bool = True) -> tuple[Said, Said]:
+        """What the critic says before and after the step of a transition."""
+        return self.critic.transition(context, deterministic)
+
+
+def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
+    """IQL as an `Agent`; its energy is minus the policy's logits."""
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    critic = setup.policy(("value", 1), ("q1", choices), ("q2", choices))
+    module = Networks(setup.policy(("logits", choices)), critic)
+    optimizer = learning.make_optimizer(setup.training)
+
+    def encode(params: Params, context: Context) -> PyTree:
+        return module.apply(params, context, method="act")
+
+    def scores(params: Params, memory: PyTree) -> jax.Array:
+        del params
+        return memory["logits"][-1]
+
+    energy = single_action(
+        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
+    )
+
+    def transition_loss(
+        params: Params, target: PyTree, transition: Transition, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
+        context = transition.context
+        earlier = windows.before(context)
+        options: Any = {"deterministic": False, "rngs": {"dropout": key}}
+        policy: Any = module.apply(params, earlier, method="act", **options)
+        judged: Any = module.apply(params, context, method="judge", **options)
+        held: Any = critic.apply(target, earlier)
+        now, later = judged
+        taken, known = losses.last_actions(context, len(held["value"]), choices)
+        least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))
+
+        advantages = least - now["value"][:, 0]
+        values = losses.expectile(advantages, settings.expectile)
+        targets = losses.bellman(transition, later["value"][:, 0], settings.discount)
+        differences = sum(
+            (losses.of_action(now[name], taken) - targets) ** 2 for name in ("q1", "q2")
+        )
+        weights = jnp.exp(settings.inverse_temperature * jax.lax.stop_gradient(advantages))
+        likelihoods = losses.of_action(jax.nn.log_softmax(policy["logits"]), taken)
+        cloned = -jnp.minimum(weights, settings.largest_weight) * likelihoods
+
+        hits = jnp.argmax(policy["logits"], axis=1) == taken
+        return losses.mean_where(values + differences + cloned, known), {
+            "accuracy": losses.mean_where(hits, known),
+            "value": losses.mean_where(now["value"][:, 0], known),
+            "advantage": losses.mean_where(advantages, known),
+        }
+
+    init = learning.make_init(setup, module, _say, optimizer, target=_critic)
+    update = learning.make_update(
+        transition_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic),
+        setup.training.microbatch,
+    )  # fmt: skip
+    return Agent(init, learning.transition_batches(setup), update, energy)
+
+
+def _critic(params: Params) -> Params:
+    """The critic's own parameters, as its network has them."""
+    return {"params": params["params"]["critic"]}
+
+
+def _say(module: Networks, context: Context, actions: jax.Array) -> tuple[Said, Said]:
+    """Touches every parameter, to initialise them."""
+    del actions
+    return module(context)
+
+
+IQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)

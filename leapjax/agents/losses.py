@@ -1,0 +1,68 @@
+"""Losses that methods share: of one context, at its last P states."""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.models.policy import past_and_present
+from leapjax.types import Context, Transition
+
+
+def actions_taken(
+    context: Context, action: jax.Array, count: int, choices: int
+) -> tuple[jax.Array, jax.Array]:
+    """The action `[P]` that was taken at each of the last states, and where there was one.
+
+    Args:
+        context: of the current state.
+        action: `[]` what was done there.
+        count: P.
+        choices: as many actions as can be chosen; 0 stands where the episode had not begun.
+    """
+    taken = past_and_present(context.actions, action, count)
+    known = taken < choices
+    return jnp.where(known, taken, 0), known
+
+
+def last_actions(context: Context, count: int, choices: int) -> tuple[jax.Array, jax.Array]:
+    """The same for the context of a `Transition`: up to the step that was taken."""
+    return actions_taken(
+        context._replace(actions=context.actions[:-1]), context.actions[-1], count, choices
+    )
+
+
+def bellman(transition: Transition, values: jax.Array, discount: float) -> jax.Array:
+    """`[P]`: each reward, and the discounted value `[P]` of the state that it led to.
+
+    No gradient flows through it. Only a transition's last step can have come to an end.
+    """
+    rewards = transition.context.rewards[-values.shape[0] :]
+    goes_on = jnp.ones(values.shape[0]).at[-1].set(1.0 - transition.terminated)
+    return jax.lax.stop_gradient(rewards + discount * goes_on * values)
+
+
+def mean_where(values: jax.Array, known: jax.Array) -> jax.Array:
+    """The mean `[]` of values `[P]` where they are known, which is once at least."""
+    return jnp.where(known, values, 0).sum() / known.sum()
+
+
+def of_action(values: jax.Array, actions: jax.Array) -> jax.Array:
+    """Which of values `[P, choices]` belongs to actions `[P]`: `[P]`."""
+    return jnp.take_along_axis(values, actions[:, None], axis=1)[:, 0]
+
+
+def imitation(
+    logits: jax.Array, actions: jax.Array, known: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The cross-entropy `[]` of actions `[P]` under logits `[P, choices]`; and the accuracy."""
+    likelihoods = of_action(jax.nn.log_softmax(logits), actions)
+    hits = jnp.argmax(logits, axis=1) == actions
+    return -mean_where(likelihoods, known), mean_where(hits, known)
+
+
+def expectile(differences: jax.Array, share: float) -> jax.Array:
+    """Squared differences, target minus estimate, whose mean is least at their expectile.
+
+    Weighted by `share` where the target is above the estimate and by `1 - share` where it is
+    below (Kostrikov et al., Implicit Q-Learning, equation 5).
+    """
+    return jnp.where(differences > 0, share, 1 - share) * differences**2

@@ -1,0 +1,181 @@
+"""Methods that learn from rewards find what is best in data of which most is not."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax import batching, training
+from leapjax.agents import bc, bcq, dt, iql
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import GibbsConfig
+from tests import mixed, toy
+from tests.toy import LEFT, RIGHT
+
+MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql}
+QUICKLY = {"discount": 0.9, "target_rate": 0.1}
+SETTINGS = {
+    "bc": bc.Settings(), "dt": dt.Settings(),
+    "bcq": bcq.Settings(**QUICKLY),
+    # Advantages are small here: far from the middle a wrong step costs a tenth.
+    "iql": iql.Settings(**QUICKLY, inverse_temperature=30.0),
+}  # fmt: skip
+STEPS = 400
+
+
+@functools.cache
+def trained(name, architecture="leapjax", past=0):
+    """An agent after a moment of training on walks that go wrong more often than right."""
+    model = ModelConfig(architecture, layers=1, heads=1, width=32, dropout=0.0)
+    learn = TrainingConfig(
+        STEPS, batch=128, warmup=10, learning_rate=3e-3, weight_decay=0.0, windows="step"
+    )
+    setup = Setup(mixed.DOMAIN, past, 1, model, learn, SETTINGS[name])
+    agent = MODULES[name].make_agent(setup)
+    metrics = []
+    state = training.train(
+        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), mixed.steps(),
+        jax.random.key(1), STEPS, lambda done, state, means: metrics.append(means),
+    )  # fmt: skip
+    return agent, state, metrics
+
+
+def acts(agent, params, past=0):
+    """What it does first, from each place."""
+    planner = batching.compile_planner(agent.energy, GibbsConfig(1, 1, temperature=0.0))
+    keys = jax.random.split(jax.random.key(0), len(mixed.PLACES))
+    return np.asarray(planner(params, keys, mixed.contexts(past)).actions[:, 0])
+
+
+def memories(agent, params):
+    return jax.jit(jax.vmap(agent.energy.encode, (None, 0)))(params, mixed.contexts(0))
+
+
+def test_cloning_does_what_was_done_most_often():
+    agent, state, _ = trained("bc")
+    actions = acts(agent, state.params)
+    inner = np.abs(mixed.PLACES) < toy.FARTHEST
+    assert (actions != mixed.best_actions())[inner].all()
+
+
+@pytest.mark.parametrize("name", ["bcq", "iql"])
+@pytest.mark.parametrize(("architecture", "past"), [("leapjax", 0), ("paper", 2)])
+def test_the_best_policy_is_found(name, architecture, past):
+    agent, state, metrics = trained(name, architecture, past)
+    np.testing.assert_array_equal(acts(agent, state.params, past), mixed.best_actions())
+    assert all(np.isfinite(list(entry.values())).all() for entry in metrics)
+
+
+def test_bcq_values_are_those_of_value_iteration():
+    agent, state, _ = trained("bcq")
+    q = memories(agent, state.params)["q"][:, -1]  # [10, 3]
+    best = mixed.best_actions()
+    rows = np.arange(len(best))
+    away = np.where(best == LEFT, RIGHT, LEFT)
+    found = np.stack([q[rows, best], q[rows, away]], axis=1)
+    np.testing.assert_allclose(found, mixed.best_values(0.9), atol=0.1)
+
+
+def test_bcq_never_does_what_the_data_do_not_hold():
+    """However good its value may look."""
+    said = {
+        "behaviour": jnp.log(jnp.array([[0.6, 0.3, 0.1], [0.5, 0.5, 0.0]])),
+        "q": jnp.array([[1.0, 2.0, 9.0], [3.0, 4.0, 9.0]]),
+    }
+    np.testing.assert_array_equal(bcq.likely_values(said, 0.3), [[1, 2, -np.inf], [3, 4, -np.inf]])
+    np.testing.assert_array_equal(bcq.likely_values(said, 0.0), said["q"])
+    np.testing.assert_array_equal(
+        bcq.likely_values(said, 1.0), [[1, -np.inf, -np.inf], [3, 4, -np.inf]]
+    )
+    agent, state, _ = trained("bcq")
+    memory = memories(agent, state.params)
+    energies = jax.vmap(agent.energy.conditional, (None, 0, None, None))(
+        state.params, memory, jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32)
+    )
+    assert np.isposinf(energies[:, 0, [toy.WAIT, toy.END]]).all()
+
+
+def test_iql_values_lie_between_what_the_data_do_and_what_is_best():
+    _, state, _ = trained("iql")
+    critic = {"params": state.params["params"]["critic"]}
+    setup = Setup(
+        mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
+        TrainingConfig(), SETTINGS["iql"],
+    )  # fmt: skip
+    module = setup.policy(("value", 1), ("q1", 3), ("q2", 3))
+    said = jax.vmap(module.apply, (None, 0))(critic, mixed.contexts(0))
+    best = mixed.best_values(0.9)
+    value = np.asarray(said["value"])[:, 0, 0]
+    assert (value < best.max(axis=1) + 0.05).all() and (value > best.min(axis=1) - 0.15).all()
+    # Nearer to the middle is better, from both sides.
+    assert (np.diff(value[:5]) > 0).all() and (np.diff(value[5:]) < 0).all()
+
+
+@pytest.mark.parametrize("name", ["bcq", "iql"])
+def test_the_target_network_follows_slowly(name):
+    agent, state, _ = trained(name)
+    data = mixed.steps()
+    batch = jax.jit(agent.batch)(jax.random.key(5), data)
+    after, _ = jax.jit(agent.update)(state, batch, jax.random.key(6))
+    online = after.params if name == "bcq" else {"params": after.params["params"]["critic"]}
+    expected = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, state.extra, online)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), after.extra, expected
+    )
+    fresh = agent.init(jax.random.key(0))
+    begun = fresh.params if name == "bcq" else {"params": fresh.params["params"]["critic"]}
+    jax.tree.map(np.testing.assert_array_equal, fresh.extra, begun)
+
+
+def test_decision_transformer_does_what_leads_to_the_return_that_is_asked_for():
+    """Of walks that end well and walks that never do, it follows those that gave as much."""
+    model = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
+    learn = TrainingConfig(
+        600, batch=64, warmup=30, learning_rate=3e-3, weight_decay=0.0, windows="step"
+    )
+    rng = np.random.default_rng(0)
+    walks = [mixed.walk(rng, int(x), share, 6) for x in mixed.PLACES for share in (0.0, 1.0)]
+    data = jax.tree.map(jnp.asarray, mixed.windows.concatenate(walks))
+    agents = {
+        target: dt.make_agent(Setup(mixed.DOMAIN, 2, 1, model, learn, dt.Settings(target)))
+        for target in (1.0, 0.0)
+    }
+    state = training.train(
+        training.make_train_step(agents[1.0]), jax.jit(agents[1.0].init)(jax.random.key(0)), data,
+        jax.random.key(1), learn.steps, lambda done, state, means: None,
+    )  # fmt: skip
+    good, bad = (acts(agents[target], state.params, 2) for target in (1.0, 0.0))
+    np.testing.assert_array_equal(good, mixed.best_actions())
+    np.testing.assert_array_equal(bad, np.where(good == LEFT, RIGHT, LEFT))
+
+
+def test_returns_to_go_are_sums_of_what_is_to_come():
+    context = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
+    np.testing.assert_array_equal(dt.returns_to_go(context, jnp.float32(10)), [17, 16, 14, 10])
+
+
+@pytest.mark.parametrize("name", list(MODULES))
+def test_longer_plans_are_refused(name):
+    setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), SETTINGS[name])
+    with pytest.raises(UserError, match="--horizon 5: .* one action at a time"):
+        MODULES[name].make_agent(setup)
+
+
+@pytest.mark.parametrize(
+    ("settings", "options"),
+    [
+        (bcq.Settings, {"threshold": -0.1}), (bcq.Settings, {"discount": 1.1}),
+        (bcq.Settings, {"target_rate": float("nan")}), (iql.Settings, {"expectile": 2.0}),
+        (iql.Settings, {"inverse_temperature": -1.0}),
+        (iql.Settings, {"largest_weight": float("inf")}),
+        (dt.Settings, {"target_return": float("nan")}),
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_refused(settings, options):
+    (name,) = options
+    with pytest.raises(ValueError, match=name):
+        settings(**options)
