@@ -31,8 +31,8 @@ from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError, first_line
-from leapjax.pretrained import Pretrained, Specification
 from leapjax.methods import find_method
+from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
 from leapjax.training import TrainStep
 from leapjax.types import Agent, Demonstration, TrainState
