@@ -193,9 +193,11 @@ def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
         path = folder.absolute() / str(step)
         try:
             target = _sealed({"params": _blank(like)}, identity)
-            wanted = ("params", "identity")
+            wanted = ("params/", "digests/params/", "identity/")
             found = {
-                k: v for k, v in _saved_shapes(path).items() if set(wanted) & set(k.split("/")[:2])
+                place: shape
+                for place, shape in _saved_shapes(path).items()
+                if f"{place}/".startswith(wanted)  # what a target network holds is not asked for
             }
             _check_shapes(found, target, path)
             arguments = ocp.checkpoint_utils.construct_restore_args(target)

@@ -8,6 +8,7 @@ import leapjax as leap
 from experiments.common import experiment, results
 from experiments.common.experiment import Experiment
 from leapjax import domains, methods, rollouts
+from leapjax.data import storage
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from tests import frozen_lake
@@ -49,6 +50,38 @@ def test_the_floor_of_every_table(workplace):
     assert experiment.main(LAKE, arguments) == 0
     (row,) = results.read(workplace / "runs" / "lake.jsonl")
     assert (row["method"], row["demos"], row["train_steps"], row["params"]) == ("random", 0, 0, 0)
+
+
+def test_every_method_from_one_command_line(workplace, capsys):
+    arguments = [*TOY, "--steps", "2", "--method", "all"]
+    assert experiment.main(LAKE, arguments) == 0
+    rows = results.read(workplace / "runs" / "lake.jsonl")
+    assert [row["method"] for row in rows] == list(methods.METHODS)
+    for folder in (path for path in (workplace / "runs").iterdir() if path.is_dir()):
+        planner = leap.load(folder)
+        context = rollouts.History(np.zeros((), np.int64), 1, 5).context()
+        contexts = jax.tree.map(lambda leaf: leaf[None], context)
+        plan = planner(leap.plan_keys(0, np.zeros(1), np.zeros(1)), contexts)
+        assert plan.valid.all() and (plan.actions < 5).all()
+    # A planner that is trained already is of one method.
+    (folder,) = (workplace / "runs").glob("*-dt-*")
+    for others, message in (("all", "of one method"), ("bc", "method is dt, not bc")):
+        assert experiment.main(LAKE, [*arguments[:-1], others, "--checkpoint", str(folder)]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(workplace, capsys):
+    lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
+    collection = frozen_lake.collect(3, 0, lambda done: None)
+    for demonstration in collection.demonstrations:
+        demonstration.rewards[:] = 0
+    storage.save("mine/unrewarded-v0", collection, lake, "nothing is rewarded")
+    arguments = [*TOY, "--steps", "0", "--demonstrations", "mine/unrewarded-v0", "--method"]
+    for method in methods.METHODS:
+        refused = method in ("dt", "bcq", "iql")
+        assert experiment.main(LAKE, [*arguments, method]) == (2 if refused else 0), method
+        error = capsys.readouterr().err
+        assert ("holds no rewards" in error and error.count("\n") == 1) == refused
 
 
 def test_contexts_of_another_domain_are_refused():
