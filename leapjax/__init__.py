@@ -17,9 +17,11 @@ from leapjax.energy import (
 )
 from leapjax.errors import UserError
 from leapjax.planners import (
+    BeamConfig,
     CrossEntropyConfig,
     GibbsConfig,
     ShootingConfig,
+    beam_search,
     cross_entropy_method,
     gibbs,
     random_shooting,
@@ -31,6 +33,7 @@ from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainStat
 
 __all__ = [
     "Agent",
+    "BeamConfig",
     "CompiledPlanner",
     "Context",
     "CrossEntropyConfig",
@@ -44,6 +47,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "beam_search",
     "classifier",
     "compile_planner",
     "compose",

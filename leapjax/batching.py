@@ -159,7 +159,8 @@ def compile_planner(
 
     Args:
         energy: what to minimise.
-        config: of `gibbs`, `random_shooting` or `cross_entropy_method`, and which of them.
+        config: of `gibbs`, `random_shooting`, `cross_entropy_method` or `beam_search`, and which
+            of them.
         chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
             split over as many of the devices as divide it.
         devices: to plan on; all of this process, if not given.

@@ -72,12 +72,24 @@ class CrossEntropyConfig:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
 
 
+@dataclasses.dataclass(frozen=True)
+class BeamConfig:
+    """Beam search, from left to right: the best of the plans that began well."""
+
+    horizon: int = 5  # T
+    width: int = 10  # W, partial plans that are kept
+    score: bool = False  # also return the energy of the plan (T more passes)
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "horizon", "width")
+
+
 def undefined(energies: jax.Array) -> jax.Array:
     """Where an energy means nothing: NaN, or -inf, against which nothing can be weighed."""
     return jnp.isnan(energies) | jnp.isneginf(energies)
 
 
-PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig
+PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
 
 
 def gibbs(
@@ -232,6 +244,50 @@ def cross_entropy_method(
     return plan._replace(energy=energies[best]) if config.score else plan
 
 
+def beam_search(
+    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: BeamConfig
+) -> Plan:
+    """The plan of least summed conditional energy among the W that began best, T passes in all.
+
+    A position is chosen while those after it are still MASK. Where the conditionals are
+    `-log p(a_t | those before)`, as of an autoregressive model, the sum is the negative log
+    likelihood of the plan, and a width of A^(T - 1) finds the likeliest of all. Nothing is
+    drawn. The trace is the best beam after every pass; what is not chosen yet is MASK there.
+
+    Raises:
+        ValueError: the energy does not accept MASK, so that no plan can be begun.
+    """
+    del key
+    if not energy.accepts_mask:
+        raise ValueError(
+            "beam search begins plans that it ends later, and this energy scores complete plans "
+            "only (accepts_mask is False): use another planner"
+        )
+    memory = energy.encode(params, context)
+    actions = energy.num_actions
+
+    def extend(
+        carry: tuple[jax.Array, jax.Array], position: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        beams, sums = carry  # [W, T], [W]
+        each = jax.vmap(lambda beam: energy.conditional(params, memory, beam, position[None])[0])
+        energies = each(beams)  # [W, A]
+        least, chosen = jax.lax.top_k(-(sums[:, None] + energies).reshape(-1), config.width)
+        beams = beams[chosen // actions].at[:, position].set(chosen % actions)
+        return (beams, -least), (beams[0], undefined(energies).any())
+
+    blank = jnp.full((config.width, config.horizon), mask_token(actions), jnp.int32)
+    # One plan is blank, not W: the others would only repeat it.
+    sums = jnp.full(config.width, jnp.inf).at[0].set(0.0)
+    (beams, _), (trace, invalid) = jax.lax.scan(extend, (blank, sums), jnp.arange(config.horizon))
+    best = beams[0]
+    plan = Plan(best, trace, energy.violation(params, memory, best) <= 0, ~invalid.any())
+    if config.score:
+        found = energy.total(params, memory, best)
+        plan = plan._replace(energy=found, valid=plan.valid & ~undefined(found))
+    return plan
+
+
 def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
     """`(params, key, context) -> Plan`: the planner that a configuration belongs to.
 
@@ -242,6 +298,7 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
         GibbsConfig: gibbs,
         ShootingConfig: random_shooting,
         CrossEntropyConfig: cross_entropy_method,
+        BeamConfig: beam_search,
     }
     if type(config) not in planners:
         raise TypeError(f"no planner takes a {type(config).__name__}")

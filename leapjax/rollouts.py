@@ -172,9 +172,9 @@ def evaluate(
         planned += len(active)
         survivors = []
         for row, episode in enumerate(active):
-            over = actions[row, 0] == end
+            over = actions[row, 0] >= end
             for action in actions[row]:
-                if action == end:
+                if action >= end:  # or MASK, of a plan that is executed before it is complete
                     break
                 transition = adapters[episode].step(int(action))
                 histories[episode].advance(int(action), transition.observation, transition.reward)

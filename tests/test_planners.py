@@ -12,6 +12,7 @@ from leapjax.batching import NotANumber, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
 from leapjax.planners import (
     ORDERS,
+    BeamConfig,
     CrossEntropyConfig,
     GibbsConfig,
     ShootingConfig,
@@ -438,6 +439,66 @@ def test_cross_entropy_solves_an_additive_energy():
     assert (plan.actions == best).all(-1).mean() > 0.98
 
 
+# Beam search.
+
+
+def slow_beam_search(joint, width):
+    """The best beam after every position, with conditionals by counting."""
+    beams, trace = [(0.0, ())], []
+    for t in range(HORIZON):
+        longer = []
+        for energy, plan in beams:
+            tokens = np.array([*plan, *[ACTIONS] * (HORIZON - t)])
+            for action, p in enumerate(conditional_by_counting(joint, tokens, t)):
+                longer.append((energy - np.log(p), (*plan, action)))
+        beams = sorted(longer)[:width]
+        trace.append([*beams[0][1], *[ACTIONS] * (HORIZON - 1 - t)])
+    return np.array(trace)
+
+
+@pytest.mark.parametrize("width", [1, 2, 9, 40])
+def test_beam_search_against_a_slow_one(width):
+    """As wide as there are ways to begin, it finds the likeliest plan; narrower, it may not."""
+    found = []
+    for seed in range(6):
+        table = random_table(seed, HORIZON, ACTIONS)
+        joint = joint_probabilities(table)
+        plan = plans_of(ENUMERABLE, BeamConfig(HORIZON, width, score=True), table, chains=2)
+        np.testing.assert_array_equal(plan.trace[0], slow_beam_search(joint, width))
+        np.testing.assert_array_equal(plan.trace[0], plan.trace[1])  # nothing is drawn
+        np.testing.assert_array_equal(plan.actions, plan.trace[:, -1])
+        np.testing.assert_allclose(plan.energy, joint_energies(plan.actions, joint), rtol=1e-4)
+        assert plan.satisfied.all() and plan.valid.all()
+        found.append((plan.actions[0] == PLANS[joint.argmax()]).all())
+    if width in (1, ACTIONS ** (HORIZON - 1), 40):
+        assert all(found) == (width > 1)
+
+
+def test_beam_search_of_a_batch_is_a_loop_over_its_contexts():
+    config = BeamConfig(HORIZON, 2)
+    keys, contexts = batch_of(9)
+    plan = compile_planner(TILTED, config, (4,))(TABLE, keys, contexts)
+    for row, tilt in enumerate(contexts["tilt"][:9]):
+        joint = joint_probabilities(TABLE, tilt)
+        np.testing.assert_array_equal(plan.trace[row], slow_beam_search(joint, 2))
+
+
+def test_beam_search_obeys_a_constraint_where_its_beams_leave_a_choice():
+    likeliest = PLANS[JOINT.argmax()]
+    safe = constrain(
+        ENUMERABLE, lambda tilt, actions: jnp.where((actions == likeliest).all(), 9.0, 0.0)
+    )
+    plan = plans_of(safe, BeamConfig(HORIZON, 9), chains=1)
+    assert plan.satisfied.all()
+    second = PLANS[np.argsort(JOINT.reshape(-1))[-2]]
+    np.testing.assert_array_equal(plan.actions[0], second)
+
+
+def test_beam_search_needs_an_energy_of_plans_that_are_begun():
+    with pytest.raises(ValueError, match="accepts_mask is False"):
+        bind(FROM_TOTAL, BeamConfig(HORIZON))(TABLE, jax.random.key(0), NO_TILT)
+
+
 # Planning under constraints. Context: a tilt and a price for each action at each position.
 
 
@@ -845,6 +906,8 @@ def test_impossible_chunk_sizes_are_refused(chunk_sizes):
         (CrossEntropyConfig, {"candidates": 0}, "candidates must be at least 1"),
         (CrossEntropyConfig, {"elites": 0}, "elites must be at least 1"),
         (CrossEntropyConfig, {"candidates": 2, "elites": 3}, "3 elites out of 2 candidates"),
+        (BeamConfig, {"horizon": 0}, "horizon must be at least 1"),
+        (BeamConfig, {"width": 0}, "width must be at least 1"),
     ],
 )
 def test_impossible_configurations_are_refused(make, options, message):
