@@ -11,7 +11,7 @@ from experiments.common.config import configuration_hash, with_options
 from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
 from leapjax import scores
-from leapjax.babyai.levels import LEVELS
+from leapjax.babyai.levels import LEVELS, paper_success
 from leapjax.checkpoints import read_json
 from leapjax.files import read_text, write_text
 
@@ -48,10 +48,17 @@ SETTINGS = (
 )
 TITLES = " | ".join(setting.title for setting in SETTINGS)
 WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fields": 0})
+# The methods of the paper's table, beside the floor, with both presets.
+COMPARED = ("random", "bc", "bcq", "iql", "dt", "leap")
+BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
+BY_METHOD = {
+    preset: {method: Setting(method, preset, method) for method in COMPARED}
+    for preset in ("paper", "leapjax")
+}
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
-FIGURE = Path("docs/iterations.png")
+ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
 
 
 def main() -> int:
@@ -63,8 +70,9 @@ def rewrite() -> None:
     """Rewrites every table here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
-    iterated = success_by_iterations(results.read(Path("results/babyai.jsonl")))
-    plots.iterations_by_level(iterated, FIGURE)
+    rows = results.read(Path("results/babyai.jsonl"))
+    plots.iterations_by_level(success_by_iterations(rows), ITERATIONS_FIGURE)
+    plots.methods_by_level(success_by_method(rows), METHODS_FIGURE)
 
 
 def documents(root: Path) -> dict[Path, str]:
@@ -80,6 +88,8 @@ def documents(root: Path) -> dict[Path, str]:
         "parts": (parts, "training"),
         "steps": (steps, "babyai"),
         "iterations": (iterations, "babyai"),
+        "methods": (methods, "babyai"),
+        "acting": (acting, "babyai"),
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -105,8 +115,8 @@ def success(rows: Sequence[Row]) -> str:
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
     """
     lines = [
-        [level.name, f"{level.paper_success:.1f}%", *cells]
-        for level, cells in zip(LEVELS.values(), _by_setting(rows, _rate), strict=True)
+        [level, f"{paper_success(level)['leap']:.1f}%", *cells]
+        for level, cells in zip(LEVELS, _by_setting(rows, _rate), strict=True)
     ]
     return _table(f"level | paper | {TITLES}", lines)
 
@@ -142,7 +152,7 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 def is_used(row: Row) -> bool:
     """Whether a row of results/babyai.jsonl is in a table; one that is in none is stale."""
     changes = ({}, EARLIER, *({"iterations": n} for n in ITERATIONS))
-    settings = (*SETTINGS, *ITERATED)
+    settings = (*SETTINGS, *ITERATED, *(s for each in BY_METHOD.values() for s in each.values()))
     return any(setting.has(row, **change) for setting in settings for change in changes)
 
 
@@ -171,6 +181,69 @@ def iterations(rows: Sequence[Row]) -> str:
         for title, by_count in by_title.items()
     ]
     return _table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
+
+
+def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
+    """Rows by level, preset and method, of levels where there are some of a baseline."""
+    found = {}
+    for level in LEVELS:
+        mine = [row for row in rows if row["level"] == level]
+        by_preset = {
+            preset: {method: _of_setting(mine, setting) for method, setting in settings.items()}
+            for preset, settings in BY_METHOD.items()
+        }
+        if any(by_method[name] for by_method in by_preset.values() for name in BASELINES):
+            found[level] = by_preset
+    return found
+
+
+def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Success in percent by level, whose numbers they are ("paper" or a preset), and method."""
+    return {
+        level: {
+            "the paper": paper_success(level),
+            **{
+                f"preset {preset}": {name: _mean_rate(of) for name, of in by_method.items() if of}
+                for preset, by_method in by_preset.items()
+            },
+        }
+        for level, by_preset in rows_by_method(rows).items()
+    }
+
+
+def methods(rows: Sequence[Row]) -> str:
+    """Success rates of every method: the paper's, and those of both presets; the best in bold."""
+    found, lines = rows_by_method(rows), []
+    for level, by_whom in success_by_method(rows).items():
+        for whose, rates in by_whom.items():
+            best = max(rates.values(), default=None)
+            cells = []
+            for method in COMPARED:
+                if method not in rates:
+                    cells.append("-")
+                    continue
+                theirs = whose == "the paper"
+                preset = whose.removeprefix("preset ")
+                cell = f"{rates[method]:.1f}%" if theirs else _rate(found[level][preset][method])
+                cells.append(f"**{cell}**" if rates[method] == best else cell)
+            lines.append([level, whose, *cells])
+    return _table("level | | " + " | ".join(COMPARED), lines)
+
+
+def acting(rows: Sequence[Row]) -> str:
+    """What acting costs and gives, of every method with preset `leapjax`."""
+
+    def milliseconds(of: Sequence[Row]) -> float:
+        planning = sum(row["plans"] / row["plans_per_second"] for row in of)
+        return 1e3 * planning / sum(row["mean_length"] * row["episodes"] for row in of)
+
+    lines = [
+        [level, method, f"{_mean_rate(of):.1f}%", _mean_length(of), f"{milliseconds(of):.2f}"]
+        for level, by_preset in rows_by_method(rows).items()
+        for method, of in by_preset["leapjax"].items()
+        if of and method != "random"
+    ]
+    return _table("level | method | success | steps per episode | ms per action", lines)
 
 
 def speed(rows: Sequence[Row]) -> str:
@@ -253,9 +326,14 @@ def _rate(rows: Sequence[Row]) -> str:
     successes = [row["successes"] for row in rows]
     episodes = [row["episodes"] for row in rows]
     low, high = scores.interval_over_seeds(successes, episodes)
-    rate = f"{100 * sum(successes) / sum(episodes):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+    rate = f"{_mean_rate(rows):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
     earlier = " \\*" if rows[0]["first_episode_seed"] == EARLIER["test_seed"] else ""
     return f"{rate}, {len(rows)} seed{'s' if len(rows) > 1 else ''}{earlier}"
+
+
+def _mean_rate(rows: Sequence[Row]) -> float:
+    """Mean success of some rows, in percent."""
+    return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
 
 
 def _mean_length(rows: Sequence[Row]) -> str:

@@ -56,7 +56,7 @@ class Domain(NamedTuple):
     # (observations [n + 1, ...], where) -> UserError if a value is out of range
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
-    paper_score: float | None = None  # the paper's result, in percent
+    paper_success: Mapping[str, float] = {}  # the paper's results by method, in percent
 
     @property
     def num_actions(self) -> int:

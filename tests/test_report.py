@@ -54,6 +54,32 @@ def test_fresh_levels_go_before_those_of_development():
     assert cell.startswith("90.0% [") and cell.endswith(", 1 seed")
 
 
+def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
+    rows = [
+        row(rate=0.9), row(method="bc", rate=1.0), row(method="bc", seed=1, rate=0.9),
+        row(method="bc", name="paper", rate=0.2), row("PickUpLoc"),
+        row(method="dt", steps=1, rate=1.0),  # not the preset's
+    ]  # fmt: skip
+    lines = report.methods(rows).splitlines()[2:]
+    found = {line[2]: line[3:] for line in ([c.strip() for c in x.split("|")] for x in lines)}
+    assert list(found) == ["the paper", "preset paper", "preset leapjax"]  # of one level
+    assert found["the paper"][:-1] == ["-", "61.5%", "63.0%", "71.5%", "63.5%", "**95.0%**"]
+    assert found["preset leapjax"][1].startswith("**95.0% [")
+    assert found["preset leapjax"][5].startswith("90.0% [")
+    assert found["preset paper"][1].startswith("**20.0% [")
+    assert found["preset leapjax"][3:5] == ["-", "-"]
+    plots.methods_by_level(report.success_by_method(rows), tmp_path / "methods.png")
+    plots.methods_by_level({}, tmp_path / "empty.png")
+    assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
+
+
+def test_what_acting_costs():
+    # 500 episodes of 6 steps, a plan for each, 100 plans per second.
+    rows = [row(method="bc", rate=1.0) | {"plans": 3000, "plans_per_second": 100}]
+    (line,) = report.acting(rows).splitlines()[2:]
+    assert line == "| GoToLocalS8N7 | bc | 100.0% | 6.0 | 10.00 |"
+
+
 def test_settings_are_kept_apart():
     others = [
         row(name="paper", rate=0.8),

@@ -131,7 +131,7 @@ def run_one(
                 console.print(f"pictures: {folder}", highlight=False, markup=False)
 
         processes.first_does(write)
-    paper = f", paper {domain.paper_score}%" if domain.paper_score is not None else ""
+    paper = "" if row["paper_success"] is None else f", paper {row['paper_success']}%"
     console.print(f"success {results.percent(row)}, mean length {row['mean_length']:.1f}{paper}")
     return row
 
@@ -166,7 +166,7 @@ def make_row(
         "plans": episodes.plans,
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
-        "paper_success": this.domain.paper_score,
+        "paper_success": this.domain.paper_success.get(this.config.method),
         "date": results.today(),
         "hash": name,
         "configuration": resolved(config, this.seed),

@@ -84,6 +84,39 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
     _save(figure, path)
 
 
+def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) -> None:
+    """Success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
+
+    Args:
+        rates: in percent by level, whose numbers they are, and method.
+        path: to write.
+    """
+    columns = min(3, max(1, len(rates)))
+    lines = max(1, -(-len(rates) // columns))
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(4.5 * columns, 2.6 * lines), sharey=True, layout="constrained",
+        squeeze=False,
+    )  # fmt: skip
+    for axis, (level, by_whom) in zip(axes.flat, rates.items(), strict=False):
+        named = [name for by_method in by_whom.values() for name in by_method]
+        names = list(dict.fromkeys(reversed(named)))[::-1]  # as the last of them has it
+        width = 0.8 / len(by_whom)
+        for index, (whose, by_method) in enumerate(by_whom.items()):
+            places = [names.index(name) + width * (index + 0.5) - 0.4 for name in by_method]
+            axis.bar(places, by_method.values(), width, label=whose, color=f"C{index}")
+        axis.set_xticks(range(len(names)), names)
+        axis.set(ylim=(0, 102))
+        axis.set_title(level, fontsize=9)
+    for axis in axes.flat[len(rates) :]:
+        axis.set_axis_off()
+    for axis in axes[:, 0]:
+        axis.set_ylabel("success (%)")
+    if rates:
+        handles, labels = axes.flat[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    _save(figure, path)
+
+
 def _save(figure: Figure, path: Path) -> None:
     try:
         with files.whole(path) as scratch:

@@ -59,7 +59,7 @@ def make(name: str, options: Settings) -> Domain:
         check=functools.partial(check, level=level),
         shortest_limit=levels.shortest_limit(env),
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
-        paper_score=level.paper_success,
+        paper_success=levels.paper_success(level.name),
     )
 
 
