@@ -24,6 +24,7 @@ from leapjax import pretrained, rollouts
 from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
+from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.scores import wilson_interval
 
@@ -63,6 +64,8 @@ def run(options: Options) -> None:
     """Measures every setting."""
     runtime.start()
     specification = pretrained.read_specification(options.run)
+    if not isinstance(specification.planner, GibbsConfig):
+        raise UserError(f"{options.run}: {specification.method} does not plan by Gibbs sampling")
     paper = levels.find_level(specification.level).iterations
     configs = variants(specification.planner, paper)
     rows = [measure(options, name, config) for name, config in configs.items()]

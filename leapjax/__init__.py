@@ -7,6 +7,7 @@ energy; `compile_planner` makes it plan for any number of contexts at once.
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.domain import Domain
 from leapjax.energy import (
+    autoregressive,
     classifier,
     compose,
     constrain,
@@ -47,6 +48,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "autoregressive",
     "beam_search",
     "classifier",
     "compile_planner",

@@ -59,6 +59,39 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
     return Energy(encode, conditional, total, _checked(num_actions))
 
 
+def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Energy:
+    """The energy of a model that chooses actions from left to right.
+
+    `total` is the negative log-likelihood of the plan, and `conditional` one term of it: the
+    energy of an action given those before it, whatever comes after. `beam_search` is the planner
+    for it.
+
+    Args:
+        encode: (params, context) -> memory.
+        logits: (params, memory, tokens `[T]`, positions `[P]`) -> `[P, A]` unnormalised
+            log-probabilities, of which each depends on the tokens before its position alone;
+            -inf forbids an action.
+        num_actions: A, the end action included.
+    """
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        actions, positions = _check_query(actions, positions, num_actions)
+        scores = logits(params, memory, actions, positions)
+        chex.assert_shape(scores, (positions.shape[0], num_actions))
+        return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = jnp.asarray(actions)
+        energies = conditional(params, memory, actions, jnp.arange(actions.shape[0]))
+        chosen = jnp.minimum(actions, num_actions - 1)[:, None]
+        energy = jnp.take_along_axis(energies, chosen, axis=1).sum()
+        return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
+
+    return Energy(encode, conditional, total, _checked(num_actions))
+
+
 def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """An energy from its total alone: any function of a complete plan will do.
 

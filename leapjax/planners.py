@@ -77,11 +77,16 @@ class BeamConfig:
     """Beam search, from left to right: the best of the plans that began well."""
 
     horizon: int = 5  # T
-    width: int = 10  # W, partial plans that are kept
-    score: bool = False  # also return the energy of the plan (T more passes)
+    beams: int = 10  # W, partial plans that are kept
+    score: bool = False  # also return the energy of the plan
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "horizon", "width")
+        check_at_least(self, 1, "horizon", "beams")
+
+    @property
+    def iterations(self) -> int:
+        """Passes: each chooses one action of every plan."""
+        return self.horizon
 
 
 def undefined(energies: jax.Array) -> jax.Array:
@@ -251,7 +256,7 @@ def beam_search(
 
     A position is chosen while those after it are still MASK. Where the conditionals are
     `-log p(a_t | those before)`, as of an autoregressive model, the sum is the negative log
-    likelihood of the plan, and a width of A^(T - 1) finds the likeliest of all. Nothing is
+    likelihood of the plan, and A^(T - 1) beams find the likeliest of all. Nothing is
     drawn. The trace is the best beam after every pass; what is not chosen yet is MASK there.
 
     Raises:
@@ -272,13 +277,13 @@ def beam_search(
         beams, sums = carry  # [W, T], [W]
         each = jax.vmap(lambda beam: energy.conditional(params, memory, beam, position[None])[0])
         energies = each(beams)  # [W, A]
-        least, chosen = jax.lax.top_k(-(sums[:, None] + energies).reshape(-1), config.width)
+        least, chosen = jax.lax.top_k(-(sums[:, None] + energies).reshape(-1), config.beams)
         beams = beams[chosen // actions].at[:, position].set(chosen % actions)
         return (beams, -least), (beams[0], undefined(energies).any())
 
-    blank = jnp.full((config.width, config.horizon), mask_token(actions), jnp.int32)
+    blank = jnp.full((config.beams, config.horizon), mask_token(actions), jnp.int32)
     # One plan is blank, not W: the others would only repeat it.
-    sums = jnp.full(config.width, jnp.inf).at[0].set(0.0)
+    sums = jnp.full(config.beams, jnp.inf).at[0].set(0.0)
     (beams, _), (trace, invalid) = jax.lax.scan(extend, (blank, sums), jnp.arange(config.horizon))
     best = beams[0]
     plan = Plan(best, trace, energy.violation(params, memory, best) <= 0, ~invalid.any())

@@ -19,7 +19,7 @@ from leapjax.errors import UserError, check_at_least
 from leapjax.files import write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
-from leapjax.planners import GibbsConfig, PlannerConfig
+from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
@@ -49,7 +49,7 @@ class Specification:
     context: int  # K
     model: ModelConfig
     training: TrainingConfig
-    planner: GibbsConfig  # its horizon is the network's too
+    planner: GibbsConfig | BeamConfig  # its horizon is the network's too
     method_settings: Any
     domain_settings: Any
     signature: dict  # of the domain, when it was trained
@@ -121,9 +121,10 @@ def read_specification(folder: Path) -> Specification:
     try:
         if not isinstance(values, dict):
             raise UserError(f"a Specification must be a JSON object, got {type(values).__name__}")
+        method = find_method(str(values.get("method")))
         return checkpoints.from_json(
             Specification, values,
-            method_settings=find_method(str(values.get("method"))).settings,
+            method_settings=method.settings, planner=method.planner,
             domain_settings=find_domain(str(values.get("domain"))).settings,
         )  # fmt: skip
     except UserError as error:

@@ -47,7 +47,7 @@ class Window(NamedTuple):
     extras: PyTree  # what the domain's augmentation must know of this step; no model sees it
 
 
-class Transition(NamedTuple):
+class TransitionWindow(NamedTuple):
     """A step that was taken, and what came of it: for methods that learn from rewards."""
 
     context: Context  # after it, one step longer than a network's: it holds the step as its last

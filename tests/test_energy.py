@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from leapjax.energy import (
+    autoregressive,
     compose,
     constrain,
     from_total,
@@ -153,6 +154,31 @@ def test_pseudo_likelihood_total_is_a_loop_over_positions():
             energy -= pairwise_log_likelihood(masked, t)[plan[t]]
         expected.append(energy)
     np.testing.assert_allclose(totals(PAIRWISE, VOTES, BIAS), expected, rtol=1e-5)
+
+
+def test_an_autoregressive_energy_is_that_of_the_joint():
+    """Its total is the negative log-likelihood; its conditionals look only at what comes before."""
+    exact = enumerable_energy(HORIZON, ACTIONS)
+
+    def logits(params, memory, tokens, positions):
+        def at(position):
+            before = jnp.where(position > EVERYWHERE, tokens, MASK)
+            return -exact.conditional(params, memory, before, position[None])[0]
+
+        return jax.vmap(at)(positions) + 5.0  # up to a constant
+
+    energy = autoregressive(exact.encode, logits, ACTIONS)
+    table = random_table(0, HORIZON, ACTIONS)
+    joint = joint_probabilities(table)
+    found, totals, _ = evaluate(energy, table, NO_TILT, PLANS)
+    np.testing.assert_allclose(totals, -np.log(joint.reshape(-1)), rtol=1e-4)
+    for plan, energies in zip(PLANS, found, strict=True):
+        for t in range(HORIZON):
+            before = np.where(t > EVERYWHERE, plan, MASK)
+            expected = -np.log(conditional_by_counting(joint, before, t))
+            np.testing.assert_allclose(energies[t], expected, rtol=1e-3, atol=1e-4)
+    incomplete = np.array([[0, 1, MASK]])
+    assert np.isposinf(evaluate(energy, table, NO_TILT, incomplete)[1]).all()
 
 
 def test_pseudo_likelihood_conditional_masks_all_positions_together():

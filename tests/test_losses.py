@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 from leapjax.agents import losses
-from leapjax.types import Context, Transition
+from leapjax.types import Context, TransitionWindow
 
 CHOICES = 3
 
@@ -38,7 +38,7 @@ def test_actions_of_the_last_states_and_which_there_were():
 
 @pytest.mark.parametrize("terminated", [False, True])
 def test_bellman_targets(terminated):
-    transition = Transition(context([0, 1, 2], [5.0, 1.0, 2.0]), jnp.array(terminated))
+    transition = TransitionWindow(context([0, 1, 2], [5.0, 1.0, 2.0]), jnp.array(terminated))
     values = jnp.array([10.0, 20.0])
     expected = [1 + 0.5 * 10, 2 + 0.5 * 20 * (not terminated)]
     np.testing.assert_allclose(losses.bellman(transition, values, 0.5), expected)

@@ -907,7 +907,7 @@ def test_impossible_chunk_sizes_are_refused(chunk_sizes):
         (CrossEntropyConfig, {"elites": 0}, "elites must be at least 1"),
         (CrossEntropyConfig, {"candidates": 2, "elites": 3}, "3 elites out of 2 candidates"),
         (BeamConfig, {"horizon": 0}, "horizon must be at least 1"),
-        (BeamConfig, {"width": 0}, "width must be at least 1"),
+        (BeamConfig, {"beams": 0}, "beams must be at least 1"),
     ],
 )
 def test_impossible_configurations_are_refused(make, options, message):

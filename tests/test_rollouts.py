@@ -230,6 +230,22 @@ def test_the_plan_is_executed_as_it_stood_after_an_iteration(iteration):
     assert (differ > 0) == (iteration in (1, 2))
 
 
+def test_a_plan_that_is_begun_is_executed_as_far_as_it_goes():
+    """Of beam search every iteration chooses one action more; none of what is not chosen is done."""
+    weight = jnp.array([1.0, 0.0, jnp.inf])  # of LEFT, RIGHT and END: always to the right
+
+    def logits(params, memory, tokens, positions):
+        return jnp.tile(-weight, (positions.shape[0], 1))
+
+    energy = leap.autoregressive(lambda params, context: (), logits, NUM_ACTIONS)
+    plan = leap.compile_planner(energy, leap.BeamConfig(HORIZON, beams=2))
+    for iteration in range(1, HORIZON + 1):
+        Corridor.made = []
+        episodes = leap.evaluate(Corridor, [1], plan, None, context=0, iteration=iteration)
+        assert episodes.successes.all() and Corridor.made[0].taken == [RIGHT] * GOAL
+        assert episodes.plans == -(-GOAL // iteration)
+
+
 def test_finished_episodes_leave_the_batch():
     seeds = [0, 6, 3, 4]
     distances = [GOAL - start(seed) for seed in seeds]

@@ -197,6 +197,33 @@ def test_transitions_are_what_was_before_and_after_every_step(context):
             index += 1
 
 
+@pytest.mark.parametrize(("context", "horizon"), [(0, 1), (0, 4), (2, 3)])
+def test_unrolled_windows_hold_every_context_of_their_plan(context, horizon):
+    demonstrations = toy_demonstrations()
+    steps = on_device(laid_out(demonstrations))
+    find = jax.jit(lambda s, i: windows.unrolled_window(s, i, context, horizon, END))
+    index = 0
+    for demonstration in demonstrations:
+        n = len(demonstration.actions)
+        for start in range(n):
+            found = find(steps, index)
+            expected = slow_window(demonstration, start, context, horizon)
+            np.testing.assert_array_equal(found.actions, expected.actions)
+            np.testing.assert_array_equal(found.extras, expected.extras)
+            for place in range(horizon):
+                at = windows.context_at(found.context, place, context)
+                now = min(start + place, n)
+                state = jax.tree.map(lambda x, i=now: x[i], demonstration.observations)
+                assert_same_observation(at.observation, state)
+                assert at.step == start + place
+                assert at.actions.shape == (context,)
+                if start + place < n:
+                    same = slow_window(demonstration, now, context, 0).context
+                    assert_same_observation(at.past, same.past)
+                    np.testing.assert_array_equal(at.actions, same.actions)
+            index += 1
+
+
 def test_real_demonstrations_against_the_slow_window(local_demonstrations):
     steps = on_device(laid_out(local_demonstrations))
     index = 0

@@ -27,14 +27,16 @@ from leapjax.pretrained import GROUPS, Origin, Specification
 
 M = TypeVar("M")
 D = TypeVar("D")
+P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(Generic[M, D]):
+class Config(Generic[M, D, P]):
     """Train a method on demonstrations of a level, then measure its success."""
 
     method_settings: Annotated[M, tyro.conf.arg(name="")]
     domain_settings: Annotated[D, tyro.conf.arg(name="")]
+    planner: Annotated[P, tyro.conf.arg(name="")]
     domain: Annotated[str, tyro.conf.Suppress]
     level: str
     """A level of the domain by its name or id, or "all" for those of the paper."""
@@ -74,7 +76,6 @@ class Config(Generic[M, D]):
     """Save the training state this often: what a killed run can lose at most."""
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
-    planner: Annotated[GibbsConfig, tyro.conf.arg(name="")] = GibbsConfig()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
 
 
@@ -85,17 +86,18 @@ _NOT_HASHED = (
 )  # fmt: skip
 
 
-def blank(domain: str, level: str, method: str) -> Config[Any, Any]:
+def blank(domain: str, level: str, method: str) -> Config[Any, Any, Any]:
     """The defaults of every option, before any preset.
 
     Raises:
         UserError: an unknown domain or method.
     """
-    settings = find_method(method).settings(), find_domain(domain).settings()
+    chosen = find_method(method)
+    settings = chosen.settings(), find_domain(domain).settings(), chosen.planner()
     return Config(*settings, domain, level, method)
 
 
-def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any]:
+def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any, Any]:
     """The defaults of a preset: the level's, then the method's, then the level's for the method.
 
     Raises:
@@ -106,22 +108,30 @@ def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any]:
     if name not in presets:
         raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
     options = {**kind.preset(level, name), **presets[name], **kind.tuned(level, method, name)}
-    return with_options(config, options)
+    # A level says how Gibbs sampling searches; other planners know less.
+    others = _names(GibbsConfig()) - _names(config.planner)
+    return with_options(config, {k: v for k, v in options.items() if k not in others})
 
 
-def with_options(config: Config[Any, Any], options: Mapping[str, Any]) -> Config[Any, Any]:
+def _names(settings: Any) -> set[str]:
+    return {field.name for field in dataclasses.fields(settings)}
+
+
+def with_options(
+    config: Config[Any, Any, Any], options: Mapping[str, Any]
+) -> Config[Any, Any, Any]:
     """A configuration with some options changed, by the names that the command line has."""
     changed: dict[str, Any] = {}
     for group in GROUPS:
         part = getattr(config, group)
-        names = {field.name for field in dataclasses.fields(part)}
+        names = _names(part)
         mine = {name: value for name, value in options.items() if name in names}
         changed[group] = dataclasses.replace(part, **mine)
         options = {name: value for name, value in options.items() if name not in names}
     return dataclasses.replace(config, **changed, **options)
 
 
-def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
+def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any, Any]]:
     """One configuration per level and method from a command line; exits with 2 if it is bad.
 
     Raises:
@@ -159,7 +169,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any]]:
     return configs
 
 
-def _as_trained(default: Config[Any, Any], trained: Specification) -> Config[Any, Any]:
+def _as_trained(default: Config[Any, Any, Any], trained: Specification) -> Config[Any, Any, Any]:
     """Defaults that are what an earlier run has."""
     return dataclasses.replace(
         default,
@@ -171,9 +181,10 @@ def _as_trained(default: Config[Any, Any], trained: Specification) -> Config[Any
     )
 
 
-def _parse(arguments: Sequence[str], default: Config[Any, Any]) -> Config[Any, Any]:
+def _parse(arguments: Sequence[str], default: Config[Any, Any, Any]) -> Config[Any, Any, Any]:
     # Which options there are depends on the method and the domain.
-    settings = type(default.method_settings), type(default.domain_settings)
+    groups = ("method_settings", "domain_settings", "planner")
+    settings = tuple(type(getattr(default, group)) for group in groups)
     generic: Any = Config
     kind = generic[settings]
     try:
@@ -182,7 +193,7 @@ def _parse(arguments: Sequence[str], default: Config[Any, Any]) -> Config[Any, A
         raise UserError(str(error)) from None
 
 
-def check(config: Config[Any, Any]) -> None:
+def check(config: Config[Any, Any, Any]) -> None:
     """Refuses what cannot work before any long work starts.
 
     Raises:
@@ -216,7 +227,7 @@ def check(config: Config[Any, Any]) -> None:
     check_memory(config, domain)
 
 
-def check_memory(config: Config[Any, Any], domain: Domain) -> None:
+def check_memory(config: Config[Any, Any, Any], domain: Domain) -> None:
     """Refuses what would need more memory than the machine has, by what it needs at least.
 
     Raises:
@@ -227,14 +238,18 @@ def check_memory(config: Config[Any, Any], domain: Domain) -> None:
     model, search = config.model, config.planner
     context = sum(leaf.nbytes for leaf in jax.tree.leaves(blank_context(domain, config.context)))
     activations = 4 * 12 * model.layers * model.width * search.horizon
-    drawn = search.resampled * domain.num_actions + search.horizon
     needs = {
-        # Noise and trace of a chunk of 128 plans, in 4 bytes each.
-        "--iterations, --restarts": 4 * 128 * search.restarts * search.iterations * drawn,
         "--batch, --context": config.training.batch * (context + activations),
         # Parameters of the transformer, their gradients and Adam's two moments.
         "--width, --layers": 4 * 4 * 12 * model.layers * model.width**2,
     }
+    # Noise and trace of a chunk of 128 plans, in 4 bytes each; or the beams and their energies.
+    if isinstance(search, GibbsConfig):
+        drawn = search.resampled * domain.num_actions + search.horizon
+        noise = 4 * 128 * search.restarts * search.iterations * drawn
+        needs["--iterations, --restarts"] = noise
+    else:
+        needs["--beams"] = 4 * 128 * search.beams * (search.horizon + domain.num_actions)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for options, needed in needs.items():
         if needed > memory:
@@ -244,12 +259,12 @@ def check_memory(config: Config[Any, Any], domain: Domain) -> None:
             )
 
 
-def make_domain(config: Config[Any, Any]) -> Domain:
+def make_domain(config: Config[Any, Any, Any]) -> Domain:
     """The level of a configuration."""
     return find_domain(config.domain).make(config.level, config.domain_settings)
 
 
-def specify(config: Config[Any, Any], seed: int, domain: Domain) -> Specification:
+def specify(config: Config[Any, Any, Any], seed: int, domain: Domain) -> Specification:
     """What a run leaves beside its parameters."""
     return Specification(
         config.domain, config.level, config.method, config.context,
@@ -280,7 +295,7 @@ def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
 
 
-def episode_seeds(config: Config[Any, Any]) -> range:
+def episode_seeds(config: Config[Any, Any, Any]) -> range:
     """The level seeds of the episodes that success is measured on.
 
     Raises:
@@ -290,13 +305,13 @@ def episode_seeds(config: Config[Any, Any]) -> range:
     return first(config.test_seed, config.episodes)
 
 
-def resolved(config: Config[Any, Any], seed: int) -> dict[str, Any]:
+def resolved(config: Config[Any, Any, Any], seed: int) -> dict[str, Any]:
     """All settings that one seed's result depends on, as JSON values."""
     values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
     return json.loads(json.dumps({**values, "seed": seed}))
 
 
-def configuration_hash(config: Config[Any, Any], seed: int) -> str:
+def configuration_hash(config: Config[Any, Any, Any], seed: int) -> str:
     """Twelve hexadecimal digits that name a configuration.
 
     They are those of domain, level, method and what differs from the defaults alone, so that a

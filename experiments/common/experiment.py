@@ -76,7 +76,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
 
 def run_one(
     experiment: Experiment,
-    config: Config[Any, Any],
+    config: Config[Any, Any, Any],
     seed: int,
     versions: dict[str, str],
     console: Console,

@@ -47,7 +47,7 @@ CHUNK_SIZES = (32,)
 class Run:
     """What every step of a run needs."""
 
-    config: Config[Any, Any]
+    config: Config[Any, Any, Any]
     domain: Domain
     specification: Specification
     folder: Path
@@ -229,7 +229,7 @@ def fit(
     return Pretrained(run.specification, agent.energy, params, plan), metrics
 
 
-def training_mesh(config: Config[Any, Any]) -> Mesh:
+def training_mesh(config: Config[Any, Any, Any]) -> Mesh:
     """The devices that a run trains on, those of all processes included.
 
     Raises:

@@ -17,7 +17,7 @@ from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.data import windows
 from leapjax.energy import single_action
 from leapjax.models.policy import PolicyModel, Said
-from leapjax.types import Agent, Context, Params, PyTree, Transition
+from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     )
 
     def transition_loss(
-        params: Params, target: PyTree, transition: Transition, key: jax.Array
+        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context

@@ -18,7 +18,7 @@ from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.data import windows
 from leapjax.energy import single_action
 from leapjax.models.policy import PolicyModel, Said
-from leapjax.types import Agent, Context, Params, PyTree, Transition
+from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     )
 
     def transition_loss(
-        params: Params, target: PyTree, transition: Transition, key: jax.Array
+        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
         context = transition.context

@@ -19,6 +19,7 @@ from leapjax.domain import Domain, blank_context, check_context
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
+from leapjax.planners import GibbsConfig
 from leapjax.types import (
     Agent,
     Context,
@@ -26,7 +27,7 @@ from leapjax.types import (
     Params,
     PyTree,
     TrainState,
-    Transition,
+    TransitionWindow,
     Window,
 )
 
@@ -129,6 +130,7 @@ class Method(NamedTuple):
     # mesh: of devices to train on (see leapjax.sharding); None for one device
     presets: Presets  # whatever the level; what that asks for is in its domain's presets
     rewards: bool = False  # it learns from them: data without any are refused
+    planner: type = GibbsConfig  # the settings of how it searches
 
 
 ExampleLoss = Callable[[Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
@@ -301,16 +303,29 @@ def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
     return batch
 
 
-def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], Transition]:
+def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
     """An agent's `batch` of transitions `[B, ...]`, augmented as the domain says."""
 
     def window(steps: Steps, index: jax.Array) -> Window:
         end = setup.domain.num_actions - 1
         return windows.transition_window(steps, index, setup.context, end)
 
-    def batch(key: jax.Array, steps: Steps) -> Transition:
+    def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
         drawn, indices = _draw(setup, window, key, steps)
-        return Transition(drawn.context, steps.terminated[indices])
+        return TransitionWindow(drawn.context, steps.terminated[indices])
+
+    return batch
+
+
+def unrolled_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of windows `[B, ...]` that hold their future, augmented likewise."""
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.unrolled_window(steps, index, setup.context, setup.horizon, end)
+
+    def batch(key: jax.Array, steps: Steps) -> Window:
+        return _draw(setup, window, key, steps)[0]
 
     return batch
 

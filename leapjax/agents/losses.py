@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.models.policy import past_and_present
-from leapjax.types import Context, Transition
+from leapjax.types import Context, TransitionWindow
 
 
 def actions_taken(
@@ -24,13 +24,13 @@ def actions_taken(
 
 
 def last_actions(context: Context, count: int, choices: int) -> tuple[jax.Array, jax.Array]:
-    """The same for the context of a `Transition`: up to the step that was taken."""
+    """The same for the context of a `TransitionWindow`: up to the step that was taken."""
     return actions_taken(
         context._replace(actions=context.actions[:-1]), context.actions[-1], count, choices
     )
 
 
-def bellman(transition: Transition, values: jax.Array, discount: float) -> jax.Array:
+def bellman(transition: TransitionWindow, values: jax.Array, discount: float) -> jax.Array:
     """`[P]`: each reward, and the discounted value `[P]` of the state that it led to.
 
     No gradient flows through it. Only a transition's last step can have come to an end.

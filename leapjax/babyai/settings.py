@@ -58,7 +58,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
-    if preset == "paper" and method not in ("leap", "classifier", "random"):
+    if preset == "paper" and method not in ("leap", "classifier", "plate", "random"):
         return {"context": level.states - 1}  # the past ones
     if (method, preset) != ("leap", "leapjax"):
         return {}

@@ -125,7 +125,7 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
 def transition_window(steps: Steps, index: jax.Array, context: int, end: int) -> Window:
     """What is known after step `index []`, as a window of K + 1 past steps and no actions.
 
-    So whatever can be done to a window can be done to a transition; see `Transition`.
+    So whatever can be done to a window can be done to a transition; see `TransitionWindow`.
 
     Args:
         steps: the data.
@@ -135,6 +135,55 @@ def transition_window(steps: Steps, index: jax.Array, context: int, end: int) ->
     """
     start = window(steps, index, context, 0, end)  # what augmentations must know is of its start
     return start._replace(context=_context(steps, index, context + 1, end, after=1))
+
+
+def unrolled_window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
+    """A window whose context goes on to the last state that its plan acts in.
+
+    The context has K + T - 1 past steps: up to step `index []`, the K of a window, then those of
+    the plan but its last. Past the end of the demonstration there is its last state, and `end`.
+    So whatever can be done to a window can be done to its future; see `context_at`.
+
+    Args:
+        steps: the data.
+        index: of the current step, in 0 .. M - 1.
+        context: K.
+        horizon: T.
+        end: the end action, `A - 1`.
+    """
+    start = window(steps, index, context, horizon, end)
+    ahead = jnp.minimum(jnp.arange(horizon), steps.remaining[index])
+    states = jax.tree.map(lambda x: x[steps.state[index] + ahead], steps.observations)
+    past = start.context.past
+    return start._replace(
+        context=start.context._replace(
+            observation=_at(states, -1),
+            past=jax.tree.map(lambda a, b: jnp.concatenate([a, b[:-1]]), past, states),
+            actions=jnp.concatenate([start.context.actions, start.actions[:-1]]),
+            rewards=jnp.concatenate([start.context.rewards, jnp.zeros(horizon - 1)]),
+        )
+    )
+
+
+def context_at(unrolled: Context, place: int, context: int) -> Context:
+    """The context of an unrolled window as it is after `place` steps of its plan.
+
+    Args:
+        unrolled: K + T - 1 past steps.
+        place: 0 .. T - 1.
+        context: K.
+    """
+    states = jax.tree.map(
+        lambda a, b: jnp.concatenate([a, b[None]]), unrolled.past, unrolled.observation
+    )
+    now = place + context
+    return unrolled._replace(
+        observation=_at(states, now),
+        past=jax.tree.map(lambda x: x[place:now], states),
+        actions=unrolled.actions[place:now],
+        rewards=unrolled.rewards[place:now],
+        step=unrolled.step + place,
+    )
 
 
 def before(context: Context) -> Context:

@@ -60,7 +60,7 @@ class PolicyModel(nn.Module):
         return self._say(self.encoder(context), context, deterministic, returns)
 
     def transition(self, context: Context, deterministic: bool = True) -> tuple[Said, Said]:
-        """What is said before and after the step of a `Transition`, of its context."""
+        """What is said before and after the step of a `TransitionWindow`, of its context."""
         earlier, later = windows.before(context), windows.after(context)
         if self.config.architecture != "paper":
             return self(earlier, deterministic), self(later, deterministic)

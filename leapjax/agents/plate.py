@@ -1,0 +1,95 @@
+"""PlaTe (Sun et al., 2021): states and actions are predicted in turn; plans by beam search."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from leapjax.agents import learning, losses
+from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.energy import autoregressive
+from leapjax.models.alternating import AlternatingModel
+from leapjax.planners import BeamConfig
+from leapjax.types import Agent, Context, Params, PyTree, Window
+
+PRESETS: Presets = {
+    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode"},
+    "leapjax": {
+        "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
+    },
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The options of PlaTe alone."""
+
+    state_weight: float = 1.0  # of the states' loss beside the actions'
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.state_weight < float("inf"):  # false for NaN too
+            raise ValueError(f"state_weight must be at least 0, got {self.state_weight}")
+
+
+def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
+    """PlaTe as an `Agent`; its energy is the negative log-likelihood of a plan."""
+    sizes, last = setup.sizes, setup.domain.num_actions - 1  # the end action
+    module = AlternatingModel(setup.model, sizes, setup.encoder())
+    optimizer = learning.make_optimizer(setup.training)
+
+    def encode(params: Params, context: Context) -> PyTree:
+        return module.apply(params, context, method="encode")
+
+    def logits(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        result = module.apply(params, memory, actions, positions, method="logits")
+        assert isinstance(result, jax.Array)
+        return result
+
+    energy = autoregressive(learning.context_encoder(encode, setup), logits, sizes.num_actions)
+
+    def window_loss(
+        params: Params, extra: PyTree, window: Window, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Cross-entropy of the actions; squared error of the states that they lead to."""
+        del extra
+        states, actions = _encoded(module, params, window.context)
+        found: Any = module.apply(
+            params, states, actions, deterministic=False, rngs={"dropout": key}, method="read"
+        )
+        chosen, led = found
+        # Up to the first end: past it nothing is chosen.
+        ended = jnp.cumsum(window.actions == last) - (window.actions == last)
+        cloning, accuracy = losses.imitation(chosen, window.actions, ended == 0)
+        acted = (window.actions < last)[:-1]
+        targets = jax.lax.stop_gradient(states[-led.shape[0] :]) if led.shape[0] else led
+        errors = ((led - targets) ** 2).mean(axis=1)
+        error = jnp.where(acted, errors, 0).sum() / jnp.maximum(acted.sum(), 1)
+        loss = cloning + setup.settings.state_weight * error
+        return loss, {"accuracy": accuracy, "state_error": error}
+
+    update = learning.make_update(
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
+    )
+    init = learning.make_init(setup, module, _encode_and_score, optimizer)
+    return Agent(init, learning.unrolled_batches(setup), update, energy)
+
+
+def _encoded(
+    module: AlternatingModel, params: Params, context: Context
+) -> tuple[jax.Array, jax.Array]:
+    found: Any = module.apply(params, context, method="encode_unrolled")
+    return found
+
+
+def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.Array) -> PyTree:
+    """Touches every parameter, to initialise them."""
+    states, before = module.encode(context)
+    plan = jnp.concatenate([states, jnp.zeros((actions.shape[0] - 1, states.shape[1]))])
+    return module.read(plan, jnp.concatenate([before, actions[:-1]]))
+
+
+PLATE = Method(Settings, make_agent, PRESETS, planner=BeamConfig)

@@ -1,0 +1,116 @@
+"""PlaTe predicts states and actions in turn, and finds plans by beam search."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax import training
+from leapjax.agents import plate
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.batching import compile_planner
+from leapjax.data import windows
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import BeamConfig
+from tests import mixed, toy
+
+HORIZON = 4
+EACH_ARCHITECTURE = pytest.mark.parametrize(
+    ("architecture", "past"), [("leapjax", 0), ("leapjax", 1), ("paper", 2)]
+)
+
+
+def setup_of(architecture, past, steps=1):
+    model = ModelConfig(architecture, layers=1, heads=2, width=32, dropout=0.0)
+    learn = TrainingConfig(
+        steps, batch=64, warmup=20, learning_rate=3e-3, weight_decay=0.0, windows="step"
+    )
+    return Setup(mixed.DOMAIN, past, HORIZON, model, learn, plate.Settings())
+
+
+def data():
+    return jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
+
+
+@functools.cache
+def untrained(architecture, past):
+    """An agent, parameters that are all random, and windows."""
+    agent = plate.make_agent(setup_of(architecture, past))
+    leaves, structure = jax.tree.flatten(agent.init(jax.random.key(0)).params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    noise = [0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
+    return agent, jax.tree.unflatten(structure, noise), agent.batch(jax.random.key(2), data())
+
+
+@EACH_ARCHITECTURE
+def test_an_action_depends_on_those_before_it_alone(architecture, past):
+    agent, params, batch = untrained(architecture, past)
+    context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, past)
+    everywhere = jnp.arange(HORIZON)
+    memory = agent.energy.encode(params, context)
+    energies = jax.jit(agent.energy.conditional)
+    plan = jnp.zeros(HORIZON, jnp.int32)
+    before = np.asarray(energies(params, memory, plan, everywhere))
+    for changed in range(HORIZON):
+        after = energies(params, memory, plan.at[changed].set(1), everywhere)
+        with np.errstate(invalid="ignore"):
+            differs = np.nanmax(np.abs(np.asarray(after) - before), axis=1) > 1e-4
+        assert differs.tolist() == [place > changed for place in range(HORIZON)]
+    # One at a time as all together, although fewer states are then predicted.
+    for place in range(HORIZON):
+        (alone,) = energies(params, memory, plan, jnp.array([place]))
+        np.testing.assert_allclose(alone, before[place], rtol=1e-4, atol=1e-4)
+    assert np.isposinf(before[0, toy.END])
+
+
+@EACH_ARCHITECTURE
+def test_the_future_is_encoded_as_the_present_is(architecture, past):
+    """State by state: what is predicted is what would be seen."""
+    agent, params, batch = untrained(architecture, past)
+    module = plate.AlternatingModel(
+        setup_of(architecture, past).model, setup_of(architecture, past).sizes,
+        setup_of(architecture, past).encoder(),
+    )  # fmt: skip
+    unrolled = jax.tree.map(lambda x: x[1], batch.context)
+    states, actions = module.apply(params, unrolled, method="encode_unrolled")
+    shown = past if architecture == "paper" else 0
+    assert states.shape[0] == shown + HORIZON and actions.shape == (shown + HORIZON - 1,)
+    for place in range(HORIZON):
+        context = windows.context_at(unrolled, place, past)
+        seen, before = agent.energy.encode(params, context)
+        np.testing.assert_allclose(seen[-1], states[shown + place], rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(before, actions[place : place + shown])
+
+
+@pytest.fixture(scope="module")
+def trained():
+    setup = setup_of("leapjax", 0, steps=300)
+    agent = plate.make_agent(setup)
+    metrics = []
+    state = training.train(
+        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), data(),
+        jax.random.key(1), setup.training.steps, lambda done, s, means: metrics.append(means),
+    )  # fmt: skip
+    return agent, state.params, metrics
+
+
+def test_plans_are_the_demonstrators_ways(trained):
+    agent, params, metrics = trained
+    assert metrics[-1]["accuracy"] == 1 and metrics[-1]["state_error"] < 0.02
+    keys = jax.random.split(jax.random.key(0), len(mixed.PLACES))
+    planner = compile_planner(agent.energy, BeamConfig(HORIZON, beams=3, score=True))
+    plans = planner(params, keys, mixed.contexts(0))
+    for place, plan, energy in zip(mixed.PLACES, plans.actions, plans.energy, strict=True):
+        steps = min(abs(place), HORIZON)
+        assert plan[:steps].tolist() == [mixed.towards(place)] * steps
+        if steps < HORIZON:
+            assert plan[steps] == toy.END
+            continue
+        assert energy < 0.1  # a likelihood near 1
+
+
+def test_settings_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="state_weight must be at least 0"):
+        plate.Settings(state_weight=-1.0)
