@@ -231,7 +231,7 @@ def test_the_plan_is_executed_as_it_stood_after_an_iteration(iteration):
 
 
 def test_a_plan_that_is_begun_is_executed_as_far_as_it_goes():
-    """Of beam search every iteration chooses one action more; none of what is not chosen is done."""
+    """Every iteration of beam search chooses one action more; what is not chosen is not done."""
     weight = jnp.array([1.0, 0.0, jnp.inf])  # of LEFT, RIGHT and END: always to the right
 
     def logits(params, memory, tokens, positions):
