@@ -11,6 +11,7 @@ import pytest
 
 from leapjax import schedules, sharding, training
 from leapjax.agents import leap, learning
+from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.domain import BABYAI
@@ -90,7 +91,7 @@ def recording_agent() -> Agent:
         metrics = {"loss": jnp.zeros(()), "batch": batch, "key": jax.random.key_data(key)}
         return TrainState(params, (), state.step + 1), metrics
 
-    return Agent(init, learning.window_batches(setup()), update, None)
+    return Agent(init, window_batches(setup()), update, None)
 
 
 def test_batch_k_is_a_function_of_the_key_and_k(data):
@@ -142,7 +143,7 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
 
     def draw(*augmentations):
         domain = toy.DOMAIN._replace(augmentations=augmentations)
-        return jax.jit(learning.window_batches(setup(domain)))(jax.random.key(0), data)
+        return jax.jit(window_batches(setup(domain)))(jax.random.key(0), data)
 
     first, second = draw(doubled, shifted), draw(shifted, doubled)
     original = (second.actions - 1) // 2
@@ -216,7 +217,7 @@ def test_without_an_end_action_no_plan_ends():
 def entropy_of_positions(data) -> float:
     """The least loss of a model that looks at nothing but the position in the plan."""
     many = dataclasses.replace(TRAINING, batch=1000)
-    draw = jax.jit(learning.window_batches(setup(LEVEL, training=many)))
+    draw = jax.jit(window_batches(setup(LEVEL, training=many)))
     actions = np.asarray(draw(jax.random.key(0), data).actions)
     shares = np.stack([(actions == action).mean(axis=0) for action in range(NUM_ACTIONS)])
     return float(-(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=0).mean())

@@ -13,9 +13,9 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
+from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.data import windows
-from leapjax.energy import single_action
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
@@ -39,16 +39,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     module = setup.policy(("q", choices), ("behaviour", choices))
     optimizer = learning.make_optimizer(setup.training)
 
-    def encode(params: Params, context: Context) -> PyTree:
+    def say(params: Params, context: Context) -> PyTree:
         return module.apply(params, context)
 
-    def scores(params: Params, memory: PyTree) -> jax.Array:
-        del params
-        return likely_values(memory, settings.threshold)[-1]
-
-    energy = single_action(
-        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
-    )
+    def likely(said: Said) -> jax.Array:
+        return likely_values(said, settings.threshold)
 
     def transition_loss(
         params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
@@ -58,7 +53,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         now, later = _both(module, params, context, key)
         held: Any = module.apply(target, windows.after(context))
         # Chosen by the one network and valued by the other, as in double Q-learning.
-        best = jnp.argmax(likely_values(later, settings.threshold), axis=1)
+        best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]
         taken, known = losses.last_actions(context, len(values), choices)
         targets = losses.bellman(transition, values, settings.discount)
@@ -74,7 +69,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
         setup.training.microbatch,
     )  # fmt: skip
-    return Agent(init, learning.transition_batches(setup), update, energy)
+    energy = learning.acting_energy(setup, say, likely)
+    return Agent(init, transition_batches(setup), update, energy)
 
 
 def likely_values(said: Said, threshold: float) -> jax.Array:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import learning
+from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
@@ -57,7 +58,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
     update = learning.make_update(window_loss, optimizer, mesh)
     init = learning.make_init(setup, module, _encode_and_judge, optimizer)
-    return Agent(init, learning.window_batches(setup), update, energy)
+    return Agent(init, window_batches(setup), update, energy)
 
 
 def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:

@@ -7,8 +7,8 @@ import jax
 from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
+from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup
-from leapjax.energy import single_action
 from leapjax.models.policy import PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -33,16 +33,8 @@ def make_imitator(
     def wanted(context: Context, return_to_go: jax.Array | None = None) -> jax.Array | None:
         return None if returns is None else returns(context, return_to_go)
 
-    def encode(params: Params, context: Context) -> PyTree:
+    def say(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, returns=wanted(context))
-
-    def scores(params: Params, memory: PyTree) -> jax.Array:
-        del params
-        return memory["logits"][-1]
-
-    energy = single_action(
-        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
-    )
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, key: jax.Array
@@ -66,4 +58,5 @@ def make_imitator(
         window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
     init = learning.make_init(setup, module, touch, optimizer)
-    return Agent(init, learning.window_batches(setup), update, energy)
+    energy = learning.acting_energy(setup, say)
+    return Agent(init, window_batches(setup), update, energy)

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
+from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.data import windows
-from leapjax.energy import single_action
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
@@ -64,16 +64,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     module = Networks(setup.policy(("logits", choices)), critic)
     optimizer = learning.make_optimizer(setup.training)
 
-    def encode(params: Params, context: Context) -> PyTree:
+    def say(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="act")
-
-    def scores(params: Params, memory: PyTree) -> jax.Array:
-        del params
-        return memory["logits"][-1]
-
-    energy = single_action(
-        learning.context_encoder(encode, setup), scores, setup.domain.num_actions
-    )
 
     def transition_loss(
         params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
@@ -111,7 +103,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic),
         setup.training.microbatch,
     )  # fmt: skip
-    return Agent(init, learning.transition_batches(setup), update, energy)
+    energy = learning.acting_energy(setup, say)
+    return Agent(init, transition_batches(setup), update, energy)
 
 
 def _critic(params: Params) -> Params:

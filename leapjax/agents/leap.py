@@ -8,6 +8,7 @@ from jax.sharding import Mesh
 
 from leapjax import schedules
 from leapjax.agents import learning
+from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
@@ -110,7 +111,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
-    return Agent(init, learning.window_batches(setup), update, energy)
+    return Agent(init, window_batches(setup), update, energy)
 
 
 def _encode_and_score(module: Model, context: Context, actions: jax.Array) -> jax.Array:

@@ -16,6 +16,7 @@ from leapjax import sharding
 from leapjax.data import windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
+from leapjax.energy import single_action
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
@@ -24,11 +25,10 @@ from leapjax.types import (
     Agent,
     Context,
     Demonstration,
+    Energy,
     Params,
     PyTree,
     TrainState,
-    TransitionWindow,
-    Window,
 )
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
@@ -290,59 +290,6 @@ def check_shares(settings: object, *names: str) -> None:
             raise ValueError(f"{name} must be in 0 .. 1, got {getattr(settings, name)}")
 
 
-def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says."""
-
-    def window(steps: Steps, index: jax.Array) -> Window:
-        end = setup.domain.num_actions - 1
-        return windows.window(steps, index, setup.context, setup.horizon, end)
-
-    def batch(key: jax.Array, steps: Steps) -> Window:
-        return _draw(setup, window, key, steps)[0]
-
-    return batch
-
-
-def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
-    """An agent's `batch` of transitions `[B, ...]`, augmented as the domain says."""
-
-    def window(steps: Steps, index: jax.Array) -> Window:
-        end = setup.domain.num_actions - 1
-        return windows.transition_window(steps, index, setup.context, end)
-
-    def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
-        drawn, indices = _draw(setup, window, key, steps)
-        return TransitionWindow(drawn.context, steps.terminated[indices])
-
-    return batch
-
-
-def unrolled_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of windows `[B, ...]` that hold their future, augmented likewise."""
-
-    def window(steps: Steps, index: jax.Array) -> Window:
-        end = setup.domain.num_actions - 1
-        return windows.unrolled_window(steps, index, setup.context, setup.horizon, end)
-
-    def batch(key: jax.Array, steps: Steps) -> Window:
-        return _draw(setup, window, key, steps)[0]
-
-    return batch
-
-
-def _draw(
-    setup: Setup, window: Callable[[Steps, jax.Array], Window], key: jax.Array, steps: Steps
-) -> tuple[Window, jax.Array]:
-    """Windows `[B, ...]`, augmented, and the indices `[B]` of their steps."""
-    domain, training = setup.domain, setup.training
-    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
-    indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
-    drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
-    for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
-        drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
-    return drawn, indices
-
-
 def blank_steps(domain: Domain) -> Steps:
     """One step of a domain in which there is nothing: the structure of all its `Steps`."""
     states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
@@ -361,6 +308,25 @@ def context_encoder(
         return encode(params, jax.tree.map(jnp.asarray, context))
 
     return checked
+
+
+def acting_energy(
+    setup: Setup,
+    say: Callable[[Params, Context], PyTree],
+    scores: Callable[[PyTree], jax.Array] = lambda said: said["logits"],
+) -> Energy:
+    """The energy of a method that chooses one action at a time.
+
+    Args:
+        setup: what the method is made from.
+        say: (params, context) -> what its network says.
+        scores: of what it says, `[P, A - 1]` logits or Q-values, at the current state last.
+    """
+    return single_action(
+        context_encoder(say, setup),
+        lambda params, said: scores(said)[-1],
+        setup.domain.num_actions,
+    )
 
 
 def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
+from leapjax.agents.batches import unrolled_batches
 from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.energy import autoregressive
 from leapjax.models.alternating import AlternatingModel
@@ -75,7 +76,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
-    return Agent(init, learning.unrolled_batches(setup), update, energy)
+    return Agent(init, unrolled_batches(setup), update, energy)
 
 
 def _encoded(

@@ -1,0 +1,63 @@
+"""What agents draw from demonstrations: windows, as they are or as a method needs them."""
+
+from collections.abc import Callable
+
+import jax
+
+from leapjax.agents.learning import Setup
+from leapjax.data import windows
+from leapjax.data.windows import Steps
+from leapjax.types import TransitionWindow, Window
+
+
+def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says."""
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.window(steps, index, setup.context, setup.horizon, end)
+
+    def batch(key: jax.Array, steps: Steps) -> Window:
+        return _draw(setup, window, key, steps)[0]
+
+    return batch
+
+
+def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
+    """An agent's `batch` of transitions `[B, ...]`, augmented as the domain says."""
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.transition_window(steps, index, setup.context, end)
+
+    def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
+        drawn, indices = _draw(setup, window, key, steps)
+        return TransitionWindow(drawn.context, steps.terminated[indices])
+
+    return batch
+
+
+def unrolled_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of windows `[B, ...]` that hold their future, augmented likewise."""
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        end = setup.domain.num_actions - 1
+        return windows.unrolled_window(steps, index, setup.context, setup.horizon, end)
+
+    def batch(key: jax.Array, steps: Steps) -> Window:
+        return _draw(setup, window, key, steps)[0]
+
+    return batch
+
+
+def _draw(
+    setup: Setup, window: Callable[[Steps, jax.Array], Window], key: jax.Array, steps: Steps
+) -> tuple[Window, jax.Array]:
+    """Windows `[B, ...]`, augmented, and the indices `[B]` of their steps."""
+    domain, training = setup.domain, setup.training
+    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+    indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
+    drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
+    for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+        drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
+    return drawn, indices
