@@ -44,6 +44,11 @@ def untrained(architecture, past):
     return agent, jax.tree.unflatten(structure, noise), agent.batch(jax.random.key(2), data())
 
 
+def network(architecture, past):
+    setup = setup_of(architecture, past)
+    return plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+
+
 @EACH_ARCHITECTURE
 def test_an_action_depends_on_those_before_it_alone(architecture, past):
     agent, params, batch = untrained(architecture, past)
@@ -68,20 +73,37 @@ def test_an_action_depends_on_those_before_it_alone(architecture, past):
 @EACH_ARCHITECTURE
 def test_the_future_is_encoded_as_the_present_is(architecture, past):
     """State by state: what is predicted is what would be seen."""
-    agent, params, batch = untrained(architecture, past)
-    module = plate.AlternatingModel(
-        setup_of(architecture, past).model, setup_of(architecture, past).sizes,
-        setup_of(architecture, past).encoder(),
-    )  # fmt: skip
+    _, params, batch = untrained(architecture, past)
+    module = network(architecture, past)
     unrolled = jax.tree.map(lambda x: x[1], batch.context)
     states, actions = module.apply(params, unrolled, method="encode_unrolled")
     shown = past if architecture == "paper" else 0
     assert states.shape[0] == shown + HORIZON and actions.shape == (shown + HORIZON - 1,)
     for place in range(HORIZON):
         context = windows.context_at(unrolled, place, past)
-        seen, before = agent.energy.encode(params, context)
+        seen, before = module.apply(params, context, method="encode")
         np.testing.assert_allclose(seen[-1], states[shown + place], rtol=1e-5, atol=1e-5)
         np.testing.assert_array_equal(before, actions[place : place + shown])
+
+
+@EACH_ARCHITECTURE
+def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
+    """Plans with predicted states, against passes over all tokens with those states."""
+    agent, params, batch = untrained(architecture, past)
+    module = network(architecture, past)
+    context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, past)
+    plan = jnp.array([0, 1, 2, 0])
+    states, before = module.apply(params, context, method="encode")
+    between = jnp.concatenate([before, plan[:-1]])
+    read = jax.jit(functools.partial(module.apply, method="read"))
+    states = jnp.concatenate([states, jnp.zeros((HORIZON - 1, states.shape[1]))])
+    for place in range(HORIZON - 1):
+        _, led = read(params, states, between)
+        states = states.at[place - HORIZON + 1].set(led[place])
+    expected = -jax.nn.log_softmax(read(params, states, between)[0])
+    memory = agent.energy.encode(params, context)
+    found = agent.energy.conditional(params, memory, plan, jnp.arange(HORIZON))
+    np.testing.assert_allclose(found[1:], expected[1:], rtol=1e-3, atol=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     optimizer = learning.make_optimizer(setup.training)
 
     def encode(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, method="encode")
+        return module.apply(params, context, method="begin")
 
     def logits(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array

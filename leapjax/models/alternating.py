@@ -1,13 +1,22 @@
 """A network that predicts states and actions in turn, for planning from left to right."""
 
+from typing import NamedTuple
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig, Sizes, check_plan, forbid_early_end
-from leapjax.models.transformer import Transformer, causal_mask, dense, embed
+from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context
+
+
+class Memory(NamedTuple):
+    """What all plans from one context share."""
+
+    known: list[KeysValues]  # of the tokens up to the current state, per layer, with room for more
+    first: jax.Array  # [A] logits of the first action
 
 
 class AlternatingModel(nn.Module):
@@ -62,6 +71,12 @@ class AlternatingModel(nn.Module):
             tokens = tokens.reshape(1, -1)
         return self.norm(self.summary(tokens))
 
+    def _tokens(self, states: jax.Array, actions: jax.Array) -> jax.Array:
+        """`[2 n - 1, D]` of n states and the actions between them."""
+        between = jnp.append(jnp.tanh(self.action(actions)), jnp.zeros((1, states.shape[1])), 0)
+        tokens = jnp.stack([states, between], axis=1).reshape(-1, states.shape[1])[:-1]
+        return tokens + self.position(jnp.arange(tokens.shape[0]))
+
     def read(
         self, states: jax.Array, actions: jax.Array, deterministic: bool = True
     ) -> tuple[jax.Array, jax.Array]:
@@ -72,9 +87,7 @@ class AlternatingModel(nn.Module):
             actions: `[past + T - 1]` those between them.
             deterministic: without dropout.
         """
-        between = jnp.append(jnp.tanh(self.action(actions)), jnp.zeros((1, states.shape[1])), 0)
-        tokens = jnp.stack([states, between], axis=1).reshape(-1, states.shape[1])[:-1]
-        tokens += self.position(jnp.arange(tokens.shape[0]))
+        tokens = self._tokens(states, actions)
         h = self.transformer(
             self.drop(tokens, deterministic=deterministic),
             jnp.arange(2 * self.past, tokens.shape[0]),
@@ -82,29 +95,39 @@ class AlternatingModel(nn.Module):
         )  # fmt: skip
         return self.choose(h[::2]), self.norm(self.predict(h[1::2]))
 
-    def logits(
-        self, memory: tuple[jax.Array, jax.Array], actions: jax.Array, positions: jax.Array
-    ) -> jax.Array:
+    def begin(self, context: Context) -> Memory:
+        """What every plan from here on shares."""
+        states, actions = self.encode(context)
+        x = self._tokens(states, actions)
+        room = self.transformer.nothing_yet(2 * (self.past + self.sizes.horizon) - 1)
+        h, memory = self.transformer.extend(x, room, 0)
+        return Memory(memory, self.choose(h[-1]))
+
+    def logits(self, memory: Memory, actions: jax.Array, positions: jax.Array) -> jax.Array:
         """Logits `[P, A]` at `positions [P]`, given the actions before each: states are predicted.
 
         Args:
-            memory: from `encode`.
+            memory: from `begin`.
             actions: `[T]`; what is not chosen yet may be MASK.
             positions: P of them.
         """
         check_plan(actions, self.sizes.horizon)
-        known, before = memory
-        horizon = self.sizes.horizon
-        between = jnp.concatenate([before, actions[:-1]])
-        unknown = jnp.zeros((horizon - 1, known.shape[1]))
+        embedded = jnp.tanh(self.action(actions))
 
-        def predict(place: int | jax.Array, states: jax.Array) -> jax.Array:
-            _, led = self.read(states, between)
-            return states.at[self.past + 1 + place].set(led[place])
+        def go_on(
+            place: int | jax.Array, carry: tuple[list[KeysValues], jax.Array]
+        ) -> tuple[list[KeysValues], jax.Array]:
+            """One action, the state that it leads to, and the logits of the next."""
+            known, chosen = carry
+            token = 2 * (self.past + place) + 1
+            h, known = self.transformer.extend(
+                (embedded[place] + self.position(token))[None], known, token
+            )
+            state = self.norm(self.predict(h)) + self.position(token + 1)
+            h, known = self.transformer.extend(state, known, token + 1)
+            return known, chosen.at[place + 1].set(self.choose(h[0]))
 
-        # Only as far as is asked for: the next pass may change what comes after.
-        states = jnp.concatenate([known, unknown])
-        if horizon > 1:
-            states = jax.lax.fori_loop(0, positions.max(), predict, states)
-        chosen, _ = self.read(states, between)
+        chosen = jnp.zeros((self.sizes.horizon, self.sizes.num_actions)).at[0].set(memory.first)
+        # Only as far as is asked for.
+        _, chosen = jax.lax.fori_loop(0, positions.max(), go_on, (memory.known, chosen))
         return forbid_early_end(chosen[positions], positions)

@@ -155,3 +155,35 @@ class Transformer(nn.Module):
                 mask = None if mask is None else mask[queried]
             x = block(x, memory, mask, deterministic)
         return self.norm(x)
+
+    def nothing_yet(self, tokens: int) -> list[KeysValues]:
+        """Room for the keys and values of so many tokens, per layer, for `extend`."""
+        empty = jnp.zeros((tokens, self.heads, self.width // self.heads))
+        return [KeysValues(empty, empty)] * self.layers
+
+    def extend(
+        self, x: jax.Array, memory: list[KeysValues], start: jax.Array | int
+    ) -> tuple[jax.Array, list[KeysValues]]:
+        """Outputs `[n, D]` of the tokens `x [n, D]` that come next, with causal attention.
+
+        The same as of `__call__` with a `causal_mask`, a few tokens at a time, without dropout.
+
+        Args:
+            x: tokens number `start` and after.
+            memory: of the tokens before them, with room for more.
+            start: `[]` how many there are before.
+        """
+        slots = jnp.arange(memory[0].keys.shape[0])
+        mask = slots <= start + jnp.arange(x.shape[0])[:, None]
+        extended = []
+        for block, old in zip(self.blocks, memory, strict=True):
+            new = block.keys_values(x)
+            joined = KeysValues(
+                *(
+                    jax.lax.dynamic_update_slice_in_dim(all_, some, start, axis=0)
+                    for all_, some in zip(old, new, strict=True)
+                )
+            )
+            extended.append(joined)
+            x = block(x, joined, mask, True)
+        return self.norm(x), extended
