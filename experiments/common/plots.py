@@ -104,7 +104,7 @@ def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], pat
         for index, (whose, by_method) in enumerate(by_whom.items()):
             places = [names.index(name) + width * (index + 0.5) - 0.4 for name in by_method]
             axis.bar(places, by_method.values(), width, label=whose, color=f"C{index}")
-        axis.set_xticks(range(len(names)), names)
+        axis.set_xticks(range(len(names)), names, rotation=30)
         axis.set(ylim=(0, 102))
         axis.set_title(level, fontsize=9)
     for axis in axes.flat[len(rates) :]:
