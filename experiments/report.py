@@ -198,7 +198,7 @@ def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Ro
 
 
 def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Success in percent by level, whose numbers they are ("paper" or a preset), and method."""
+    """Success in percent by level, whose numbers they are, and method."""
     return {
         level: {
             "the paper": paper_success(level),
@@ -213,21 +213,23 @@ def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, floa
 
 def methods(rows: Sequence[Row]) -> str:
     """Success rates of every method: the paper's, and those of both presets; the best in bold."""
-    found, lines = rows_by_method(rows), []
-    for level, by_whom in success_by_method(rows).items():
-        for whose, rates in by_whom.items():
-            best = max(rates.values(), default=None)
-            cells = []
-            for method in COMPARED:
-                if method not in rates:
-                    cells.append("-")
-                    continue
-                theirs = whose == "the paper"
-                preset = whose.removeprefix("preset ")
-                cell = f"{rates[method]:.1f}%" if theirs else _rate(found[level][preset][method])
-                cells.append(f"**{cell}**" if rates[method] == best else cell)
-            lines.append([level, whose, *cells])
+    lines = []
+    for level, by_preset in rows_by_method(rows).items():
+        theirs = paper_success(level)
+        cells = {name: f"{rate:.1f}%" for name, rate in theirs.items()}
+        lines.append([level, "the paper", *_compared(theirs, cells)])
+        for preset, by_method in by_preset.items():
+            ours = {name: _mean_rate(of) for name, of in by_method.items() if of}
+            cells = {name: _rate(by_method[name]) for name in ours}
+            lines.append([level, f"preset {preset}", *_compared(ours, cells)])
     return _table("level | | " + " | ".join(COMPARED), lines)
+
+
+def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
+    """The cell of every method, those of the best rate in bold."""
+    best = max(rates.values(), default=None)
+    bold = {name: f"**{cell}**" for name, cell in cells.items() if rates[name] == best}
+    return [{**cells, **bold}.get(name, "-") for name in COMPARED]
 
 
 def acting(rows: Sequence[Row]) -> str:

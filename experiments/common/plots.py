@@ -7,6 +7,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -59,14 +60,9 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         rows: by level, label of the line, and number of iterations.
         path: to write.
     """
-    columns = min(4, max(1, len(rows)))
-    lines = max(1, -(-len(rows) // columns))
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(2.7 * columns, 2.6 * lines), sharey=True, layout="constrained",
-        squeeze=False,
-    )  # fmt: skip
+    figure, axes = _panels(len(rows), columns=4, width=2.7)
     drawn: dict[str, Line2D] = {}  # one of each label, for the legend
-    for axis, (level, by_label) in zip(axes.flat, rows.items(), strict=False):
+    for axis, (level, by_label) in zip(axes, rows.items(), strict=False):
         for label, by_count in by_label.items():
             rates = [100 * row["successes"] / row["episodes"] for row in by_count.values()]
             colour = drawn[label].get_color() if label in drawn else f"C{len(drawn)}"
@@ -75,10 +71,6 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         axis.set(xscale="log", ylim=(0, 102), xlabel="iterations N")
         axis.set_xticks([1, 2, 5, 10, 30], ["1", "2", "5", "10", "30"])
         axis.minorticks_off()
-    for axis in axes.flat[len(rows) :]:
-        axis.set_axis_off()
-    for axis in axes[:, 0]:
-        axis.set_ylabel("success (%)")
     labels = [label.replace("`", "") for label in drawn]
     figure.legend(drawn.values(), labels, loc="outside lower center", ncols=max(1, len(drawn)))
     _save(figure, path)
@@ -91,30 +83,36 @@ def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], pat
         rates: in percent by level, whose numbers they are, and method.
         path: to write.
     """
-    columns = min(3, max(1, len(rates)))
-    lines = max(1, -(-len(rates) // columns))
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(4.5 * columns, 2.6 * lines), sharey=True, layout="constrained",
-        squeeze=False,
-    )  # fmt: skip
-    for axis, (level, by_whom) in zip(axes.flat, rates.items(), strict=False):
+    figure, axes = _panels(len(rates), columns=3, width=4.5)
+    for axis, (level, by_whom) in zip(axes, rates.items(), strict=False):
         named = [name for by_method in by_whom.values() for name in by_method]
         names = list(dict.fromkeys(reversed(named)))[::-1]  # as the last of them has it
         width = 0.8 / len(by_whom)
         for index, (whose, by_method) in enumerate(by_whom.items()):
             places = [names.index(name) + width * (index + 0.5) - 0.4 for name in by_method]
-            axis.bar(places, by_method.values(), width, label=whose, color=f"C{index}")
+            axis.bar(places, list(by_method.values()), width, label=whose, color=f"C{index}")
         axis.set_xticks(range(len(names)), names, rotation=30)
         axis.set(ylim=(0, 102))
         axis.set_title(level, fontsize=9)
-    for axis in axes.flat[len(rates) :]:
+    if rates:
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    _save(figure, path)
+
+
+def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of so many panels of success, at most `columns` side by side, one for each level."""
+    columns = min(columns, max(1, count))
+    lines = max(1, -(-count // columns))
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(width * columns, 2.6 * lines), sharey=True, layout="constrained",
+        squeeze=False,
+    )  # fmt: skip
+    for axis in axes.flat[count:]:
         axis.set_axis_off()
     for axis in axes[:, 0]:
         axis.set_ylabel("success (%)")
-    if rates:
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    _save(figure, path)
+    return figure, list(axes.flat)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -10,12 +10,19 @@ from leapjax.data.windows import Steps
 from leapjax.types import TransitionWindow, Window
 
 
-def window_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says."""
+def window_batches(
+    setup: Setup, cut: Callable[[Steps, jax.Array, int, int, int], Window] = windows.window
+) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says.
+
+    Args:
+        setup: what it is made from.
+        cut: (steps, index, K, T, end action) -> window: `windows.window` or
+            `windows.unrolled_window`.
+    """
 
     def window(steps: Steps, index: jax.Array) -> Window:
-        end = setup.domain.num_actions - 1
-        return windows.window(steps, index, setup.context, setup.horizon, end)
+        return cut(steps, index, setup.context, setup.horizon, setup.domain.num_actions - 1)
 
     def batch(key: jax.Array, steps: Steps) -> Window:
         return _draw(setup, window, key, steps)[0]
@@ -33,19 +40,6 @@ def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionW
     def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
         drawn, indices = _draw(setup, window, key, steps)
         return TransitionWindow(drawn.context, steps.terminated[indices])
-
-    return batch
-
-
-def unrolled_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of windows `[B, ...]` that hold their future, augmented likewise."""
-
-    def window(steps: Steps, index: jax.Array) -> Window:
-        end = setup.domain.num_actions - 1
-        return windows.unrolled_window(steps, index, setup.context, setup.horizon, end)
-
-    def batch(key: jax.Array, steps: Steps) -> Window:
-        return _draw(setup, window, key, steps)[0]
 
     return batch
 

@@ -50,19 +50,22 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
-        now, later = _both(module, params, context, key)
+        said: Any = module.apply(
+            params, context, deterministic=False, rngs={"dropout": key}, method="transition"
+        )
+        now, later = said
         held: Any = module.apply(target, windows.after(context))
         # Chosen by the one network and valued by the other, as in double Q-learning.
         best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]
         taken, known = losses.last_actions(context, len(values), choices)
         targets = losses.bellman(transition, values, settings.discount)
-        errors = optax.losses.huber_loss(losses.of_action(now["q"], taken), targets)
+        estimates = losses.of_action(now["q"], taken)
+        errors = optax.losses.huber_loss(estimates, targets)
         cloning, accuracy = losses.imitation(now["behaviour"], taken, known)
         squares = (now["behaviour"] ** 2).mean(axis=1)
         loss = losses.mean_where(errors + settings.logit_penalty * squares, known) + cloning
-        value = losses.mean_where(losses.of_action(now["q"], taken), known)
-        return loss, {"accuracy": accuracy, "value": value}
+        return loss, {"accuracy": accuracy, "value": losses.mean_where(estimates, known)}
 
     init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
     update = learning.make_update(
@@ -78,15 +81,6 @@ def likely_values(said: Said, threshold: float) -> jax.Array:
     likelihoods = jax.nn.softmax(said["behaviour"])
     likely = likelihoods >= threshold * likelihoods.max(axis=1, keepdims=True)
     return jnp.where(likely, said["q"], -jnp.inf)
-
-
-def _both(
-    module: PolicyModel, params: Params, context: Context, key: jax.Array
-) -> tuple[Said, Said]:
-    found: Any = module.apply(
-        params, context, deterministic=False, rngs={"dropout": key}, method="transition"
-    )
-    return found
 
 
 def _say(module: PolicyModel, context: Context, actions: jax.Array) -> Said:

@@ -33,13 +33,16 @@ from leapjax.types import (
 
 Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
 SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
-SINGLE_ACTION_PRESETS: Presets = {
-    "paper": {**SINGLE_ACTION, "architecture": "paper", "dropout": 0.1, "windows": "episode"},
+# Of methods that have no reason for others.
+NETWORK_PRESETS: Presets = {
+    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode"},
     "leapjax": {
-        **SINGLE_ACTION, "architecture": "leapjax", "dropout": 0.0, "windows": "step",
-        "learning_rate": 3e-3,
+        "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
     },
 }  # fmt: skip
+SINGLE_ACTION_PRESETS: Presets = {
+    name: {**SINGLE_ACTION, **options} for name, options in NETWORK_PRESETS.items()
+}
 UNDECAYED = ("bias", "scale", "embedding")
 
 

@@ -8,19 +8,13 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
-from leapjax.agents.batches import unrolled_batches
-from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.agents.batches import window_batches
+from leapjax.agents.learning import NETWORK_PRESETS, Method, Setup
+from leapjax.data import windows
 from leapjax.energy import autoregressive
 from leapjax.models.alternating import AlternatingModel
 from leapjax.planners import BeamConfig
 from leapjax.types import Agent, Context, Params, PyTree, Window
-
-PRESETS: Presets = {
-    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode"},
-    "leapjax": {
-        "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
-    },
-}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +70,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
-    return Agent(init, unrolled_batches(setup), update, energy)
+    return Agent(init, window_batches(setup, windows.unrolled_window), update, energy)
 
 
 def _encoded(
@@ -93,4 +87,4 @@ def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.A
     return module.read(plan, jnp.concatenate([before, actions[:-1]]))
 
 
-PLATE = Method(Settings, make_agent, PRESETS, planner=BeamConfig)
+PLATE = Method(Settings, make_agent, NETWORK_PRESETS, planner=BeamConfig)

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig, Sizes, check_plan, forbid_early_end
-from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
+from leapjax.models.transformer import (
+    KeysValues,
+    Transformer,
+    causal_mask,
+    dense,
+    embed,
+    interleave,
+)
 from leapjax.types import Context
 
 
@@ -73,8 +80,7 @@ class AlternatingModel(nn.Module):
 
     def _tokens(self, states: jax.Array, actions: jax.Array) -> jax.Array:
         """`[2 n - 1, D]` of n states and the actions between them."""
-        between = jnp.append(jnp.tanh(self.action(actions)), jnp.zeros((1, states.shape[1])), 0)
-        tokens = jnp.stack([states, between], axis=1).reshape(-1, states.shape[1])[:-1]
+        tokens = interleave(states, jnp.tanh(self.action(actions)))
         return tokens + self.position(jnp.arange(tokens.shape[0]))
 
     def read(

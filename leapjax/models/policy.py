@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig, Sizes
-from leapjax.models.transformer import Transformer, causal_mask, dense, embed
+from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
 
 Said = dict[str, jax.Array]  # by head: [P, count]
@@ -82,9 +82,8 @@ class PolicyModel(nn.Module):
         self, states: jax.Array, context: Context, deterministic: bool, goals: jax.Array | None
     ) -> jax.Array:
         actions = jnp.tanh(self.action(context.actions))  # [K, D]
-        actions = jnp.concatenate([actions, jnp.zeros((1, self.config.width))])
         each = [states, actions] if goals is None else [goals, states, actions]
-        tokens = jnp.stack(each, axis=1).reshape(-1, self.config.width)[:-1]
+        tokens = interleave(*each)
         tokens += self.position(jnp.arange(tokens.shape[0]))
         tokens += self.time(jnp.minimum(context.step, self.sizes.max_steps))
         return self.transformer(

@@ -51,6 +51,13 @@ def causal_mask(tokens: int, prefix: int = 0) -> jax.Array:
     return jnp.tril(jnp.ones((tokens, prefix + tokens), bool), prefix)
 
 
+def interleave(*sequences: jax.Array) -> jax.Array:
+    """One token of each in turn, `[k n - 1, D]`: k sequences `[n, D]`, the last of `[n - 1, D]`."""
+    *whole, last = sequences
+    last = jnp.concatenate([last, jnp.zeros_like(whole[0][:1])])
+    return jnp.stack([*whole, last], axis=1).reshape(-1, last.shape[1])[:-1]
+
+
 class Block(nn.Module):
     """One layer: attention, then a two-layer perceptron, each on a normalised residual.
 
