@@ -3,8 +3,9 @@
 from leapjax.babyai.domain import BABYAI
 from leapjax.domain import DomainType
 from leapjax.errors import UserError
+from leapjax.stars.domain import STARS
 
-DOMAINS: dict[str, DomainType] = {"babyai": BABYAI}
+DOMAINS: dict[str, DomainType] = {"babyai": BABYAI, "stars": STARS}
 
 
 def find_domain(name: str) -> DomainType:

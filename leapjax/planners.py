@@ -6,6 +6,7 @@ They know only `Energy`. `leapjax.batching` makes one of them plan for any numbe
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import chex
 import jax
@@ -15,17 +16,28 @@ from leapjax.errors import check_at_least
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number
-ORDERS = ("random", "sequential")
+FILLS = ("together", "confident", "margin", "sequential", "random")
+ORDERS = ("random", "sequential", "uncertain")
 
 
 @dataclasses.dataclass(frozen=True)
 class GibbsConfig:
-    """Iterative planning through energy minimisation (paper, algorithm 1)."""
+    """Iterative planning through energy minimisation (paper, algorithm 1).
+
+    `fill` says how the first plan is made: "together", all positions in one pass, as in the
+    paper; or P positions in each pass, while the others stay MASK: those that are most certain
+    ("confident": by the probability of the likeliest action, "margin": by its lead over the
+    second), or from left to right ("sequential"), or in "random" order. `order` says which P
+    positions every later iteration resamples: "random" ones, the next from left to right
+    ("sequential"), or those that were least certain when they were chosen ("uncertain", each
+    once before any is again).
+    """
 
     horizon: int = 5  # T, planned actions
-    iterations: int = 10  # N, passes of the model; the first fills every position
-    resampled: int = 1  # P, positions resampled together in every later iteration
-    order: str = "random"  # which positions: "random", or "sequential" from left to right
+    iterations: int = 10  # N, passes of the model, those that fill the plan included
+    resampled: int = 1  # P, positions chosen together in a pass, but where all are
+    fill: str = "together"  # or "confident", "margin", "sequential", "random"
+    order: str = "random"  # or "sequential", "uncertain"
     temperature: float = 0.0  # 0 takes the most likely action
     restarts: int = 1  # R independent plans, of which the one of least energy is kept
     score: bool = False  # also return the energy of the plan (T more passes)
@@ -39,8 +51,20 @@ class GibbsConfig:
             )
         if not 0 <= self.temperature <= HOTTEST:  # false for NaN too
             raise ValueError(f"a temperature must be in 0 .. {HOTTEST}, got {self.temperature}")
-        if self.order not in ORDERS:
-            raise ValueError(f"unknown order {self.order!r}: expected one of {', '.join(ORDERS)}")
+        for name, known in {"fill": FILLS, "order": ORDERS}.items():
+            value = getattr(self, name)
+            if value not in known:
+                raise ValueError(f"unknown {name} {value!r}: expected one of {', '.join(known)}")
+        if self.iterations < self.fill_iterations:
+            raise ValueError(
+                f"fill {self.fill!r} chooses {self.resampled} of {self.horizon} actions in a pass, "
+                f"so it needs {self.fill_iterations} iterations, got {self.iterations}"
+            )
+
+    @property
+    def fill_iterations(self) -> int:
+        """The passes after which no position is MASK."""
+        return 1 if self.fill == "together" else -(-self.horizon // self.resampled)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,11 +126,23 @@ def gibbs(
 ) -> Plan:
     """Gibbs sampling over action tokens (paper, algorithm 1): N passes in all.
 
-    Iteration 1 fills every position from all MASK (or is a uniform plan, for an energy
-    that does not accept MASK); iterations 2 to N mask P positions, read the energy of
-    every action there, and draw actions with probability proportional to
+    The first iterations fill every position (see `GibbsConfig.fill`; for an energy that does not
+    accept MASK the first plan is uniform); each later one masks P positions, reads the energy
+    of every action there, and draws actions with probability proportional to
     `exp(-energy / temperature)`.
+
+    Filling one position at a time, at temperature 1 and with the conditionals of a joint
+    distribution, draws from that joint: it is the chain rule, and which position comes next may
+    depend on what was drawn before. At temperature 0 it is a search.
+
+    Raises:
+        ValueError: a plan should be filled position by position, and the energy accepts no MASK.
     """
+    if config.fill != "together" and not energy.accepts_mask:
+        raise ValueError(
+            f"fill {config.fill!r} chooses actions while others are MASK, and this energy scores "
+            "complete plans only (accepts_mask is False): use fill 'together'"
+        )
     memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
@@ -128,12 +164,23 @@ def gibbs(
     return plan
 
 
+class _Chain(NamedTuple):
+    """A plan in the making."""
+
+    actions: jax.Array  # [T] int32; MASK where none is chosen yet
+    age: jax.Array | None = None  # [T] how often each position was chosen, and for a fraction
+    # half of the probability of what was; only where the order is "uncertain"
+
+
 def _gibbs_chain(
     energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """One chain: final actions `[T]`, the actions after every iteration `[N, T]`, `valid`."""
-    horizon, later = config.horizon, config.iterations - 1
+    horizon, filling = config.horizon, config.fill_iterations
+    later = config.iterations - filling
     order_key, noise_key, start_key = jax.random.split(key, 3)
+    everywhere = jnp.arange(horizon)
+    mask = mask_token(energy.num_actions)
 
     # All randomness is drawn at once, before the loop: inside it costs more than the draws.
     def noise(k: jax.Array, *shape: int) -> jax.Array:
@@ -141,41 +188,103 @@ def _gibbs_chain(
             return jax.random.gumbel(k, (*shape, energy.num_actions))
         return jnp.zeros((*shape, 1))
 
-    def draw(tokens: jax.Array, where: jax.Array, gumbel: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Tokens `[T]` with new actions at positions `[P]`; whether no energy was NaN."""
+    def energies_at(tokens: jax.Array, where: jax.Array) -> jax.Array:
         energies = energy.conditional(params, memory, tokens, where)
         chex.assert_shape(energies, (where.shape[0], energy.num_actions))
+        return energies
+
+    def draw(
+        chain: _Chain, where: jax.Array, energies: jax.Array, gumbel: jax.Array
+    ) -> tuple[_Chain, jax.Array]:
+        """The chain with new actions at positions `[P]`; whether no energy was NaN."""
         # Gumbel-max. Noise times temperature, not energy over temperature: exact at 0, and
         # +inf stays +inf.
         drawn = jnp.argmin(energies - config.temperature * gumbel, axis=-1).astype(jnp.int32)
         # Where every action is forbidden another position has to change: leave this one
         # (and 0 for MASK, which is the number of actions).
         hopeless = jnp.all(jnp.isinf(energies), axis=-1)
-        drawn = jnp.where(hopeless, tokens[where] % energy.num_actions, drawn)
-        return tokens.at[where].set(drawn), ~jnp.any(undefined(energies))
+        drawn = jnp.where(hopeless, chain.actions[where] % energy.num_actions, drawn)
+        age = chain.age
+        if age is not None:
+            chosen = jnp.take_along_axis(_probabilities(energies), drawn[:, None], axis=1)[:, 0]
+            age = age.at[where].set(jnp.floor(age[where]) + 1 + chosen / 2)
+        return _Chain(chain.actions.at[where].set(drawn), age), ~jnp.any(undefined(energies))
 
-    if energy.accepts_mask:
-        blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
-        first, first_valid = draw(blank, jnp.arange(horizon), noise(start_key, horizon))
+    def fill(
+        chain: _Chain, inputs: tuple[jax.Array, jax.Array]
+    ) -> tuple[_Chain, tuple[jax.Array, jax.Array]]:
+        """P positions that are MASK get actions; the others stay as they are."""
+        turn, gumbel = inputs
+        masked = chain.actions == mask
+        # One pass scores all that is masked. (A position that is not would become MASK by being
+        # asked for: one that is stands in for it.)
+        energies = energies_at(chain.actions, jnp.where(masked, everywhere, jnp.argmax(masked)))
+        ranks = jnp.where(masked, _fill_ranks(energies, turn, config.fill), -jnp.inf)
+        where = jax.lax.top_k(ranks, config.resampled)[1]
+        drawn, valid = draw(chain, where, energies[where], gumbel)
+        # The last pass may have fewer than P left.
+        chain = jax.tree.map(lambda new, old: jnp.where(masked, new, old), drawn, chain)
+        return chain, (chain.actions, valid)
+
+    def resample(
+        chain: _Chain, inputs: tuple[jax.Array, jax.Array]
+    ) -> tuple[_Chain, tuple[jax.Array, jax.Array]]:
+        """P positions are masked, and get new actions."""
+        where, gumbel = inputs
+        if chain.age is not None:
+            where = jax.lax.top_k(-chain.age, config.resampled)[1]
+        chain, valid = draw(chain, where, energies_at(chain.actions, where), gumbel)
+        return chain, (chain.actions, valid)
+
+    blank = jnp.full((horizon,), mask, jnp.int32)
+    chain = _Chain(blank, jnp.zeros(horizon) if config.order == "uncertain" else None)
+    if not energy.accepts_mask:
+        uniform = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
+        chain, begun, begun_valid = chain._replace(actions=uniform), uniform[None], jnp.bool_(True)
+    elif config.fill == "together":
+        chain, begun_valid = draw(
+            chain, everywhere, energies_at(blank, everywhere), noise(start_key, horizon)
+        )
+        begun = chain.actions[None]
     else:
-        first = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
-        first_valid = jnp.bool_(True)
+        turns = jax.random.uniform(jax.random.fold_in(start_key, 1), (horizon,))
+        turns = jnp.broadcast_to(turns, (filling, horizon))
+        inputs = turns, noise(start_key, filling, config.resampled)
+        chain, (begun, begun_valid) = jax.lax.scan(fill, chain, inputs)
 
-    def iterate(
-        actions: jax.Array, inputs: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        actions, valid = draw(actions, *inputs)
-        return actions, (actions, valid)
-
-    positions = _scan_order(order_key, config)  # [N - 1, P]
-    gumbel = noise(noise_key, later, config.resampled)  # [N - 1, P, A]
-    last, (trace, valid) = jax.lax.scan(iterate, first, (positions, gumbel))
-    return last, jnp.concatenate([first[None], trace]), first_valid & valid.all()
+    positions = _scan_order(order_key, config, later)  # [N - F, P]
+    gumbel = noise(noise_key, later, config.resampled)  # [N - F, P, A]
+    chain, (trace, valid) = jax.lax.scan(resample, chain, (positions, gumbel))
+    return chain.actions, jnp.concatenate([begun, trace]), jnp.all(begun_valid) & valid.all()
 
 
-def _scan_order(key: jax.Array, config: GibbsConfig) -> jax.Array:
-    """The positions of iterations 2 to N: `[N - 1, P]`, distinct within an iteration."""
-    shape = (config.iterations - 1, config.resampled)
+def _probabilities(energies: jax.Array) -> jax.Array:
+    """Of each action `[P, A]`; 0 where all are forbidden."""
+    return jnp.nan_to_num(jax.nn.softmax(-energies, axis=-1))
+
+
+def _fill_ranks(energies: jax.Array, turn: jax.Array, fill: str) -> jax.Array:
+    """Which of the positions that are MASK come first: `[T]`, the highest does.
+
+    Certainty by margin is of Kim et al., 2025 (arXiv 2502.06768), by probability of Chang et al.,
+    2022 (MaskGIT).
+
+    Args:
+        energies: `[T, A]`.
+        turn: `[T]` random numbers.
+        fill: of `FILLS`.
+    """
+    if fill == "random":
+        return turn
+    if fill == "sequential":
+        return -jnp.arange(turn.shape[0], dtype=jnp.float32)
+    likeliest = jax.lax.top_k(_probabilities(energies), min(2, energies.shape[-1]))[0]
+    return likeliest[:, 0] if fill == "confident" else likeliest[:, 0] - likeliest[:, -1]
+
+
+def _scan_order(key: jax.Array, config: GibbsConfig, later: int) -> jax.Array:
+    """The positions of the iterations after the first plan: `[N - F, P]`, distinct in each."""
+    shape = (later, config.resampled)
     if config.order == "sequential":
         return jnp.arange(shape[0] * shape[1]).reshape(shape) % config.horizon
     if config.resampled == 1:

@@ -1,4 +1,5 @@
 import functools
+import itertools
 import pickle
 
 import jax
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from leapjax.batching import NotANumber, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
 from leapjax.planners import (
+    FILLS,
     ORDERS,
     BeamConfig,
     CrossEntropyConfig,
@@ -138,10 +140,10 @@ def test_without_mask_the_first_plan_is_uniform():
 
 
 @functools.cache
-def greedy_traces(order):
+def greedy_traces(order, fill="together"):
     """Traces `[tables, N, T]` at temperature 0, each on a joint of its own, and the joints."""
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(200)])
-    config = GibbsConfig(HORIZON, iterations=16, order=order)
+    config = GibbsConfig(HORIZON, iterations=16, order=order, fill=fill)
     keys = jax.random.split(jax.random.key(1), len(tables))
     plan = quick_jit(jax.vmap(lambda p, k: gibbs(ENUMERABLE, p, k, NO_TILT, config)))(tables, keys)
     return np.asarray(plan.trace), [joint_probabilities(table) for table in tables]
@@ -170,6 +172,93 @@ def test_greedy_start_takes_the_most_likely_action_everywhere():
         for t in range(HORIZON):
             marginal = conditional_by_counting(joint, blank, t)
             assert marginal[trace[0][t]] == pytest.approx(marginal.max(), rel=1e-5)
+
+
+# Filling a plan position by position.
+
+ONE_BY_ONE = [fill for fill in FILLS if fill != "together"]
+
+
+@pytest.mark.parametrize("fill", ONE_BY_ONE)
+def test_filling_one_by_one_at_temperature_one_samples_the_joint(fill):
+    config = GibbsConfig(HORIZON, iterations=HORIZON, fill=fill, temperature=1.0)
+    counts = plan_counts(plans_of(ENUMERABLE, config).actions, ACTIONS)
+    assert fit_p_value(counts, JOINT) > ACCEPTED
+    assert total_variation(counts, JOINT) < 0.04
+
+
+def test_filling_two_at_once_is_not_the_joint():
+    config = GibbsConfig(HORIZON, iterations=2, fill="random", resampled=2, temperature=1.0)
+    counts = plan_counts(plans_of(ENUMERABLE, config).actions, ACTIONS)
+    assert fit_p_value(counts, JOINT) < REJECTED
+
+
+@pytest.mark.parametrize("fill", ONE_BY_ONE)
+@pytest.mark.parametrize(("resampled", "chosen"), [(1, [1, 2, 3]), (2, [2, 3]), (3, [3])])
+def test_each_pass_fills_so_many_and_keeps_them(fill, resampled, chosen):
+    config = GibbsConfig(
+        HORIZON, iterations=len(chosen), fill=fill, resampled=resampled, temperature=1.0
+    )
+    trace = plans_of(ENUMERABLE, config, chains=200).trace
+    known = trace < ACTIONS  # [chains, N, T]
+    assert (known.sum(-1) == chosen).all()
+    for before, after in itertools.pairwise(range(len(chosen))):
+        kept = (trace[:, before] == trace[:, after]) | ~known[:, before]
+        assert kept.all()
+    if fill == "sequential":
+        np.testing.assert_array_equal(known[0], np.arange(HORIZON) < np.array(chosen)[:, None])
+
+
+@pytest.mark.parametrize("fill", ["confident", "margin"])
+def test_the_most_certain_position_is_filled_first(fill):
+    tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(100)])
+    config = GibbsConfig(HORIZON, iterations=HORIZON, fill=fill)
+    plan = quick_jit(
+        jax.vmap(lambda params: gibbs(ENUMERABLE, params, jax.random.key(0), NO_TILT, config))
+    )
+    firsts = set()
+    for table, trace in zip(tables, np.asarray(plan(tables).trace), strict=True):
+        joint, tokens = joint_probabilities(table), np.full(HORIZON, ACTIONS)
+        for step, after in enumerate(trace):
+            certainty = np.full(HORIZON, -np.inf)
+            for t in np.flatnonzero(tokens == ACTIONS):
+                second, likeliest = np.sort(conditional_by_counting(joint, tokens, t))[-2:]
+                certainty[t] = likeliest if fill == "confident" else likeliest - second
+            (chosen,) = np.flatnonzero(after != tokens)
+            assert certainty[chosen] == pytest.approx(certainty.max(), rel=1e-4)
+            conditional = conditional_by_counting(joint, tokens, chosen)
+            assert conditional[after[chosen]] == pytest.approx(conditional.max(), rel=1e-4)
+            firsts |= {chosen} if step == 0 else set()
+            tokens = after
+    assert len(firsts) == HORIZON
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_what_follows_a_filled_plan_is_gibbs_sampling(order):
+    traces, joints = greedy_traces(order, "random")
+    assert (traces[:, HORIZON - 2] == ACTIONS).any(axis=-1).all()
+    filled = traces[:, HORIZON - 1 :]
+    changes = np.array([np.diff(joint_energies(t, j)) for t, j in zip(filled, joints, strict=True)])
+    assert (changes <= 1e-5).all()
+    assert (changes < -0.1).sum() > 3
+
+
+def test_a_constraint_is_obeyed_once_a_plan_is_complete():
+    def penalty(context, actions):
+        return 100.0 * (actions[0] == actions[1])
+
+    table = np.zeros((ACTIONS,) * HORIZON, np.float32)
+    table[0, 0] = 3.0  # against the constraint
+    constrained = constrain(ENUMERABLE, penalty)
+    fills = GibbsConfig(HORIZON, iterations=HORIZON, fill="confident")
+    refines = GibbsConfig(HORIZON, iterations=2 * HORIZON, fill="confident", order="sequential")
+    assert not plans_of(constrained, fills, table, chains=20).satisfied.any()
+    assert plans_of(constrained, refines, table, chains=20).satisfied.all()
+
+
+def test_an_energy_of_complete_plans_cannot_be_filled():
+    with pytest.raises(ValueError, match="fill 'confident' .* use fill 'together'"):
+        plans_of(FROM_TOTAL, GibbsConfig(HORIZON, fill="confident"), chains=2)
 
 
 # Which positions are resampled.
@@ -215,6 +304,26 @@ def test_sequential_order_goes_from_left_to_right_and_around(resampled, expected
     changed = resampled_positions(config, chains=2)
     for row in changed:
         assert [set(np.flatnonzero(step)) for step in row] == [set(step) for step in expected]
+
+
+CERTAINTY = np.array([2.0, 0.5, 3.0, 1.0], np.float32)  # of the positions of `_next_sure_action`
+
+
+def _next_sure_action(params, memory, actions, positions):
+    """As `_next_action`, surer of some positions than of others."""
+    return _next_action(params, memory, actions, positions) * jnp.array(CERTAINTY)[positions][:, None]
+
+
+@pytest.mark.parametrize(
+    ("resampled", "expected"), [(1, [1, 3, 0, 2, 1, 3]), (2, [(1, 3), (0, 2), (1, 3)])]
+)
+def test_uncertain_order_resamples_the_least_certain_and_all_before_any_again(resampled, expected):
+    energy = COUNTER._replace(conditional=_next_sure_action)
+    config = GibbsConfig(4, 1 + len(expected), resampled, order="uncertain")
+    trace = plans_of(energy, config, None, None, 2).trace
+    for row in np.diff(trace, axis=1) % 5:
+        found = [tuple(np.flatnonzero(step)) for step in row]
+        assert found == [tuple(np.ravel(where)) for where in expected]
 
 
 def test_positions_resampled_together_are_masked_together():
@@ -899,6 +1008,8 @@ def test_impossible_chunk_sizes_are_refused(chunk_sizes):
         (GibbsConfig, {"restarts": -1}, "restarts must be at least 1, got -1"),
         (GibbsConfig, {"horizon": 3, "resampled": 4}, "resampled is 4, .* the horizon 3"),
         (GibbsConfig, {"order": "backwards"}, "unknown order 'backwards': .*sequential"),
+        (GibbsConfig, {"fill": "at once"}, "unknown fill 'at once': .*confident"),
+        (GibbsConfig, {"fill": "margin", "horizon": 5, "iterations": 2, "resampled": 2}, "needs 3"),
         (ShootingConfig, {"horizon": -2}, "horizon must be at least 1, got -2"),
         (ShootingConfig, {"candidates": 0}, "candidates must be at least 1, got 0"),
         (CrossEntropyConfig, {"horizon": 0}, "horizon must be at least 1"),

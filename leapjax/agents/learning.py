@@ -58,7 +58,7 @@ class TrainingConfig:
     betas: tuple[float, float] = (0.9, 0.95)
     weight_decay: float = 0.1  # not on embeddings, norms and biases
     clip: float = 1.0  # global norm of the gradient
-    windows: str = "episode"  # drawn by "episode" or by "step"
+    windows: str = "episode"  # drawn by "episode", by "step", or at the "start" of episodes
     microbatch: int = 0  # examples a device takes the gradient of at a time; 0: all of its own
 
     def __post_init__(self) -> None:
@@ -73,8 +73,9 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"betas must be in [0, 1), got {self.betas}")
-        if self.windows not in ("episode", "step"):
-            raise ValueError(f"unknown windows {self.windows!r}: expected episode or step")
+        if self.windows not in windows.SAMPLINGS:
+            known = ", ".join(windows.SAMPLINGS)
+            raise ValueError(f"unknown windows {self.windows!r}: expected one of {known}")
 
 
 class Setup(NamedTuple):

@@ -15,6 +15,8 @@ import numpy as np
 
 from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
 
+SAMPLINGS = ("episode", "step", "start")
+
 
 class Steps(NamedTuple):
     """All steps of all demonstrations, one after the other: M steps of E episodes.
@@ -236,17 +238,20 @@ def _context(steps: Steps, index: jax.Array, length: int, end: int, after: int =
 def sample_steps(key: jax.Array, steps: Steps, batch: int, by: str) -> jax.Array:
     """Indices `[B]` of steps: a function of `key` and the data alone.
 
-    `by` is "episode" (a uniform demonstration, then a uniform step of it, as in the
-    authors' code) or "step" (a uniform step, so that long demonstrations count for more).
+    `by` is one of `SAMPLINGS`: "episode" (a uniform demonstration, then a uniform step of it, as
+    in the authors' code), "step" (a uniform step, so that long demonstrations count for more) or
+    "start" (the first step of a uniform demonstration, for what is planned once).
 
     Raises:
         ValueError: another `by`.
     """
+    if by not in SAMPLINGS:
+        raise ValueError(f"unknown sampling {by!r}: expected one of {', '.join(SAMPLINGS)}")
     if by == "step":
         return jax.random.randint(key, (batch,), 0, steps.count)
-    if by == "episode":
-        episode_key, step_key = jax.random.split(key)
-        episode = jax.random.randint(episode_key, (batch,), 0, steps.starts.shape[0])
-        offset = jax.random.uniform(step_key, (batch,)) * steps.lengths[episode]
-        return steps.starts[episode] + offset.astype(jnp.int32)
-    raise ValueError(f"unknown sampling {by!r}: expected episode or step")
+    episode_key, step_key = jax.random.split(key)
+    episode = jax.random.randint(episode_key, (batch,), 0, steps.starts.shape[0])
+    if by == "start":
+        return steps.starts[episode]
+    offset = jax.random.uniform(step_key, (batch,)) * steps.lengths[episode]
+    return steps.starts[episode] + offset.astype(jnp.int32)

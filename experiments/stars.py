@@ -1,0 +1,18 @@
+"""Star graphs: `python -m experiments.stars --help`."""
+
+import sys
+from collections.abc import Sequence
+
+from experiments.common import experiment
+from experiments.common.experiment import Experiment
+
+EXPERIMENT = Experiment("stars", "stars")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs every level and seed asked for; the exit code."""
+    return experiment.main(EXPERIMENT, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

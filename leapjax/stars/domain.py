@@ -1,0 +1,122 @@
+"""Star graphs as a `Domain`."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.typing import Dtype
+
+from leapjax.domain import Domain, DomainType
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from leapjax.models.transformer import dense
+from leapjax.stars import graphs
+from leapjax.stars.graphs import Graph, StarAdapter
+from leapjax.types import Context
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Star graphs: augmentation."""
+
+    augment: bool = True  # draw names and the order of edges anew: every window is a new graph
+
+
+class GraphTokens(nn.Module):
+    """A token for each edge, and one for where the agent is and where it should be."""
+
+    labels: int
+    width: int
+    dtype: Dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, context: Context) -> jax.Array:
+        """Tokens `[E + 1, D]`."""
+        graph = context.observation
+        names = nn.Embed(self.labels, self.width, embedding_init=nn.initializers.normal(1.0))
+        scale = (2 * self.width) ** -0.5
+        edges = names(graph.edges).reshape(-1, 2 * self.width)
+        task = names(jnp.stack([graph.node, graph.goal])).reshape(1, -1)
+        read = [
+            dense(self.width, scale=scale, name=name, dtype=self.dtype)(tokens)
+            for name, tokens in {"edge": edges, "task": task}.items()
+        ]
+        return jnp.concatenate(read)
+
+
+def make(name: str, settings: Settings) -> Domain:
+    """A level by name, such as Star3x5.
+
+    Raises:
+        UserError: there is none.
+    """
+    star = graphs.find_level(name)
+    labels = star.labels
+    blank = Graph(
+        np.zeros((star.nodes - 1, 2), np.int32), np.zeros((), np.int32), np.zeros((), np.int32)
+    )
+
+    def tokens(model: ModelConfig, context: int) -> nn.Module:
+        del context
+        return GraphTokens(labels, model.width, model.dtype)
+
+    return Domain(
+        level=name,
+        make_adapter=lambda: StarAdapter(star),
+        collect=functools.partial(graphs.collect, star),
+        actions=(*(str(label) for label in range(labels)), "end"),
+        max_steps=star.length,
+        blank=blank,
+        encoders={"leapjax": tokens},
+        augmentations=(
+            [functools.partial(graphs.relabel, labels=labels)] if settings.augment else []
+        ),
+        check=functools.partial(check, labels=labels),
+        signature={"arms": star.arms, "length": star.length, "labels": labels},
+    )
+
+
+def check(states: Graph, where: str, labels: int) -> None:
+    """Refuses labels that there are not.
+
+    Raises:
+        UserError: says which there are.
+    """
+    for field, values in states._asdict().items():
+        if values.min() < 0 or values.max() >= labels:
+            raise UserError(
+                f"{where}: {field} run from {values.min()} to {values.max()}, expected 0 to "
+                f"{labels - 1}"
+            )
+
+
+def preset(name: str, preset: str) -> Mapping[str, Any]:
+    """What a preset sets for a level: a plan is the whole way.
+
+    Raises:
+        UserError: an unknown level.
+    """
+    del preset
+    star = graphs.find_level(name)
+    return {
+        "horizon": star.length, "iterations": star.length, "fill": "confident",
+        "steps": 4000, "batch": 128, "episodes": 500,
+        "demos": 100,  # augmentation makes any graph of any other
+    }  # fmt: skip
+
+
+def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
+    """What a level changes of a method's own options."""
+    del name, preset
+    rate = {"learning_rate": 1e-3}
+    if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
+        return {**rate, "temperature": 0.0, "windows": "start"}
+    return rate
+
+
+STARS = DomainType(Settings, make, graphs.LEVELS, preset, tuned)
