@@ -11,7 +11,7 @@ from experiments.animation import animate
 from experiments.common import experiment
 from experiments.common.experiment import Experiment
 
-EXPERIMENT = Experiment("babyai", "babyai", animate)
+EXPERIMENT = Experiment("babyai", "babyai", animate=animate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

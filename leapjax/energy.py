@@ -314,7 +314,8 @@ def _check_query(
     ):
         if isinstance(values, jax.core.Tracer) or values.size == 0:
             continue
-        least, most = int(np.min(values)), int(np.max(values))
+        seen = np.asarray(values)  # a constant of a program is an array there too
+        least, most = int(seen.min()), int(seen.max())
         if least < 0 or most >= end:
             what = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
             expected = what if name == "actions" else f"0 .. {end - 1}, the horizon is {end}"

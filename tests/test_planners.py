@@ -311,7 +311,9 @@ CERTAINTY = np.array([2.0, 0.5, 3.0, 1.0], np.float32)  # of the positions of `_
 
 def _next_sure_action(params, memory, actions, positions):
     """As `_next_action`, surer of some positions than of others."""
-    return _next_action(params, memory, actions, positions) * jnp.array(CERTAINTY)[positions][:, None]
+    return (
+        _next_action(params, memory, actions, positions) * jnp.array(CERTAINTY)[positions][:, None]
+    )
 
 
 @pytest.mark.parametrize(

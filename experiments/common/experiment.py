@@ -1,7 +1,8 @@
 """An experiment: levels of a domain, trained on and played, each a row beside the paper's."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from experiments.common.config import (
     parse,
     resolved,
     specify,
+    with_options,
 )
 from experiments.common.interruption import Interrupted, Interruption, interruptible
 from experiments.common.run import Run
@@ -32,6 +34,8 @@ class Experiment(NamedTuple):
 
     name: str  # of its module, and of its file of rows
     domain: str
+    searches: Callable[[Config[Any, Any, Any]], Sequence[Mapping[str, Any]]] = lambda config: ()
+    # how else to plan with what was trained: options of the planner, a row for each
     animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
     # (planner, run, level seeds, path): draws plans being refined and executed
 
@@ -64,6 +68,11 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     for config, seed in runs:
         try:
             rows.append(run_one(experiment, config, seed, versions, console, interruption))
+            if config.checkpoint is None:
+                folder = run_folder(experiment, config, seed)
+                for options in experiment.searches(config):
+                    again = dataclasses.replace(with_options(config, options), checkpoint=folder)
+                    rows.append(run_one(experiment, again, seed, versions, console, interruption))
         except program.FAILURES as error:
             if len(runs) > 1:  # the others can still be run
                 console.print(f"{config.level}, seed {seed}, failed: {error}", markup=False)
@@ -72,6 +81,13 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
         console.print(results.success_table(rows), results.time_table(rows))
     if failure is not None:
         raise failure
+
+
+def run_folder(experiment: Experiment, config: Config[Any, Any, Any], seed: int) -> Path:
+    """Where a run leaves what it makes."""
+    of = f"{config.level}-{config.method}-{config.preset}-seed{seed}"
+    label = f"{experiment.name}-{of}-{configuration_hash(config, seed)}"
+    return config.runs / ("evaluations" if config.checkpoint else "") / label
 
 
 def run_one(
@@ -92,8 +108,7 @@ def run_one(
         console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
         return known
     played = episode_seeds(config)
-    label = f"{experiment.name}-{config.level}-{config.method}-{config.preset}-seed{seed}-{name}"
-    folder = config.runs / ("evaluations" if config.checkpoint else "") / label
+    folder = run_folder(experiment, config, seed)
     domain = make_domain(config)
     this = Run(config, domain, specify(config, seed, domain), folder, console, interruption)
     console.print(

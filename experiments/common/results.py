@@ -125,14 +125,23 @@ def percent(row: Row) -> str:
     return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
 
 
+def planner_name(row: Row) -> str:
+    """How a row's plans were found, as far as it says."""
+    planner = row.get("configuration", {}).get("planner", {})
+    fill = planner.get("fill", "together")
+    passes = [f"N = {planner['iterations']}"] if "iterations" in planner else []
+    return ", ".join([*passes, *([fill] if fill != "together" else [])])
+
+
 def success_table(rows: Sequence[Row]) -> Table:
     """Success rates beside the paper's."""
-    result = Table("level", "method", "seed", "success [95%]", "length", "paper")
+    result = Table("level", "method", "planner", "seed", "success [95%]", "length", "paper")
     for row in rows:
         paper = row.get("paper_success")
         result.add_row(
             row["level"],
             f"{row['method']} ({row['preset']})",
+            planner_name(row),
             str(row["seed"]),
             percent(row),
             f"{row['mean_length']:.1f}",

@@ -1,0 +1,180 @@
+"""Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import stars
+from experiments.common import results
+from experiments.common.config import preset
+from leapjax.agents.learning import Setup
+from leapjax.data import windows
+from leapjax.domain import blank_context
+from leapjax.errors import UserError
+from leapjax.methods import find_method
+from leapjax.models.trajectory import ModelConfig
+from leapjax.stars import graphs
+from leapjax.stars.domain import Settings, make
+from leapjax.stars.graphs import Star, StarAdapter
+from leapjax.types import pad_token
+
+STAR = Star(arms=3, length=4)
+LABELS = STAR.labels
+
+
+def way(graph):
+    """From the goal back to where the agent is: each node has one edge that leads to it."""
+    parents = {int(child): int(parent) for parent, child in np.asarray(graph.edges)}
+    nodes = [int(graph.goal)]
+    while parents[nodes[-1]] != int(graph.node):
+        nodes.append(parents[nodes[-1]])
+    return nodes[::-1]
+
+
+@pytest.mark.parametrize("star", [Star(1, 1), STAR, Star(5, 10)])
+def test_a_graph_is_a_star_and_its_path_leads_to_the_goal(star):
+    for seed in range(20):
+        graph, path = graphs.draw(star, seed)
+        assert graph.edges.shape == (star.nodes - 1, 2)
+        starts, ends = graph.edges.T
+        assert len(set(ends)) == star.nodes - 1 and graph.node not in ends
+        assert ((graph.edges >= 0) & (graph.edges < star.labels)).all()
+        out = np.bincount(starts, minlength=star.labels)
+        assert out[graph.node] == star.arms and np.delete(out, graph.node).max(initial=0) <= 1
+        assert path.tolist() == way(graph) and len(path) == star.length
+
+
+def test_names_arms_and_the_order_of_edges_are_uniform():
+    drawn = [graphs.draw(STAR, seed)[0] for seed in range(600)]
+    centres = np.bincount([int(graph.node) for graph in drawn], minlength=LABELS)
+    assert len(centres) == LABELS and centres.max() < 5 * 600 / LABELS
+    # The edge that ends at the goal is anywhere in the list.
+    places = [int(np.flatnonzero(graph.edges[:, 1] == graph.goal)[0]) for graph in drawn]
+    counts = np.bincount(places, minlength=STAR.nodes - 1)
+    assert counts.min() > 600 / 12 / 2 and counts.max() < 600 / 12 * 2
+
+
+def test_the_path_is_rewarded_and_any_other_step_is_the_last():
+    adapter = StarAdapter(STAR)
+    adapter.reset(3)
+    path = adapter.path
+    steps = [adapter.step(int(node)) for node in path]
+    assert [step.reward for step in steps] == [0, 0, 0, 1]
+    assert [step.terminated for step in steps] == [False, False, False, True]
+    assert steps[-1].success and not any(step.success for step in steps[:-1])
+    graph = adapter.reset(3)
+    others = [child for parent, child in graph.edges if parent == graph.node and child != path[0]]
+    assert len(others) == STAR.arms - 1
+    step = adapter.step(int(others[0]))  # into another arm: only its end tells
+    assert not step.terminated and int(step.observation.node) == others[0]
+    step = adapter.step(int(path[1]))
+    assert step.terminated and not step.success and step.reward == 0
+    adapter.reset(3)
+    assert adapter.step(int(graph.node)).terminated  # to where it is
+
+
+def collected(count=4, seed=0):
+    return graphs.collect(STAR, count, seed, lambda done: None).demonstrations
+
+
+def test_demonstrations_are_the_way():
+    for demonstration in collected():
+        graph, path = graphs.draw(STAR, demonstration.seed)
+        np.testing.assert_array_equal(demonstration.actions, path)
+        nodes = demonstration.observations.node
+        np.testing.assert_array_equal(nodes, [graph.node, *path])
+        assert demonstration.rewards.tolist() == [0, 0, 0, 1] and demonstration.terminated
+
+
+def test_a_relabelled_window_is_that_of_another_graph_with_its_way():
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
+    relabel = jax.jit(lambda key, window: graphs.relabel(key, window, LABELS))
+    cut = jax.jit(lambda index: windows.window(steps, index, 2, STAR.length, LABELS))
+    seen = set()
+    for index in range(8):
+        window = cut(index)
+        for seed in range(3):
+            new = jax.tree.map(np.asarray, relabel(jax.random.key(10 * index + seed), window))
+            graph, known = new.context.observation, np.asarray(window.actions) < LABELS
+            assert new.actions[known].tolist() == way(graph)
+            assert (new.actions[~known] == LABELS).all()  # the end action has no other name
+            past = new.context.actions
+            padded = np.asarray(window.context.actions) == pad_token(LABELS + 1)
+            assert (past[padded] == pad_token(LABELS + 1)).all()
+            if not padded.all():  # the action before led to where the agent is
+                assert past[-1] == graph.node
+                assert (new.context.past.edges[-1] == graph.edges).all()
+            seen.add(int(graph.goal))
+    assert len(seen) > 10
+
+
+def agent_and_domain(method="leap"):
+    domain = make("Star3x4", Settings())
+    config = preset("stars", "Star3x4", method, "leapjax")
+    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
+    setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
+    return find_method(method).make_agent(setup, None), domain
+
+
+def test_the_order_of_edges_means_nothing_to_the_network():
+    agent, domain = agent_and_domain()
+    params = agent.init(jax.random.key(0)).params
+    context = blank_context(domain, 0)
+    graph, _ = graphs.draw(STAR, 0)
+    blank = jnp.full(STAR.length, domain.num_actions)
+
+    @jax.jit
+    def energies(graph):
+        memory = agent.energy.encode(params, context._replace(observation=graph))
+        return agent.energy.conditional(params, memory, blank, jnp.arange(STAR.length))
+
+    found = energies(graph)
+    shuffled = graph._replace(edges=graph.edges[::-1])
+    turned = graph._replace(edges=graph.edges[:, ::-1])
+    np.testing.assert_allclose(energies(shuffled), found, rtol=1e-4)
+    assert np.abs(energies(turned) - found)[:, :LABELS].max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Star3", "unknown level 'Star3': expected Star<arms>x<edges of an arm>"),
+        ("star3x5", "did you mean Star3x5"),
+        ("Star0x5", "unknown level"),
+        ("Star100x100", "has 10001 nodes: at most 1000"),
+    ],
+)
+def test_unknown_levels_are_one_line(name, message, capsys):
+    with pytest.raises(UserError, match=message):
+        graphs.find_level(name)
+    assert stars.main(["--level", name]) == 2
+    error = capsys.readouterr().err
+    assert message.split(":")[0] in error and error.count("\n") == 1
+
+
+def test_presets_and_data_that_there_are_not(capsys):
+    assert stars.main(["--preset", "paper"]) == 2
+    assert "no encoder for architecture 'paper': expected one of leapjax" in capsys.readouterr().err
+    domain = make("Star3x4", Settings())
+    states = collected()[0].observations
+    domain.check(states, "here")
+    with pytest.raises(UserError, match="here: goal run from 50 to 50, expected 0 to 49"):
+        domain.check(states._replace(goal=np.full(5, 50)), "here")
+
+
+def test_every_planner_has_a_row(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few = {name: stars.PLANNERS[name] for name in (stars.AT_ONCE, "most certain first")}
+    monkeypatch.setattr(stars, "PLANNERS", few)
+    toy = "--level Star2x2 --steps 2 --demos 2 --episodes 4 --batch 2 --width 8 --heads 2"
+    arguments = [*toy.split(), "--layers", "1", "--no-pictures"]
+    assert stars.main(arguments) == 0
+    rows = results.read(tmp_path / "runs" / "stars.jsonl")
+    found = [(row["train_steps"], row["iterations"], results.planner_name(row)) for row in rows]
+    assert found == [
+        (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
+    ]  # fmt: skip
+    assert rows[0]["successes"] == rows[2]["successes"]  # the same planner, played again
+    assert stars.main([*arguments, "--method", "bc"]) == 0  # one action at a time: one row
+    assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1
