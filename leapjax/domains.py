@@ -4,8 +4,9 @@ from leapjax.babyai.domain import BABYAI
 from leapjax.domain import DomainType
 from leapjax.errors import UserError
 from leapjax.stars.domain import STARS
+from leapjax.sudoku.domain import SUDOKU
 
-DOMAINS: dict[str, DomainType] = {"babyai": BABYAI, "stars": STARS}
+DOMAINS: dict[str, DomainType] = {"babyai": BABYAI, "stars": STARS, "sudoku": SUDOKU}
 
 
 def find_domain(name: str) -> DomainType:

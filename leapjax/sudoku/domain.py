@@ -1,0 +1,111 @@
+"""Sudoku as a `Domain`."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax.domain import Domain, DomainType
+from leapjax.errors import UserError
+from leapjax.models.transformer import embed
+from leapjax.sudoku import boards
+from leapjax.sudoku.boards import Board, SudokuAdapter
+from leapjax.types import Context
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Sudoku: augmentation."""
+
+    augment: bool = True  # every window becomes one of another board, by what keeps the rules
+
+
+class BoardTokens(nn.Module):
+    """A token for each cell, and one for the cell that is written next."""
+
+    side: int
+    width: int
+
+    @nn.compact
+    def __call__(self, context: Context) -> jax.Array:
+        """Tokens `[cells + 1, D]`."""
+        board, cells = context.observation, self.side**2
+        row, column = jnp.divmod(jnp.arange(cells), self.side)
+        box = boards.side_of_box(self.side)
+        groups = {"row": row, "column": column, "box": row // box * box + column // box}
+        each = [embed(self.side, self.width, name)(at) for name, at in groups.items()]
+        place = jnp.stack(each).sum(axis=0)  # [cells, D]
+        digits = embed(self.side + 1, self.width, "digit")(board.digits)
+        task = embed(1, self.width, "task")(jnp.zeros(1, jnp.int32))
+        here = place[jnp.minimum(board.cell, cells - 1)]
+        return jnp.concatenate([place + digits, task + here])
+
+
+def make(name: str, settings: Settings) -> Domain:
+    """A level by name, such as Sudoku9x36.
+
+    Raises:
+        UserError: there is none.
+    """
+    size = boards.find_level(name)
+    turn = functools.partial(boards.transform, side=size.side)
+    return Domain(
+        level=name,
+        make_adapter=lambda: SudokuAdapter(size),
+        collect=functools.partial(boards.collect, size),
+        actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
+        max_steps=size.cells,
+        blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
+        encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
+        augmentations=[turn] if settings.augment else [],
+        extras=boards.puzzles,
+        check=functools.partial(check, side=size.side),
+        signature={"side": size.side, "clues": size.clues},
+    )
+
+
+def check(states: Board, where: str, side: int) -> None:
+    """Refuses digits that there are not, and what does not solve a board cell by cell.
+
+    Raises:
+        UserError: says what is expected.
+    """
+    digits, cells = states.digits, side**2
+    if digits.min() < 0 or digits.max() > side:
+        raise UserError(
+            f"{where}: digits run from {digits.min()} to {digits.max()}, expected 0 to {side}"
+        )
+    if not np.array_equal(states.cell, np.arange(cells + 1)) or digits[-1].min() < 1:
+        raise UserError(f"{where} does not fill the {cells} cells of a board, one after the other")
+
+
+def preset(name: str, preset: str) -> Mapping[str, Any]:
+    """What a preset sets for a level: a plan is the whole board.
+
+    Raises:
+        UserError: an unknown level.
+    """
+    del preset
+    size = boards.find_level(name)
+    small = size.side == 4
+    return {
+        "horizon": size.cells, "iterations": size.cells, "fill": "confident",
+        "demos": 500 if small else 2000, "episodes": 500,
+        "steps": 4000 if small else 8000, "batch": 64 if small else 32, "learning_rate": 1e-3,
+    }  # fmt: skip
+
+
+def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
+    """What a level changes of a method's own options."""
+    del name, preset
+    if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
+        return {"learning_rate": 1e-3, "temperature": 0.0, "windows": "start"}
+    return {"learning_rate": 1e-3}
+
+
+SUDOKU = DomainType(Settings, make, boards.LEVELS, preset, tuned)
