@@ -10,9 +10,11 @@ from experiments.common import plots, program, results
 from experiments.common.config import configuration_hash, with_options
 from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
+from experiments.common.searches import SEARCHES
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS, paper_success
 from leapjax.checkpoints import read_json
+from leapjax.domains import find_domain
 from leapjax.files import read_text, write_text
 
 EARLIER = {"test_seed": 0, "episodes": 200}  # test levels that were played during development
@@ -55,10 +57,14 @@ BY_METHOD = {
     preset: {method: Setting(method, preset, method) for method in COMPARED}
     for preset in ("paper", "leapjax")
 }
+PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
+# Of levels whose plans are executed whole: each way to search, and methods of one action.
+ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
+SEARCHES_FIGURE = Path("docs/searches.png")
 
 
 def main() -> int:
@@ -70,14 +76,20 @@ def rewrite() -> None:
     """Rewrites every table here."""
     for path, text in documents(Path()).items():
         write_text(path, text)
-    rows = results.read(Path("results/babyai.jsonl"))
+    rows = rows_of(Path(), "babyai")
     plots.iterations_by_level(success_by_iterations(rows), ITERATIONS_FIGURE)
     plots.methods_by_level(success_by_method(rows), METHODS_FIGURE)
+    plots.iterations_by_level(success_by_passes(rows_of(Path(), *PUZZLES)), SEARCHES_FIGURE)
+
+
+def rows_of(root: Path, *names: str) -> list[Row]:
+    """The rows of some experiments."""
+    return [row for name in names for row in results.read(root / "results" / f"{name}.jsonl")]
 
 
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
-    rows: dict[str, list[Row]] = {"babyai": results.read(root / "results" / "babyai.jsonl")}
+    rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
     for name in ("planning", "training"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
@@ -90,6 +102,7 @@ def documents(root: Path) -> dict[Path, str]:
         "iterations": (iterations, "babyai"),
         "methods": (methods, "babyai"),
         "acting": (acting, "babyai"),
+        "searches": (searches, "puzzles"),
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -150,7 +163,9 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row of results/babyai.jsonl is in a table; one that is in none is stale."""
+    """Whether a row is in a table; one that is in none is stale."""
+    if row["domain"] in PUZZLES:
+        return any(setting.has(row) for _, _, setting in _searches(row["domain"], row["level"]))
     changes = ({}, EARLIER, *({"iterations": n} for n in ITERATIONS))
     settings = (*SETTINGS, *ITERATED, *(s for each in BY_METHOD.values() for s in each.values()))
     return any(setting.has(row, **change) for setting in settings for change in changes)
@@ -246,6 +261,52 @@ def acting(rows: Sequence[Row]) -> str:
         if of and method != "random"
     ]
     return _table("level | method | success | steps per episode | ms per action", lines)
+
+
+def _searches(domain: str, level: str) -> list[tuple[str, int, Setting]]:
+    """What a level's column holds: its name, how many times T passes it makes (0: one), setting."""
+    horizon = config_of_preset(domain, level, "leap", "leapjax").planner.horizon
+    found = [
+        (search.name, search.passes, Setting(search.name, "leapjax", options=search.of(horizon)))
+        for search in SEARCHES
+    ]
+    return [*found, *((f"`--method {s.method}`", 1, s) for s in ONE_ACTION)]
+
+
+def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, list[Row]]]]:
+    """By level, in the order of their domains: name, times T passes, and rows of each search."""
+    levels = [(domain, level) for domain in PUZZLES for level in find_domain(domain).levels]
+    found = {}
+    for domain, level in levels:
+        mine = [row for row in rows if row["level"] == level]
+        if mine:
+            found[level] = [
+                (name, times, _of_setting(mine, setting))
+                for name, times, setting in _searches(domain, level)
+            ]
+    return found
+
+
+def searches(rows: Sequence[Row]) -> str:
+    """Success of every way to search with the same trained energy, beside methods of one action."""
+    found = rows_by_search(rows)
+    lines = []
+    for each in zip(*found.values(), strict=True):  # one search, on every level
+        name, times, _ = each[0]
+        passes = {0: "1", 1: "T"}.get(times, f"{times} T")
+        lines.append([name, passes, *(_rate(of) for _, _, of in each)])
+    return _table(" | ".join(["planner", "passes", *found]), lines)
+
+
+def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+    """By level, name of the search, and number of passes: its rows, added up."""
+    added: dict[str, dict[str, dict[int, Row]]] = {}
+    for level, columns in rows_by_search(rows).items():
+        for name, _, of in columns:
+            if of and of[0]["method"] == "leap":
+                sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
+                added.setdefault(level, {}).setdefault(name, {})[of[0]["iterations"]] = sums
+    return added
 
 
 def speed(rows: Sequence[Row]) -> str:

@@ -1,11 +1,15 @@
-"""Sudoku: `python -m experiments.sudoku --help`."""
+"""Sudoku: `python -m experiments.sudoku --help`.
+
+Trains a method to fill boards that it has never seen, then plans with what was trained in every
+way that there is, and reports success against the passes of the model that each takes.
+"""
 
 import sys
 from collections.abc import Sequence
 
 from experiments.common import experiment
 from experiments.common.experiment import Experiment
-from experiments.stars import searches
+from experiments.common.searches import searches
 
 EXPERIMENT = Experiment("sudoku", "sudoku", searches)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import stars
-from experiments.common import results
+from experiments.common import results, searches
 from experiments.common.config import preset
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
@@ -165,8 +165,8 @@ def test_presets_and_data_that_there_are_not(capsys):
 
 def test_every_planner_has_a_row(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    few = {name: stars.PLANNERS[name] for name in (stars.AT_ONCE, "most certain first")}
-    monkeypatch.setattr(stars, "PLANNERS", few)
+    few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]
+    monkeypatch.setattr(searches, "SEARCHES", few)
     toy = "--level Star2x2 --steps 2 --demos 2 --episodes 4 --batch 2 --width 8 --heads 2"
     arguments = [*toy.split(), "--layers", "1", "--no-pictures"]
     assert stars.main(arguments) == 0

@@ -68,11 +68,14 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
             colour = drawn[label].get_color() if label in drawn else f"C{len(drawn)}"
             (drawn[label],) = axis.plot(list(by_count), rates, "o-", color=colour)
         axis.set_title(level, fontsize=9)
-        axis.set(xscale="log", ylim=(0, 102), xlabel="iterations N")
-        axis.set_xticks([1, 2, 5, 10, 30], ["1", "2", "5", "10", "30"])
+        axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
+        ticks = sorted({count for by_count in by_label.values() for count in by_count})
+        axis.set_xticks(ticks, [str(count) for count in ticks])
         axis.minorticks_off()
     labels = [label.replace("`", "") for label in drawn]
-    figure.legend(drawn.values(), labels, loc="outside lower center", ncols=max(1, len(drawn)))
+    figure.legend(
+        drawn.values(), labels, loc="outside lower center", ncols=min(4, max(1, len(drawn)))
+    )
     _save(figure, path)
 
 

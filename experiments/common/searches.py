@@ -1,0 +1,39 @@
+"""Every way to search with one trained energy over plans that are executed whole."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from experiments.common.config import Config
+
+
+class Search(NamedTuple):
+    """A way to plan."""
+
+    name: str
+    passes: int  # of the model, in units of the horizon T; 0: a single one
+    options: Mapping[str, Any]  # of `GibbsConfig`, but for the number of iterations
+
+    def of(self, horizon: int) -> dict[str, Any]:
+        """Options for plans of T actions."""
+        plain = {"fill": "together", "order": "random"}
+        return {**plain, **self.options, "iterations": max(1, self.passes * horizon)}
+
+
+SEARCHES = (
+    Search("all at once", 0, {}),
+    Search("left to right", 1, {"fill": "sequential"}),
+    Search("in random order", 1, {"fill": "random"}),
+    *(Search("Gibbs sampling, random order", n, {}) for n in (1, 2, 4)),
+    *(Search("Gibbs sampling, left to right", n, {"order": "sequential"}) for n in (1, 2, 4)),
+    *(Search("Gibbs sampling, least certain first", n, {"order": "uncertain"}) for n in (1, 2, 4)),
+    Search("most certain first", 1, {"fill": "confident"}),
+    Search("most certain first, by margin", 1, {"fill": "margin"}),
+    Search("most certain first, then Gibbs", 2, {"fill": "confident", "order": "uncertain"}),
+)
+
+
+def searches(config: Config[Any, Any, Any]) -> list[Mapping[str, Any]]:
+    """Options of every way to plan with LEAP; methods of one action at a time have one."""
+    if config.method != "leap":
+        return []
+    return [search.of(config.planner.horizon) for search in SEARCHES]

@@ -1,0 +1,238 @@
+"""Sudoku: boards have one solution, whatever is done to them; its rules as an energy."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import sudoku
+from experiments.common import results, searches
+from leapjax.batching import compile_planner
+from leapjax.data import windows
+from leapjax.domain import blank_context
+from leapjax.energy import compose
+from leapjax.errors import UserError
+from leapjax.planners import GibbsConfig
+from leapjax.sudoku import boards
+from leapjax.sudoku.boards import Size, SudokuAdapter
+from leapjax.sudoku.domain import Settings, make
+from leapjax.sudoku.rules import rules
+from leapjax.types import pad_token
+
+SMALL, LARGE = Size(4, 6), Size(9, 36)
+SIZES = pytest.mark.parametrize("size", [SMALL, LARGE], ids=str)
+
+
+def groups(side):
+    """Rows, columns and boxes, cell by cell: `[3 side, side]`."""
+    box = {4: 2, 9: 3}[side]
+    cells = [(r, c) for r in range(side) for c in range(side)]
+    found: dict = {}
+    for r, c in cells:
+        for name in (("row", r), ("column", c), ("box", r // box, c // box)):
+            found.setdefault(name, []).append(r * side + c)
+    return np.array(list(found.values()))
+
+
+def solved(digits, side):
+    """Whether every group holds every digit."""
+    return all(sorted(digits[group]) == list(range(1, side + 1)) for group in groups(side))
+
+
+def test_the_search_finds_every_board_and_no_other():
+    every = boards.solutions(np.zeros(16, np.int32), most=1000)
+    assert len(every) == 288  # as is known of 4 by 4
+    assert len({tuple(board) for board in every}) == 288
+    assert all(solved(board, 4) for board in every)
+    contradiction = np.zeros(16, np.int32)
+    contradiction[[0, 3]] = 2
+    assert boards.solutions(contradiction) == []
+
+
+def test_the_search_finds_the_solution_of_a_published_board():
+    clues = "530070000600195000098000060800060003400803001700020006060000280000419005000080079"
+    solution = "534678912672195348198342567859761423426853791713924856961537284287419635345286179"
+    (found,) = boards.solutions(np.array(list(clues), int))
+    assert "".join(map(str, found)) == solution
+
+
+@SIZES
+def test_boards_have_so_many_clues_and_one_solution(size):
+    seen = set()
+    for seed in range(10):
+        clues, solution = boards.draw(size, seed)
+        assert (clues > 0).sum() == size.clues
+        assert (clues == np.where(clues > 0, solution, 0)).all() and solved(solution, size.side)
+        (only,) = boards.solutions(clues)
+        np.testing.assert_array_equal(only, solution)
+        seen.add(tuple(clues))
+        np.testing.assert_array_equal(boards.draw(size, seed)[0], clues)
+    assert len(seen) == 10
+
+
+def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
+    adapter = SudokuAdapter(SMALL)
+    adapter.reset(1)
+    solution = adapter.solution
+    steps = [adapter.step(int(digit) - 1) for digit in solution]
+    assert [step.terminated for step in steps] == [False] * 15 + [True]
+    assert [step.reward for step in steps] == [0.0] * 15 + [1.0] and steps[-1].success
+    np.testing.assert_array_equal(steps[-1].observation.digits, solution)
+    first = adapter.reset(1)
+    assert (first.digits > 0).sum() == SMALL.clues and first.cell == 0
+    step = adapter.step(int(solution[0]) % 4)
+    assert step.terminated and not step.success
+    np.testing.assert_array_equal(step.observation.digits, first.digits)
+
+
+@functools.cache
+def transformed(size):
+    """The window at a cell of a demonstration, with another board: compiled once."""
+    data = boards.collect(size, 2, 0, lambda done: None).demonstrations
+    extras = make(f"Sudoku{size.side}x{size.clues}", Settings()).extras
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, extras))
+
+    @jax.jit
+    def draw(key, index):
+        window = windows.window(steps, index, 2, size.cells, size.side)
+        return boards.transform(key, window, size.side)
+
+    return draw
+
+
+@SIZES
+@pytest.mark.parametrize("cell", [0, 1, 7])
+def test_a_transformed_window_is_that_of_another_board(size, cell):
+    draw, seen = transformed(size), set()
+    for seed, episode in itertools.product(range(4), range(2)):
+        window = draw(jax.random.key(seed), episode * size.cells + cell)
+        window = jax.tree.map(np.asarray, window)
+        board, past = window.context.observation, window.context.past
+        assert board.cell == cell
+        rest = size.cells - cell
+        assert (window.actions[rest:] == size.side).all()  # the end action
+        (solution,) = boards.solutions(board.digits)  # what is left has one solution
+        np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
+        assert (board.digits[:cell] > 0).all()
+        clues = (board.digits[cell:] > 0).sum()
+        assert clues <= size.clues and (cell > 0 or clues == size.clues)
+        for back in (1, 2):
+            if back > cell:
+                assert window.context.actions[-back] == pad_token(size.side + 1)
+                assert not past.digits[-back].any()
+            else:
+                assert window.context.actions[-back] + 1 == solution[cell - back]
+                assert past.cell[-back] == cell - back
+                after = past.digits[-back].copy()
+                after[cell - back : cell] = board.digits[cell - back : cell]
+                np.testing.assert_array_equal(after, board.digits)
+        seen.add(tuple(board.digits))
+    assert len(seen) == 8
+
+
+def broken(digits, side):
+    """Pairs of cells with the same digit in one row, column or box."""
+    pairs = {
+        pair for group in groups(side) for pair in itertools.combinations(sorted(group.tolist()), 2)
+    }
+    return sum(digits[a] == digits[b] and digits[a] > 0 for a, b in pairs)
+
+
+def test_the_energy_of_the_rules_counts_what_breaks_them():
+    energy, rng = rules(4, weight=3.0), np.random.default_rng(0)
+    clues, solution = boards.draw(SMALL, 0)
+    context = blank_context(make("Sudoku4x6", Settings()), 0)
+    context = context._replace(observation=context.observation._replace(digits=clues))
+    memory = energy.encode((), context)
+    assert float(energy.total((), memory, jnp.asarray(solution - 1))) == 0
+    empty = np.flatnonzero(clues == 0)
+    for _ in range(20):
+        digits = np.where(clues > 0, clues, rng.integers(1, 5, 16))
+        total = float(energy.total((), memory, jnp.asarray(digits - 1)))
+        assert total == pytest.approx(3.0 * broken(digits, 4))
+        # A conditional is the total with each digit in turn, up to a constant.
+        cell = int(rng.choice(empty))
+        tried = [np.where(np.arange(16) == cell, digit, digits) for digit in range(1, 5)]
+        totals = np.array([3.0 * broken(board, 4) for board in tried])
+        found = energy.conditional((), memory, jnp.asarray(digits - 1), jnp.array([cell]))[0]
+        np.testing.assert_allclose(found[:4] - found[0], totals - totals[0], rtol=1e-5)
+        assert np.isinf(found[4])  # the end action
+        # What is MASK breaks nothing; a clue counts even where it is MASK.
+        blank = jnp.full(16, 5)
+        found = energy.conditional((), memory, blank, jnp.array([cell]))[0]
+        tried = [np.where(np.arange(16) == cell, digit, clues) for digit in range(1, 5)]
+        np.testing.assert_allclose(found[:4], [3.0 * broken(board, 4) for board in tried])
+    changed = solution.copy()
+    clue = int(np.flatnonzero(clues)[0])
+    changed[clue] = solution[clue] % 4 + 1
+    assert np.isinf(energy.total((), memory, jnp.asarray(changed - 1)))
+
+
+def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
+    domain = make("Sudoku4x6", Settings())
+    drawn = [boards.draw(SMALL, seed) for seed in range(40)]
+    clues, solution = (np.stack(part) for part in zip(*drawn, strict=True))
+    blank = jax.tree.map(lambda x: np.stack([x] * 40), blank_context(domain, 0))
+    contexts = blank._replace(observation=blank.observation._replace(digits=clues))
+    keys = jax.random.split(jax.random.key(0), 40)
+
+    def share(energy, params, config):
+        plan = compile_planner(energy, config, chunk_sizes=(40,))(params, keys, contexts)
+        kept = np.where(clues > 0, plan.actions + 1, 0)
+        np.testing.assert_array_equal(kept, clues)
+        return (plan.actions + 1 == solution).all(axis=1).mean()
+
+    certain = GibbsConfig(16, iterations=16, fill="confident")
+    left_to_right = GibbsConfig(16, iterations=16, fill="sequential")
+    refined = GibbsConfig(16, iterations=160, temperature=1.0, restarts=10)
+    energy = rules(4)
+    assert share(energy, (), left_to_right) < share(energy, (), certain)
+    assert share(energy, (), certain) > 0.9
+    assert share(energy, (), refined) > 0.9
+    both = compose([energy, energy], [0.5, 0.5])
+    assert share(both, ((), ()), certain) == share(energy, (), certain)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Sudoku9", "unknown level 'Sudoku9': expected Sudoku<4 or 9>x<clues>, such as Sudoku4x6"),
+        ("sudoku9x36", "did you mean Sudoku9x36"),
+        ("Sudoku6x10", "unknown level"),
+        ("Sudoku9x17", r"clues must be in 26 \.\. 81, got 17"),
+        ("Sudoku4x17", r"clues must be in 4 \.\. 16"),
+    ],
+)
+def test_unknown_levels_are_one_line(name, message):
+    with pytest.raises(UserError, match=message):
+        boards.find_level(name)
+
+
+def test_data_that_solve_no_board_are_refused():
+    domain = make("Sudoku4x6", Settings())
+    (demonstration,) = boards.collect(SMALL, 1, 0, lambda done: None).demonstrations
+    states = demonstration.observations
+    domain.check(states, "here")
+    for wrong, message in (
+        (
+            states._replace(digits=states.digits + 1),
+            "here: digits run from 1 to 5, expected 0 to 4",
+        ),
+        (jax.tree.map(lambda x: x[:5], states), "here does not fill the 16 cells"),
+        (states._replace(cell=states.cell[::-1]), "one after the other"),
+    ):
+        with pytest.raises(UserError, match=message):
+            domain.check(wrong, "here")
+
+
+def test_the_program_trains_and_plans(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few = [search for search in searches.SEARCHES if search.name == "all at once"]
+    monkeypatch.setattr(searches, "SEARCHES", few)
+    toy = "--level Sudoku4x8 --steps 2 --demos 2 --episodes 3 --batch 2 --width 8 --heads 2"
+    assert sudoku.main([*toy.split(), "--layers", "1", "--no-pictures"]) == 0
+    rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
+    assert [(row["iterations"], row["horizon"]) for row in rows] == [(16, 16), (1, 16)]
