@@ -10,11 +10,10 @@ from experiments.common import plots, program, results
 from experiments.common.config import configuration_hash, with_options
 from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
-from experiments.common.searches import SEARCHES
+from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS, paper_success
 from leapjax.checkpoints import read_json
-from leapjax.domains import find_domain
 from leapjax.files import read_text, write_text
 
 EARLIER = {"test_seed": 0, "episodes": 200}  # test levels that were played during development
@@ -60,7 +59,13 @@ BY_METHOD = {
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
-# Of levels whose plans are executed whole: each way to search, and methods of one action.
+# Where plans are executed whole: what is minimised, and methods of one action.
+LEARNED = ", learned"
+MINIMISED = {
+    LEARNED: Setting("learned", "leapjax"),
+    ", rules": Setting("rules", "leapjax", "rules"),
+    ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
+}
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
@@ -165,7 +170,7 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 def is_used(row: Row) -> bool:
     """Whether a row is in a table; one that is in none is stale."""
     if row["domain"] in PUZZLES:
-        return any(setting.has(row) for _, _, setting in _searches(row["domain"], row["level"]))
+        return any(row in of for each in rows_by_search([row]).values() for _, _, of in each)
     changes = ({}, EARLIER, *({"iterations": n} for n in ITERATIONS))
     settings = (*SETTINGS, *ITERATED, *(s for each in BY_METHOD.values() for s in each.values()))
     return any(setting.has(row, **change) for setting in settings for change in changes)
@@ -263,27 +268,26 @@ def acting(rows: Sequence[Row]) -> str:
     return _table("level | method | success | steps per episode | ms per action", lines)
 
 
-def _searches(domain: str, level: str) -> list[tuple[str, int, Setting]]:
-    """What a level's column holds: its name, how many times T passes it makes (0: one), setting."""
-    horizon = config_of_preset(domain, level, "leap", "leapjax").planner.horizon
-    found = [
-        (search.name, search.passes, Setting(search.name, "leapjax", options=search.of(horizon)))
-        for search in SEARCHES
-    ]
-    return [*found, *((f"`--method {s.method}`", 1, s) for s in ONE_ACTION)]
+def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
+    """By level and what is minimised: name, passes and rows of each way.
 
-
-def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, int, list[Row]]]]:
-    """By level, in the order of their domains: name, times T passes, and rows of each search."""
-    levels = [(domain, level) for domain in PUZZLES for level in find_domain(domain).levels]
+    Each has the same ways to search, whether there are rows or not.
+    """
     found = {}
-    for domain, level in levels:
-        mine = [row for row in rows if row["level"] == level]
-        if mine:
-            found[level] = [
-                (name, times, _of_setting(mine, setting))
-                for name, times, setting in _searches(domain, level)
-            ]
+    for domain, level in {(row["domain"], row["level"]): None for row in rows}:
+        mine = [row for row in rows if (row["domain"], row["level"]) == (domain, level)]
+        horizon = config_of_preset(domain, level, "leap", "leapjax").planner.horizon
+        for suffix, setting in MINIMISED.items():
+            ways: list[tuple[str, str, list[Row]]] = []
+            for search in (*SEARCHES, BEST_OF_MANY):
+                options = {**setting.options, **search.of(horizon)}
+                of = _of_setting(mine, dataclasses.replace(setting, options=options))
+                ways.append((search.name, search.cost, of))
+            for one in ONE_ACTION:
+                of = _of_setting(mine, one) if suffix == LEARNED else []
+                ways.append((f"`--method {one.method}`", "T", of))
+            if any(of for _, _, of in ways):
+                found[f"{level}{suffix}"] = ways
     return found
 
 
@@ -292,18 +296,18 @@ def searches(rows: Sequence[Row]) -> str:
     found = rows_by_search(rows)
     lines = []
     for each in zip(*found.values(), strict=True):  # one search, on every level
-        name, times, _ = each[0]
-        passes = {0: "1", 1: "T"}.get(times, f"{times} T")
+        name, passes, _ = each[0]
         lines.append([name, passes, *(_rate(of) for _, _, of in each)])
     return _table(" | ".join(["planner", "passes", *found]), lines)
 
 
 def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
-    """By level, name of the search, and number of passes: its rows, added up."""
+    """By level, name of the search, and number of passes: rows of what was learned, added up."""
     added: dict[str, dict[str, dict[int, Row]]] = {}
-    for level, columns in rows_by_search(rows).items():
-        for name, _, of in columns:
-            if of and of[0]["method"] == "leap":
+    planned = [row for row in rows if row["method"] == "leap"]
+    for level, ways in rows_by_search(planned).items():
+        for name, _, of in ways if level.endswith(LEARNED) else []:
+            if of:
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
                 added.setdefault(level, {}).setdefault(name, {})[of[0]["iterations"]] = sums
     return added

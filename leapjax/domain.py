@@ -15,7 +15,7 @@ import numpy as np
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
-from leapjax.types import Context, Demonstration, PyTree, Window
+from leapjax.types import Context, Demonstration, Energy, PyTree, Window
 
 Augmentation = Callable[[jax.Array, Window], Window]
 # (key, window) -> window: one training example as it could have been
@@ -54,6 +54,7 @@ class Domain(NamedTuple):
     # what augmentations must know of each step, [n, ...]; no model sees it
     check: Callable[[PyTree, str], None] = _nothing_to_check
     # (observations [n + 1, ...], where) -> UserError if a value is out of range
+    rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
     paper_success: Mapping[str, float] = {}  # the paper's results by method, in percent

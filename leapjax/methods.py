@@ -9,6 +9,7 @@ from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
 from leapjax.agents.plate import PLATE
 from leapjax.agents.random import RANDOM
+from leapjax.agents.rules import RULES
 from leapjax.errors import UserError
 
 METHODS: dict[str, Method] = {
@@ -19,6 +20,7 @@ METHODS: dict[str, Method] = {
     "bcq": BCQ,
     "iql": IQL,
     "plate": PLATE,
+    "rules": RULES,
     "random": RANDOM,
 }
 

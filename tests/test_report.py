@@ -118,3 +118,46 @@ def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path
     assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
     plots.iterations_by_level(found, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 1000
+
+
+def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
+    """A row of a level whose plans are executed whole."""
+    domain = "stars" if level.startswith("Star") else "sudoku"
+    config = with_options(preset(domain, level, method, "leapjax"), options)
+    return {
+        "domain": domain, "level": level, "method": method, "preset": "leapjax", "seed": seed,
+        "first_episode_seed": config.test_seed, "episodes": 100, "successes": round(100 * rate),
+        "iterations": config.planner.iterations, "train_steps": config.training.steps,
+        "hash": configuration_hash(config, seed),
+    }  # fmt: skip
+
+
+def test_ways_to_search_stand_beside_each_other(tmp_path):
+    rows = [
+        puzzle_row(rate=1.0), puzzle_row(seed=1, rate=0.9),  # as trained
+        puzzle_row(rate=0.3, fill="together", iterations=20),
+        puzzle_row(method="bc", rate=0.4),
+        puzzle_row("Sudoku4x6", "rules", rate=0.6, fill="together", iterations=1),
+        puzzle_row("Sudoku4x6", rate=0.7, rules=1.0),
+        puzzle_row(rate=0.8, fill="margin", iterations=9),  # of no table
+    ]  # fmt: skip
+    assert [report.is_used(row) for row in rows] == [True] * 6 + [False]
+    lines = [[c.strip() for c in line.split("|")[1:-1]] for line in
+             report.searches(rows).splitlines()]  # fmt: skip
+    assert lines[0] == [
+        "planner", "passes", "Star3x5, learned", "Sudoku4x6, rules", "Sudoku4x6, learned and rules",
+    ]  # fmt: skip
+    found = {tuple(line[:2]): [cell.split(" ")[0] for cell in line[2:]] for line in lines[2:]}
+    assert found["most certain first", "T"] == ["95.0%", "-", "70.0%"]
+    assert found["Gibbs sampling, random order", "4 T"] == ["30.0%", "-", "-"]
+    assert found["`--method bc`", "T"] == ["40.0%", "-", "-"]
+    assert found["all at once", "1"] == ["-", "60.0%", "-"]
+    assert found["most certain first, best of 100", "100 T"] == ["-"] * 3
+    by_passes = report.success_by_passes(rows)
+    assert list(by_passes) == ["Star3x5, learned"]
+    assert by_passes["Star3x5, learned"] == {
+        "most certain first": {5: {"successes": 190, "episodes": 200}},
+        "Gibbs sampling, random order": {20: {"successes": 30, "episodes": 100}},
+    }
+    plots.iterations_by_level(by_passes, tmp_path / "searches.png")
+    assert (tmp_path / "searches.png").stat().st_size > 0

@@ -60,6 +60,8 @@ class Config(Generic[M, D, P]):
     """K, past steps that the planner sees."""
     executed: int | None = None
     """Actions to execute before replanning; None: the whole plan, as in the paper."""
+    rules: float = 0.0
+    """Weight of the domain's rules, which are added to what was learned while planning."""
     checkpoint: Path | None = None
     """Folder of an earlier run to evaluate instead of training; brings its settings along."""
     pretrained: bool = False
@@ -158,7 +160,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any, Any]]:
             trained = pretrained.read_specification(folder)
         method = chosen.method or (trained.method if trained else Config.method)
         name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        for one in METHODS if method == "all" else [method]:
+        every = [other for other in METHODS if METHODS[other].everywhere]
+        for one in every if method == "all" else [method]:
             default = preset(domain, each, one, name)
             if trained and (trained.domain, trained.method) == (domain, one):
                 default = _as_trained(default, trained)
@@ -216,6 +219,10 @@ def check(config: Config[Any, Any, Any]) -> None:
     check_executed(config.executed, config.planner.horizon)
     checkpoints.check_path(config.runs)
     domain = make_domain(config)
+    if not 0 <= config.rules < float("inf"):  # false for NaN too
+        raise UserError(f"--rules must be a number, at least 0, got {config.rules}")
+    if config.rules and domain.rules is None:
+        raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     limit = domain.shortest_limit
     if limit is not None and config.planner.horizon > limit:
         raise UserError(

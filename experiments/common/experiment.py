@@ -134,6 +134,7 @@ def run_one(
             seeds.check_disjoint([d.seed for d in data], played)
             processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
             planner, metrics = run.fit(this, data, mesh, wait)
+        planner = run.with_rules(planner, this)
         episodes = run.measure(planner, this, played)
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
 

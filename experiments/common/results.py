@@ -127,10 +127,14 @@ def percent(row: Row) -> str:
 
 def planner_name(row: Row) -> str:
     """How a row's plans were found, as far as it says."""
-    planner = row.get("configuration", {}).get("planner", {})
-    fill = planner.get("fill", "together")
-    passes = [f"N = {planner['iterations']}"] if "iterations" in planner else []
-    return ", ".join([*passes, *([fill] if fill != "together" else [])])
+    configuration = row.get("configuration", {})
+    planner, rules = configuration.get("planner", {}), configuration.get("rules", 0)
+    parts = {
+        f"N = {planner.get('iterations')}": "iterations" in planner,
+        str(planner.get("fill")): planner.get("fill", "together") != "together",
+        f"rules {rules}": bool(rules),
+    }
+    return ", ".join(part for part, said in parts.items() if said)
 
 
 def success_table(rows: Sequence[Row]) -> Table:

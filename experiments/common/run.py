@@ -30,6 +30,7 @@ from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.domain import Domain, blank_context
+from leapjax.energy import compose
 from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
@@ -303,6 +304,16 @@ def _training_settings(specification: Specification) -> dict[str, Any]:
         for name, value in settings.items()
         if name == "planner.horizon" or name.split(".")[0] not in ("planner", "signature")
     }
+
+
+def with_rules(planner: Pretrained, run: Run) -> Pretrained:
+    """A planner that minimises the domain's rules too, where that is asked for."""
+    weight, rules = run.config.rules, run.domain.rules
+    if not weight or rules is None:
+        return planner
+    energy = compose([planner.energy, rules], [1.0, weight])
+    plan = compile_planner(energy, run.config.planner, CHUNK_SIZES)
+    return Pretrained(planner.specification, energy, (planner.params, ()), plan)
 
 
 def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from experiments.common.config import Config
+from leapjax.planners import GibbsConfig
 
 
 class Search(NamedTuple):
@@ -12,6 +13,12 @@ class Search(NamedTuple):
     name: str
     passes: int  # of the model, in units of the horizon T; 0: a single one
     options: Mapping[str, Any]  # of `GibbsConfig`, but for the number of iterations
+
+    @property
+    def cost(self) -> str:
+        """Passes in all, in words."""
+        passes = self.passes * self.options.get("restarts", 1)
+        return {0: "1", 1: "T"}.get(passes, f"{passes} T")
 
     def of(self, horizon: int) -> dict[str, Any]:
         """Options for plans of T actions."""
@@ -30,10 +37,16 @@ SEARCHES = (
     Search("most certain first, by margin", 1, {"fill": "margin"}),
     Search("most certain first, then Gibbs", 2, {"fill": "confident", "order": "uncertain"}),
 )
+# To score a learned energy takes T more passes: only for rules, whose total is one.
+BEST_OF_MANY = Search(
+    "most certain first, best of 100", 1,
+    {"fill": "confident", "temperature": 0.2, "restarts": 100},
+)  # fmt: skip
 
 
 def searches(config: Config[Any, Any, Any]) -> list[Mapping[str, Any]]:
-    """Options of every way to plan with LEAP; methods of one action at a time have one."""
-    if config.method != "leap":
+    """Options of every way to plan; methods of one action at a time have one."""
+    if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
-    return [search.of(config.planner.horizon) for search in SEARCHES]
+    every = (*SEARCHES, BEST_OF_MANY) if config.method == "rules" else SEARCHES
+    return [search.of(config.planner.horizon) for search in every]

@@ -135,6 +135,23 @@ class Method(NamedTuple):
     presets: Presets  # whatever the level; what that asks for is in its domain's presets
     rewards: bool = False  # it learns from them: data without any are refused
     planner: type = GibbsConfig  # the settings of how it searches
+    everywhere: bool = True  # every domain can have it, so it is one of `--method all`
+
+
+def untrained(energy: Energy) -> Agent:
+    """An agent whose energy has nothing to learn: its parameters are `()`."""
+
+    def init(key: jax.Array) -> TrainState:
+        del key
+        return TrainState((), (), jnp.int32(0))
+
+    def update(
+        state: TrainState, batch: PyTree, key: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        del batch, key
+        return state._replace(step=state.step + 1), {"loss": jnp.zeros(())}
+
+    return Agent(init, lambda key, steps: (), update, energy)
 
 
 ExampleLoss = Callable[[Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]

@@ -2,13 +2,12 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import SINGLE_ACTION, Method, Presets, Setup
+from leapjax.agents.learning import SINGLE_ACTION, Method, Presets, Setup, untrained
 from leapjax.energy import single_action
-from leapjax.types import Agent, Context, Params, PyTree, TrainState
+from leapjax.types import Agent, Context, Params, PyTree
 
 # There is nothing to learn and nothing to learn it from; at temperature 1 all actions are alike.
 NOTHING = {**SINGLE_ACTION, "steps": 0, "demos": 0, "temperature": 1.0}
@@ -29,18 +28,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         del params, context
         return ()
 
-    def init(key: jax.Array) -> TrainState:
-        del key
-        return TrainState({}, (), jnp.int32(0))
-
-    def update(
-        state: TrainState, batch: PyTree, key: jax.Array
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
-        del batch, key
-        return state._replace(step=state.step + 1), {"loss": jnp.zeros(())}
-
     energy = single_action(encode, lambda params, memory: jnp.zeros(choices), choices + 1)
-    return Agent(init, lambda key, steps: (), update, energy)
+    return untrained(energy)
 
 
 RANDOM = Method(Settings, make_agent, PRESETS)

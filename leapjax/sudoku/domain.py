@@ -15,6 +15,7 @@ from leapjax.errors import UserError
 from leapjax.models.transformer import embed
 from leapjax.sudoku import boards
 from leapjax.sudoku.boards import Board, SudokuAdapter
+from leapjax.sudoku.rules import rules
 from leapjax.types import Context
 
 
@@ -64,6 +65,7 @@ def make(name: str, settings: Settings) -> Domain:
         encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
         augmentations=[turn] if settings.augment else [],
         extras=boards.puzzles,
+        rules=rules(size.side),
         check=functools.partial(check, side=size.side),
         signature={"side": size.side, "clues": size.clues},
     )

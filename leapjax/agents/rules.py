@@ -1,0 +1,34 @@
+"""Planning by what a domain knows of itself: its rules as an energy, without any learning."""
+
+import dataclasses
+
+from jax.sharding import Mesh
+
+from leapjax.agents.learning import Method, Presets, Setup, untrained
+from leapjax.errors import UserError
+from leapjax.types import Agent
+
+NOTHING = {"steps": 0, "demos": 0}
+PRESETS: Presets = {"paper": NOTHING, "leapjax": NOTHING}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """There is nothing to choose."""
+
+
+def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
+    """The domain's rules as an `Agent`.
+
+    Raises:
+        UserError: it has none.
+    """
+    del mesh
+    if setup.domain.rules is None:
+        raise UserError(
+            f"--method rules: {setup.domain.level} has no rules that are written as an energy"
+        )
+    return untrained(setup.domain.rules)
+
+
+RULES = Method(Settings, make_agent, PRESETS, everywhere=False)
