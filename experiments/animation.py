@@ -8,8 +8,9 @@ import numpy as np
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from PIL import Image, ImageDraw
 
+from experiments.common.pictures import Frame, save_animation
 from experiments.common.run import Run
-from leapjax import files, rollouts
+from leapjax import rollouts
 from leapjax.babyai import levels
 from leapjax.babyai.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.babyai.levels import Level
@@ -27,22 +28,13 @@ GLYPHS = dict(zip(range(len(ACTIONS)), ["L", "R", "F", "pick", "drop", "open", "
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws one episode per level seed, one after the other, with MiniGrid's renderer."""
     level = levels.find_level(run.config.level)
-    frames: list[Image.Image] = []
-    durations: list[int] = []
+    frames: list[Frame] = []
     for level_seed in seeds:
-        for frame, duration in episode_frames(planner, level, level_seed, run.seed):
-            frames.append(frame)
-            durations.append(duration)
-    with files.whole(path) as scratch:
-        frames[0].save(
-            scratch, save_all=True, append_images=frames[1:], duration=durations, loop=0,
-            optimize=True,
-        )  # fmt: skip
+        frames += episode_frames(planner, level, level_seed, run.seed)
+    save_animation(frames, path)
 
 
-def episode_frames(
-    planner: Pretrained, level: Level, level_seed: int, seed: int
-) -> list[tuple[Image.Image, int]]:
+def episode_frames(planner: Pretrained, level: Level, level_seed: int, seed: int) -> list[Frame]:
     """The frames of one episode with their durations in milliseconds."""
     adapter = BabyAIAdapter(level)
     context = planner.specification.context

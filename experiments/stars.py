@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from experiments.common import experiment
 from experiments.common.experiment import Experiment
 from experiments.common.searches import searches
+from experiments.star_animation import animate
 
-EXPERIMENT = Experiment("stars", "stars", searches)
+EXPERIMENT = Experiment("stars", "stars", searches, animate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

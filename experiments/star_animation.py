@@ -1,0 +1,119 @@
+"""The way through star graphs being found, by two planners side by side, as an animated GIF."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from PIL import Image, ImageDraw
+
+from experiments.common.pictures import Frame, save_animation
+from experiments.common.run import Run
+from experiments.common.searches import SEARCHES, searches
+from leapjax import rollouts
+from leapjax.batching import compile_planner, plan_keys
+from leapjax.pretrained import Pretrained
+from leapjax.stars.graphs import Graph, Star, StarAdapter, find_level
+
+SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels
+PASS_MS, LAST_MS = 700, 2200
+SHOWN = ("Gibbs sampling, random order", "most certain first")
+WHITE, GREY, BLACK = (255, 255, 255), (170, 170, 170), (0, 0, 0)
+BLUE, LIGHT, GREEN, RED = (80, 160, 255), (205, 228, 255), (60, 170, 80), (215, 70, 60)
+
+
+def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
+    """Draws the passes over one graph per level seed; nothing for methods of one action."""
+    if not searches(run.config):
+        return
+    star = find_level(run.config.level)
+    chosen = {s.name: s for s in SEARCHES if s.name in SHOWN and s.passes == 1}
+    frames: list[Frame] = []
+    for seed in seeds:
+        adapter = StarAdapter(star)
+        graph = adapter.reset(seed)
+        history = rollouts.History(graph, planner.specification.context, adapter.num_actions)
+        contexts = rollouts.stack_contexts([history])
+        keys = plan_keys(run.seed, np.array([seed]), np.array([0]))
+        traces = {}
+        for name in SHOWN:
+            options = chosen[name].of(star.length)
+            config = dataclasses.replace(run.config.planner, **options)
+            plan = compile_planner(planner.energy, config, (1,), jax.devices()[:1])
+            traces[name] = np.asarray(plan(planner.params, keys, contexts).trace[0])
+        frames += _frames(star, graph, adapter.path, traces)
+    save_animation(frames, path)
+
+
+def _frames(
+    star: Star, graph: Graph, path: np.ndarray, traces: dict[str, np.ndarray]
+) -> list[Frame]:
+    """One frame for each pass, the planners side by side."""
+    places = layout(star, graph)
+    passes = len(next(iter(traces.values())))
+    found = []
+    for index in range(passes):
+        image = Image.new("RGB", (SIDE * len(traces), SIDE + CAPTION), WHITE)
+        for column, (name, trace) in enumerate(traces.items()):
+            panel = picture(graph, places, path, trace[: index + 1], name, index == passes - 1)
+            image.paste(panel, (SIDE * column, 0))
+        found.append((image, LAST_MS if index == passes - 1 else PASS_MS))
+    return found
+
+
+def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
+    """Where each node is drawn: the centre in the middle, arms as rays."""
+    after: dict[int, list[int]] = {}
+    for parent, child in graph.edges.tolist():
+        after.setdefault(parent, []).append(child)
+    middle, step = SIDE / 2, (SIDE / 2 - 2 * RADIUS) / star.length
+    places = {int(graph.node): (middle, middle)}
+    for arm, first in enumerate(sorted(after[int(graph.node)])):
+        angle = 2 * math.pi * arm / star.arms - math.pi / 2
+        node, distance = first, step
+        while True:
+            places[node] = middle + distance * math.cos(angle), middle + distance * math.sin(angle)
+            if node not in after:
+                break
+            (node,) = after[node]
+            distance += step
+    return places
+
+
+def picture(
+    graph: Graph,
+    places: dict[int, tuple[float, float]],
+    path: np.ndarray,
+    trace: np.ndarray,
+    name: str,
+    last: bool,
+) -> Image.Image:
+    """The graph, the plan after the last pass of `trace [n, T]`, and what it is.
+
+    Nodes of the plan are blue, those of this pass dark; at the end green where they are right.
+    """  # fmt: skip
+    image = Image.new("RGB", (SIDE, SIDE + CAPTION), WHITE)
+    pen = ImageDraw.Draw(image)
+    plan = trace[-1]
+    new = plan != (trace[-2] if len(trace) > 1 else np.full_like(plan, -1))
+    for parent, child in graph.edges.tolist():
+        pen.line([places[parent], places[child]], fill=GREY, width=2)
+    colours = {}
+    for position, node in enumerate(plan.tolist()):
+        done = GREEN if node == path[position] else RED
+        colours[node] = done if last else BLUE if new[position] else LIGHT
+    for node, (x, y) in places.items():
+        box = (x - RADIUS, y - RADIUS, x + RADIUS, y + RADIUS)
+        goal = node == int(graph.goal)
+        pen.ellipse(box, fill=colours.get(node, WHITE), outline=BLACK, width=3 if goal else 1)
+        pen.text((x, y), str(node), fill=BLACK, anchor="mm")
+    known = [str(node) if node in places else "?" for node in plan.tolist()]
+    pen.text((6, SIDE + 4), f"{name}: pass {len(trace)}", fill=BLACK)
+    way = f"from {int(graph.node)} to {int(graph.goal)}: {' '.join(known)}"
+    right = bool((plan == path).all())
+    pen.text(
+        (6, SIDE + 22), f"{way}   {'found' if right else 'wrong'}" if last else way, fill=BLACK
+    )
+    return image
