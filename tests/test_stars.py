@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
-from experiments import stars
+from experiments import star_animation, stars
 from experiments.common import results, searches
 from experiments.common.config import preset
 from leapjax.agents.learning import Setup
@@ -168,13 +169,19 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch):
     few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]
     monkeypatch.setattr(searches, "SEARCHES", few)
     toy = "--level Star2x2 --steps 2 --demos 2 --episodes 4 --batch 2 --width 8 --heads 2"
-    arguments = [*toy.split(), "--layers", "1", "--no-pictures"]
+    arguments = [*toy.split(), "--layers", "1"]
     assert stars.main(arguments) == 0
+    (folder,) = (tmp_path / "runs").glob("stars-*")
+    with Image.open(folder / "plan.gif") as animation:
+        assert animation.n_frames == 3 * 2  # graphs, passes
+        assert animation.width == 2 * star_animation.SIDE
     rows = results.read(tmp_path / "runs" / "stars.jsonl")
     found = [(row["train_steps"], row["iterations"], results.planner_name(row)) for row in rows]
     assert found == [
         (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
     ]  # fmt: skip
     assert rows[0]["successes"] == rows[2]["successes"]  # the same planner, played again
-    assert stars.main([*arguments, "--method", "bc"]) == 0  # one action at a time: one row
+    assert (
+        stars.main([*arguments, "--method", "bc", "--no-pictures"]) == 0
+    )  # one action at a time: one row
     assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import sudoku
+from experiments import babyai, sudoku
 from experiments.common import results, searches
 from leapjax.batching import compile_planner
 from leapjax.data import windows
@@ -228,11 +228,39 @@ def test_data_that_solve_no_board_are_refused():
             domain.check(wrong, "here")
 
 
-def test_the_program_trains_and_plans(tmp_path, monkeypatch):
+def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     few = [search for search in searches.SEARCHES if search.name == "all at once"]
     monkeypatch.setattr(searches, "SEARCHES", few)
-    toy = "--level Sudoku4x8 --steps 2 --demos 2 --episodes 3 --batch 2 --width 8 --heads 2"
-    assert sudoku.main([*toy.split(), "--layers", "1", "--no-pictures"]) == 0
+    toy = "--level Sudoku4x8 --episodes 8 --no-pictures".split()
+    network = "--steps 2 --demos 2 --batch 2 --width 8 --heads 2 --layers 1".split()
+    assert sudoku.main([*toy, *network]) == 0
+    (folder,) = (path for path in (tmp_path / "runs").glob("sudoku-*"))
+    assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
+    monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
+    assert sudoku.main([*toy, "--method", "rules"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
-    assert [(row["iterations"], row["horizon"]) for row in rows] == [(16, 16), (1, 16)]
+    found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
+    assert found == [
+        ("leap", 16, "N = 16, confident"), ("leap", 1, "N = 1"),
+        ("leap", 16, "N = 16, confident, rules 1.0"),
+        ("rules", 16, "N = 16, confident"), ("rules", 1, "N = 1"),
+    ]  # fmt: skip
+    # Eight clues leave little open. What two steps have learned is next to nothing.
+    assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]
+    assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "message"),
+    [
+        (babyai, ["--method", "rules"], "GoToLocalS7N5 has no rules that are written as an energy"),
+        (babyai, ["--rules", "1"], "--rules: GoToLocalS7N5 has no rules"),
+        (sudoku, ["--rules", "-1"], "--rules must be a number, at least 0, got -1.0"),
+        (sudoku, ["--rules", "nan"], "--rules must be a number"),
+    ],
+)
+def test_rules_that_cannot_be_had_are_one_line(program, arguments, message, capsys):
+    assert program.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

@@ -71,7 +71,8 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
             if config.checkpoint is None:
                 folder = run_folder(experiment, config, seed)
                 for options in experiment.searches(config):
-                    again = dataclasses.replace(with_options(config, options), checkpoint=folder)
+                    other = with_options(config, options)
+                    again = dataclasses.replace(other, checkpoint=folder, pictures=False)
                     rows.append(run_one(experiment, again, seed, versions, console, interruption))
         except program.FAILURES as error:
             if len(runs) > 1:  # the others can still be run
