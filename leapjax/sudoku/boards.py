@@ -137,8 +137,9 @@ def solutions(
     return found
 
 
+@functools.lru_cache(maxsize=10_000)  # every way to search is measured on the same boards
 def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`.
+    """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`; not to be changed.
 
     Cells of a random solution are emptied in random order, as long as the rest have one solution;
     where no more can be, another is begun.
@@ -160,6 +161,8 @@ def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
             else:
                 several //= 2  # one of these is
         if not excess:
+            for board in (clues, solution):
+                board.setflags(write=False)
             return clues, solution
 
 
