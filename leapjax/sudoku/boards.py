@@ -139,10 +139,10 @@ def solutions(
 
 @functools.lru_cache(maxsize=10_000)  # every way to search is measured on the same boards
 def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`; not to be changed.
+    """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`.
 
-    Cells of a random solution are emptied in random order, as long as the rest have one solution;
-    where no more can be, another is begun.
+    Neither may be changed. Cells of a random solution are emptied in random order, as long as the
+    rest have one solution; where no more can be, another is begun.
     """
     rng = np.random.default_rng(seed)
     while True:
