@@ -1,7 +1,7 @@
 """What each way to search costs and gives: `python -m benchmarks.quality runs/RUN`.
 
-Success on validation levels (never on test levels) against plans per second, for one
-trained planner and many search settings. Speed is measured at one batch of contexts, the
+Success on validation levels (never on test levels) against plans per second, for
+trained planners and many search settings. Speed is measured at one batch of contexts, the
 first states of those levels.
 """
 
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import matplotlib
 import numpy as np
@@ -25,7 +25,7 @@ from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
 from leapjax.errors import UserError
-from leapjax.planners import GibbsConfig
+from leapjax.planners import FILLS, GibbsConfig
 from leapjax.scores import wilson_interval
 
 matplotlib.use("Agg")
@@ -39,8 +39,8 @@ AUTHORS = {(5, 10): 11.8, (10, 30): 2.9, (15, 50): 1.2}
 class Options:
     """Measure success and speed of search settings."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """The folder of a run."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or levels for which a planner comes with the library."""
     episodes: int = 500
     """Validation episodes for each setting."""
     batch: int = 256
@@ -62,13 +62,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Options) -> None:
     """Measures every setting."""
+    if not options.runs:
+        raise UserError("expected at least one folder of a run, or a level")
+    folders = [pretrained.find(path) for path in options.runs]
+    searches = {}
+    for folder in folders:
+        specification = pretrained.read_specification(folder)
+        if not isinstance(specification.planner, GibbsConfig):
+            raise UserError(f"{folder}: {specification.method} does not plan by Gibbs sampling")
+        most = levels.find_level(specification.level).iterations
+        searches[folder] = variants(specification.planner, most)
     runtime.start()
-    specification = pretrained.read_specification(options.run)
-    if not isinstance(specification.planner, GibbsConfig):
-        raise UserError(f"{options.run}: {specification.method} does not plan by Gibbs sampling")
-    paper = levels.find_level(specification.level).iterations
-    configs = variants(specification.planner, paper)
-    rows = [measure(options, name, config) for name, config in configs.items()]
+    rows = [
+        measure(options, folder, name, config)
+        for folder, configs in searches.items()
+        for name, config in configs.items()
+    ]
     Console().print(table(rows))
     write_rows(options.json, rows)
     if options.plot:
@@ -77,27 +86,34 @@ def run(options: Options) -> None:
 
 def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:
     """Search settings to compare, by what to call them; the paper's N is `most`."""
-    greedy = dataclasses.replace(trained, temperature=0.0)
-    result = {}
-    for n in sorted({1, 2, 3, 5, 10, most}):
-        if n <= most:
-            result[f"random, N = {n}"] = dataclasses.replace(trained, iterations=n)
-            result[f"random, N = {n}, temperature 0"] = dataclasses.replace(greedy, iterations=n)
-    half = max(2, most // 2)
-    result[f"sequential, N = {half}"] = dataclasses.replace(
-        trained, iterations=half, order="sequential"
-    )
-    if trained.horizon > 1:
-        result[f"random, N = {half}, P = 2"] = dataclasses.replace(
-            trained, iterations=half, resampled=2
+    horizon = trained.horizon
+
+    def search(**options: Any) -> GibbsConfig:
+        plain = {"fill": "together", "order": "random", "resampled": 1}
+        return dataclasses.replace(trained, **{**plain, **options})
+
+    result = {
+        f"all at once, N = {n}": search(iterations=n) for n in sorted({1, 2, 5, horizon, most})
+    }
+    for order in ("sequential", "uncertain"):
+        result[f"all at once, {order}, N = {horizon}"] = search(iterations=horizon, order=order)
+    for fill in FILLS[1:]:
+        result[f"{fill}, N = {horizon}"] = search(iterations=horizon, fill=fill)
+    half = -(-horizon // 2)
+    if horizon > 1:
+        result[f"all at once, P = 2, N = {half}"] = search(iterations=half, resampled=2)
+        result[f"confident, P = 2, N = {half}"] = search(
+            iterations=half, resampled=2, fill="confident"
         )
-    result["best of 4, N = 3"] = dataclasses.replace(trained, iterations=min(3, most), restarts=4)
+    result[f"confident, best of 4, N = {horizon}"] = search(
+        iterations=horizon, fill="confident", restarts=4
+    )
     return result
 
 
-def measure(options: Options, name: str, config: GibbsConfig) -> Row:
+def measure(options: Options, path: Path, name: str, config: GibbsConfig) -> Row:
     """Success and speed of one setting."""
-    planner = pretrained.load(options.run, config)
+    planner = pretrained.load(path, config)
     specification = planner.specification
     domain, context = pretrained.make_domain(specification), specification.context
     adapter = domain.make_adapter()
@@ -117,10 +133,11 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
     row: Row = {
         "variant": name,
         "level": specification.level,
+        "preset": specification.origin.preset,
         "horizon": config.horizon,
         "iterations": config.iterations,
         "paper_iterations": levels.find_level(specification.level).iterations,
-        "run": options.run.resolve().name,
+        "run": path.resolve().name,
         "training_steps": specification.training.steps,
         "plans_per_second": options.batch / taken,
         "episodes": options.episodes,
@@ -134,11 +151,12 @@ def measure(options: Options, name: str, config: GibbsConfig) -> Row:
 
 def table(rows: Sequence[Row]) -> Table:
     """The rows for a terminal."""
-    result = Table("search", "success", "95% interval", "plans/s", "authors' code x")
+    result = Table("level", "search", "success", "95% interval", "plans/s", "authors' code x")
     for row in rows:
         low, high = wilson_interval(row["successes"], row["episodes"])
         authors = AUTHORS.get((row["horizon"], row["paper_iterations"]))
         result.add_row(
+            f"{row['level']}, {row['preset']}",
             row["variant"],
             f"{row['successes'] / row['episodes']:.1%}",
             f"{low:.1%} to {high:.1%}",
@@ -158,11 +176,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             row["plans_per_second"], 100 * share,
             yerr=[[100 * (share - low)], [100 * (high - share)]],
             fmt="os^Dv<>P*Xhp"[index % 12], color=f"C{index % 10}", capsize=2,
-            label=row["variant"],
+            label=f"{row['level']}, {row['preset']}: {row['variant']}",
         )  # fmt: skip
     axes.set(
         xscale="log", xlabel="plans per second",
-        ylabel=f"success on {rows[0]['episodes']} validation episodes, %", title=rows[0]["level"],
+        ylabel=f"success on {rows[0]['episodes']} validation episodes, %",
     )  # fmt: skip
     speeds = [row["plans_per_second"] for row in rows]
     ticks = [t for t in 125.0 * 2.0 ** np.arange(10) if min(speeds) / 1.5 < t < max(speeds) * 1.5]

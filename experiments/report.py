@@ -95,7 +95,7 @@ def rows_of(root: Path, *names: str) -> list[Row]:
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
-    for name in ("planning", "training"):
+    for name in ("planning", "training", "quality"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
         "results": (success, "babyai"),
@@ -108,6 +108,7 @@ def documents(root: Path) -> dict[Path, str]:
         "methods": (methods, "babyai"),
         "acting": (acting, "babyai"),
         "searches": (searches, "puzzles"),
+        "quality": (quality, "quality"),
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -350,6 +351,23 @@ def planning(rows: Sequence[Row]) -> str:
         if row["batch"] in (1, 16, 256, 1024)
     ]
     return _table("preset | T, N | batch | plans/s | GFLOP/s | peak | fraction", lines)
+
+
+def quality(rows: Sequence[Row]) -> str:
+    """What each way to search gives and costs, for each planner: success, steps, ms per plan."""
+
+    def cell(row: Row) -> str:
+        rate, milliseconds = row["successes"] / row["episodes"], 1e3 / row["plans_per_second"]
+        return f"{rate:.1%}, {row['mean_length']:.1f}, {milliseconds:.2f}"
+
+    planners = list(dict.fromkeys((row["level"], row["preset"]) for row in rows))
+    found = {(row["level"], row["preset"], row["variant"]): cell(row) for row in rows}
+    titles = [f"{level}, `{preset}`" for level, preset in planners]
+    lines = [
+        [variant, *(found.get((*planner, variant), "-") for planner in planners)]
+        for variant in dict.fromkeys(row["variant"] for row in rows)
+    ]
+    return _table(" | ".join(["search", *titles]), lines)
 
 
 def training(rows: Sequence[Row]) -> str:

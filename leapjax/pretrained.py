@@ -154,6 +154,13 @@ def publish(folder: Path, target: Path) -> None:
     save_specification(target, planner.specification)
 
 
+def find(path: str | os.PathLike[str]) -> Path:
+    """The folder of a run; or, where there is none, of the published planner of a level."""
+    folder = Path(path)
+    published = not folder.exists() and (PUBLISHED / folder).is_dir()
+    return PUBLISHED / folder if published else folder
+
+
 def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
@@ -170,9 +177,7 @@ def load(
     Raises:
         UserError: no such run, one that cannot be read, or another horizon.
     """
-    folder = Path(path)
-    if not folder.exists() and (PUBLISHED / folder).is_dir():
-        folder = PUBLISHED / folder
+    folder = find(path)
     specification = read_specification(folder)
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:

@@ -152,7 +152,7 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     assert found["Gibbs sampling, random order", "4 T"] == ["30.0%", "-", "-"]
     assert found["`--method bc`", "T"] == ["40.0%", "-", "-"]
     assert found["all at once", "1"] == ["-", "60.0%", "-"]
-    assert found["most certain first, best of 100", "100 T"] == ["-"] * 3
+    assert found["most certain first, best of 16", "16 T"] == ["-"] * 3
     by_passes = report.success_by_passes(rows)
     assert list(by_passes) == ["Star3x5, learned"]
     assert by_passes["Star3x5, learned"] == {

@@ -39,8 +39,8 @@ SEARCHES = (
 )
 # To score a learned energy takes T more passes: only for rules, whose total is one.
 BEST_OF_MANY = Search(
-    "most certain first, best of 100", 1,
-    {"fill": "confident", "temperature": 0.2, "restarts": 100},
+    "most certain first, best of 16", 1,
+    {"fill": "confident", "temperature": 0.2, "restarts": 16},
 )  # fmt: skip
 
 
