@@ -50,7 +50,7 @@ SETTINGS = (
 TITLES = " | ".join(setting.title for setting in SETTINGS)
 WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fields": 0})
 # The methods of the paper's table, beside the floor, with both presets.
-COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "leap")
+COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
 BY_METHOD = {
     preset: {method: Setting(method, preset, method) for method in COMPARED}

@@ -7,6 +7,7 @@ from leapjax.agents.dt import DT
 from leapjax.agents.iql import IQL
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
+from leapjax.agents.mopo import MOPO
 from leapjax.agents.plate import PLATE
 from leapjax.agents.random import RANDOM
 from leapjax.agents.rules import RULES
@@ -19,6 +20,7 @@ METHODS: dict[str, Method] = {
     "dt": DT,
     "bcq": BCQ,
     "iql": IQL,
+    "mopo": MOPO,
     "plate": PLATE,
     "rules": RULES,
     "random": RANDOM,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from leapjax import batching, training
-from leapjax.agents import bc, bcq, dt, iql
+from leapjax.agents import bc, bcq, dt, iql, mopo
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
@@ -16,30 +16,37 @@ from leapjax.planners import GibbsConfig
 from tests import mixed, toy
 from tests.toy import LEFT, RIGHT
 
-MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql}
+MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql, "mopo": mopo}
 QUICKLY = {"discount": 0.9, "target_rate": 0.1}
 SETTINGS = {
     "bc": bc.Settings(), "dt": dt.Settings(),
     "bcq": bcq.Settings(**QUICKLY),
     # Advantages are small here: far from the middle a wrong step costs a tenth.
     "iql": iql.Settings(**QUICKLY, inverse_temperature=30.0),
+    "mopo": mopo.Settings(**QUICKLY, inverse_temperature=30.0),
 }  # fmt: skip
 STEPS = 400
 
 
-@functools.cache
 def trained(name, architecture="leapjax", past=0):
+    """As `_trained`: the same arguments, however they are given, are trained once."""
+    return _trained(name, architecture, past)
+
+
+@functools.cache
+def _trained(name, architecture, past):
     """An agent after a moment of training on walks that go wrong more often than right."""
     model = ModelConfig(architecture, layers=1, heads=1, width=32, dropout=0.0)
+    steps = 2 * STEPS if name == "mopo" else STEPS  # a model of the world comes first
     learn = TrainingConfig(
-        STEPS, batch=128, warmup=10, learning_rate=3e-3, weight_decay=0.0, windows="step"
+        steps, batch=128, warmup=10, learning_rate=3e-3, weight_decay=0.0, windows="step"
     )
     setup = Setup(mixed.DOMAIN, past, 1, model, learn, SETTINGS[name])
     agent = MODULES[name].make_agent(setup)
     metrics = []
     state = training.train(
         training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), mixed.steps(),
-        jax.random.key(1), STEPS, lambda done, state, means: metrics.append(means),
+        jax.random.key(1), steps, lambda done, state, means: metrics.append(means),
     )  # fmt: skip
     return agent, state, metrics
 
@@ -64,7 +71,7 @@ def test_cloning_does_what_was_done_most_often():
 
 @pytest.mark.parametrize(
     ("name", "architecture", "past"),
-    [("bcq", "leapjax", 0), ("iql", "leapjax", 0), ("bcq", "paper", 2)],
+    [("bcq", "leapjax", 0), ("iql", "leapjax", 0), ("mopo", "leapjax", 0), ("bcq", "paper", 2)],
 )
 def test_the_best_policy_is_found(name, architecture, past):
     agent, state, metrics = trained(name, architecture, past)
@@ -115,6 +122,32 @@ def test_iql_values_lie_between_what_the_data_do_and_what_is_best():
     assert (value < best.max(axis=1) + 0.05).all() and (value > best.min(axis=1) - 0.15).all()
     # Nearer to the middle is better, from both sides.
     assert (np.diff(value[:5]) > 0).all() and (np.diff(value[5:]) < 0).all()
+
+
+def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_others():
+    """Nobody waits in the data."""
+    _, state, metrics = trained("mopo")
+    setup = Setup(
+        mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
+        TrainingConfig(), SETTINGS["mopo"],
+    )  # fmt: skip
+    module = mopo.Networks(setup.policy(("features", 32)), 3, SETTINGS["mopo"].members)
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def predict(context, action):
+        features = module.apply(state.extra, context, method="features")
+        predicted = module.apply(state.params, features, action[None], method="predict")
+        return predicted.reward.mean(axis=0)[0], mopo.disagreement(predicted)[0]
+
+    found = {action: predict(mixed.contexts(0), jnp.int32(action)) for action in range(3)}
+    unseen = found[toy.WAIT][1]
+    for action in (LEFT, RIGHT):
+        rewards, disagreement = found[action]
+        assert (disagreement < unseen).all()
+        ends = 1 if action == LEFT else -1  # from where such a step leads to the middle
+        assert mixed.PLACES[np.argmax(rewards)] == ends and rewards.max() > 0.3
+    assert metrics[-1]["ensemble"] < metrics[0]["ensemble"]
 
 
 def test_the_target_network_follows_slowly():
@@ -171,7 +204,9 @@ def test_longer_plans_are_refused(name):
         (bcq.Settings, {"threshold": -0.1}), (bcq.Settings, {"discount": 1.1}),
         (bcq.Settings, {"target_rate": float("nan")}), (iql.Settings, {"expectile": 2.0}),
         (iql.Settings, {"inverse_temperature": -1.0}),
-        (iql.Settings, {"largest_weight": float("inf")}),
+        (iql.Settings, {"largest_weight": float("inf")}), (mopo.Settings, {"members": 1}),
+        (mopo.Settings, {"penalty": -1.0}), (mopo.Settings, {"real_share": 1.5}),
+        (mopo.Settings, {"rollout": 0}), (mopo.Settings, {"expectile": -1.0}),
         (dt.Settings, {"target_return": float("nan")}),
     ],
 )  # fmt: skip

@@ -6,6 +6,7 @@ of what was done.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -81,21 +82,15 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         taken, known = losses.last_actions(context, len(held["value"]), choices)
         least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))
 
-        advantages = least - now["value"][:, 0]
-        values = losses.expectile(advantages, settings.expectile)
-        targets = losses.bellman(transition, later["value"][:, 0], settings.discount)
-        differences = sum(
-            (losses.of_action(now[name], taken) - targets) ** 2 for name in ("q1", "q2")
-        )
-        weights = jnp.exp(settings.inverse_temperature * jax.lax.stop_gradient(advantages))
-        likelihoods = losses.of_action(jax.nn.log_softmax(policy["logits"]), taken)
-        cloned = -jnp.minimum(weights, settings.largest_weight) * likelihoods
+        value, logits = now["value"][:, 0], policy["logits"]
+        returns = losses.bellman(transition, later["value"][:, 0], settings.discount)
+        each = loss(settings, value, (now["q1"], now["q2"]), least, logits, taken, returns)
 
-        hits = jnp.argmax(policy["logits"], axis=1) == taken
-        return losses.mean_where(values + differences + cloned, known), {
+        hits = jnp.argmax(logits, axis=1) == taken
+        return losses.mean_where(each, known), {
             "accuracy": losses.mean_where(hits, known),
-            "value": losses.mean_where(now["value"][:, 0], known),
-            "advantage": losses.mean_where(advantages, known),
+            "value": losses.mean_where(value, known),
+            "advantage": losses.mean_where(least - value, known),
         }
 
     init = learning.make_init(setup, module, _say, optimizer, target=_critic)
@@ -105,6 +100,34 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     )  # fmt: skip
     energy = learning.acting_energy(setup, say)
     return Agent(init, transition_batches(setup), update, energy)
+
+
+def loss(
+    settings: Settings,
+    value: jax.Array,
+    qs: Sequence[jax.Array],
+    least: jax.Array,
+    logits: jax.Array,
+    taken: jax.Array,
+    returns: jax.Array,
+) -> jax.Array:
+    """The losses `[P]` of the value (equation 5), of all Q-functions (6) and of the policy (7).
+
+    Args:
+        settings: the expectile, and how advantages weigh.
+        value: `[P]` of each state.
+        qs: Q-values `[P, A - 1]`, each of a function of its own.
+        least: `[P]` the least of the target's, of the action that was taken.
+        logits: `[P, A - 1]` of the policy.
+        taken: `[P]` the actions.
+        returns: `[P]` what they gave, and the value of what they led to.
+    """
+    advantages = jax.lax.stop_gradient(least) - value
+    values = losses.expectile(advantages, settings.expectile)
+    differences = sum(jnp.square(losses.of_action(q, taken) - returns) for q in qs)
+    weights = jnp.exp(settings.inverse_temperature * jax.lax.stop_gradient(advantages))
+    likelihoods = losses.of_action(jax.nn.log_softmax(logits), taken)
+    return values + differences - jnp.minimum(weights, settings.largest_weight) * likelihoods
 
 
 def _critic(params: Params) -> Params:
