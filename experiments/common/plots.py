@@ -60,7 +60,7 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         rows: by level, label of the line, and number of iterations.
         path: to write.
     """
-    figure, axes = _panels(len(rows), columns=4, width=2.7)
+    figure, axes = _panels(len(rows), columns=4, width=2.7 if len(rows) > 1 else 5)
     drawn: dict[str, Line2D] = {}  # one of each label, for the legend
     for axis, (level, by_label) in zip(axes, rows.items(), strict=False):
         for label, by_count in by_label.items():
