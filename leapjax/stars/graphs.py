@@ -22,7 +22,7 @@ from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration, Window
 
-LEVELS = ("Star3x5", "Star5x10")
+LEVELS = ("Star3x5", "Star5x5")
 MOST_NODES = 1000
 
 
