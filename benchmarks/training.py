@@ -26,7 +26,7 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import Config, make_domain, preset, specify
+from experiments.common.config import make_domain, preset, specify
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
 from leapjax.data.windows import Steps, concatenate
@@ -74,7 +74,7 @@ def run(options: Options) -> None:
 class Stepper:
     """Training steps of a configuration on made-up demonstrations, compiled; a call makes one."""
 
-    def __init__(self, config: Config[Any, Any, Any], mesh: Mesh) -> None:
+    def __init__(self, config: AnyConfig, mesh: Mesh) -> None:
         self._config, self._domain = config, make_domain(config)
         agent = self._agent(mesh)
         self.energy = agent.energy
@@ -167,7 +167,7 @@ def _is_float(leaf: jax.Array) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def measure(config: Config[Any, Any, Any], seconds: float) -> Row:
+def measure(config: AnyConfig, seconds: float) -> Row:
     """One preset on one level."""
     batch = config.training.batch
     mesh = sharding.make_mesh(batch)

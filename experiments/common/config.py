@@ -81,6 +81,8 @@ class Config(Generic[M, D, P]):
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
 
 
+AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
+
 # What a result does not depend on, or what its row holds on its own.
 _NOT_HASHED = (
     "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
@@ -88,7 +90,7 @@ _NOT_HASHED = (
 )  # fmt: skip
 
 
-def blank(domain: str, level: str, method: str) -> Config[Any, Any, Any]:
+def blank(domain: str, level: str, method: str) -> AnyConfig:
     """The defaults of every option, before any preset.
 
     Raises:
@@ -99,7 +101,7 @@ def blank(domain: str, level: str, method: str) -> Config[Any, Any, Any]:
     return Config(*settings, domain, level, method)
 
 
-def preset(domain: str, level: str, method: str, name: str) -> Config[Any, Any, Any]:
+def preset(domain: str, level: str, method: str, name: str) -> AnyConfig:
     """The defaults of a preset: the level's, then the method's, then the level's for the method.
 
     Raises:
@@ -119,9 +121,7 @@ def _names(settings: Any) -> set[str]:
     return {field.name for field in dataclasses.fields(settings)}
 
 
-def with_options(
-    config: Config[Any, Any, Any], options: Mapping[str, Any]
-) -> Config[Any, Any, Any]:
+def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
     """A configuration with some options changed, by the names that the command line has."""
     changed: dict[str, Any] = {}
     for group in GROUPS:
@@ -133,7 +133,7 @@ def with_options(
     return dataclasses.replace(config, **changed, **options)
 
 
-def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any, Any]]:
+def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     """One configuration per level and method from a command line; exits with 2 if it is bad.
 
     Raises:
@@ -172,7 +172,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[Config[Any, Any, Any]]:
     return configs
 
 
-def _as_trained(default: Config[Any, Any, Any], trained: Specification) -> Config[Any, Any, Any]:
+def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
     """Defaults that are what an earlier run has."""
     return dataclasses.replace(
         default,
@@ -184,7 +184,7 @@ def _as_trained(default: Config[Any, Any, Any], trained: Specification) -> Confi
     )
 
 
-def _parse(arguments: Sequence[str], default: Config[Any, Any, Any]) -> Config[Any, Any, Any]:
+def _parse(arguments: Sequence[str], default: AnyConfig) -> AnyConfig:
     # Which options there are depends on the method and the domain.
     groups = ("method_settings", "domain_settings", "planner")
     settings = tuple(type(getattr(default, group)) for group in groups)
@@ -196,7 +196,7 @@ def _parse(arguments: Sequence[str], default: Config[Any, Any, Any]) -> Config[A
         raise UserError(str(error)) from None
 
 
-def check(config: Config[Any, Any, Any]) -> None:
+def check(config: AnyConfig) -> None:
     """Refuses what cannot work before any long work starts.
 
     Raises:
@@ -234,7 +234,7 @@ def check(config: Config[Any, Any, Any]) -> None:
     check_memory(config, domain)
 
 
-def check_memory(config: Config[Any, Any, Any], domain: Domain) -> None:
+def check_memory(config: AnyConfig, domain: Domain) -> None:
     """Refuses what would need more memory than the machine has, by what it needs at least.
 
     Raises:
@@ -266,12 +266,12 @@ def check_memory(config: Config[Any, Any, Any], domain: Domain) -> None:
             )
 
 
-def make_domain(config: Config[Any, Any, Any]) -> Domain:
+def make_domain(config: AnyConfig) -> Domain:
     """The level of a configuration."""
     return find_domain(config.domain).make(config.level, config.domain_settings)
 
 
-def specify(config: Config[Any, Any, Any], seed: int, domain: Domain) -> Specification:
+def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
     """What a run leaves beside its parameters."""
     return Specification(
         config.domain, config.level, config.method, config.context,
@@ -302,7 +302,7 @@ def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
 
 
-def episode_seeds(config: Config[Any, Any, Any]) -> range:
+def episode_seeds(config: AnyConfig) -> range:
     """The level seeds of the episodes that success is measured on.
 
     Raises:
@@ -312,13 +312,13 @@ def episode_seeds(config: Config[Any, Any, Any]) -> range:
     return first(config.test_seed, config.episodes)
 
 
-def resolved(config: Config[Any, Any, Any], seed: int) -> dict[str, Any]:
+def resolved(config: AnyConfig, seed: int) -> dict[str, Any]:
     """All settings that one seed's result depends on, as JSON values."""
     values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
     return json.loads(json.dumps({**values, "seed": seed}))
 
 
-def configuration_hash(config: Config[Any, Any, Any], seed: int) -> str:
+def configuration_hash(config: AnyConfig, seed: int) -> str:
     """Twelve hexadecimal digits that name a configuration.
 
     They are those of domain, level, method and what differs from the defaults alone, so that a

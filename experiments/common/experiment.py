@@ -11,7 +11,7 @@ from rich.console import Console
 
 from experiments.common import program, results, run, runtime
 from experiments.common.config import (
-    Config,
+    AnyConfig,
     configuration_hash,
     episode_seeds,
     make_domain,
@@ -34,7 +34,7 @@ class Experiment(NamedTuple):
 
     name: str  # of its module, and of its file of rows
     domain: str
-    searches: Callable[[Config[Any, Any, Any]], Sequence[Mapping[str, Any]]] = lambda config: ()
+    searches: Callable[[AnyConfig], Sequence[Mapping[str, Any]]] = lambda config: ()
     # how else to plan with what was trained: options of the planner, a row for each
     animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
     # (planner, run, level seeds, path): draws plans being refined and executed
@@ -84,7 +84,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
         raise failure
 
 
-def run_folder(experiment: Experiment, config: Config[Any, Any, Any], seed: int) -> Path:
+def run_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:
     """Where a run leaves what it makes."""
     of = f"{config.level}-{config.method}-{config.preset}-seed{seed}"
     label = f"{experiment.name}-{of}-{configuration_hash(config, seed)}"
@@ -93,7 +93,7 @@ def run_folder(experiment: Experiment, config: Config[Any, Any, Any], seed: int)
 
 def run_one(
     experiment: Experiment,
-    config: Config[Any, Any, Any],
+    config: AnyConfig,
     seed: int,
     versions: dict[str, str],
     console: Console,

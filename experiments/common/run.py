@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from experiments.common import plots
-from experiments.common.config import Config
+from experiments.common.config import AnyConfig
 from experiments.common.interruption import Interruption
 from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
@@ -48,7 +48,7 @@ CHUNK_SIZES = (32,)
 class Run:
     """What every step of a run needs."""
 
-    config: Config[Any, Any, Any]
+    config: AnyConfig
     domain: Domain
     specification: Specification
     folder: Path
@@ -230,7 +230,7 @@ def fit(
     return Pretrained(run.specification, agent.energy, params, plan), metrics
 
 
-def training_mesh(config: Config[Any, Any, Any]) -> Mesh:
+def training_mesh(config: AnyConfig) -> Mesh:
     """The devices that a run trains on, those of all processes included.
 
     Raises:

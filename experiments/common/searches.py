@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from experiments.common.config import Config
+from experiments.common.config import AnyConfig
 from leapjax.planners import GibbsConfig
 
 
@@ -44,7 +44,7 @@ BEST_OF_MANY = Search(
 )  # fmt: skip
 
 
-def searches(config: Config[Any, Any, Any]) -> list[Mapping[str, Any]]:
+def searches(config: AnyConfig) -> list[Mapping[str, Any]]:
     """Options of every way to plan; methods of one action at a time have one."""
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
