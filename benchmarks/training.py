@@ -26,7 +26,7 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import make_domain, preset, specify
+from experiments.common.config import AnyConfig, make_domain, preset, specify
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
 from leapjax.data.windows import Steps, concatenate
