@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax import batching, training
+from leapjax import batching
 from leapjax.agents import bc
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
@@ -25,12 +25,8 @@ SETUP = Setup(toy.DOMAIN, 2, 1, MODEL, TRAINING, bc.Settings())
 def trained():
     """An agent that was trained for a moment, its parameters and the last metrics."""
     agent = bc.make_agent(SETUP)
-    data = jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
-    metrics = []
-    state = training.train(
-        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), data,
-        jax.random.key(1), TRAINING.steps, lambda done, state, means: metrics.append(means),
-    )  # fmt: skip
+    data = windows.concatenate(toy.demonstrations())
+    state, metrics = toy.learn(agent, data, TRAINING.steps)
     return agent, state.params, metrics
 
 

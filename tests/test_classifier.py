@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax import batching, training
+from leapjax import batching
 from leapjax.agents import classifier
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
@@ -42,12 +42,8 @@ def trained():
     """An agent that was trained for a moment, its parameters, a batch and the losses."""
     agent = classifier.make_agent(SETUP)
     data = jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
-    losses = []
-    state = training.train(
-        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), data,
-        jax.random.key(1), TRAINING.steps,
-        lambda done, state, means: losses.append(means["loss"]),
-    )  # fmt: skip
+    state, metrics = toy.learn(agent, data, TRAINING.steps)
+    losses = [means["loss"] for means in metrics]
     return agent, state.params, jax.jit(agent.batch)(jax.random.key(2), data), losses
 
 

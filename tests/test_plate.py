@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax import training
 from leapjax.agents import plate
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.batching import compile_planner
@@ -110,11 +109,7 @@ def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
 def trained():
     setup = setup_of("leapjax", 0, steps=300)
     agent = plate.make_agent(setup)
-    metrics = []
-    state = training.train(
-        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), data(),
-        jax.random.key(1), setup.training.steps, lambda done, s, means: metrics.append(means),
-    )  # fmt: skip
+    state, metrics = toy.learn(agent, data(), setup.training.steps)
     return agent, state.params, metrics
 
 

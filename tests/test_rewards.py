@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax import batching, training
+from leapjax import batching
 from leapjax.agents import bc, bcq, dt, iql, mopo
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.errors import UserError
@@ -43,12 +43,7 @@ def _trained(name, architecture, past):
     )
     setup = Setup(mixed.DOMAIN, past, 1, model, learn, SETTINGS[name])
     agent = MODULES[name].make_agent(setup)
-    metrics = []
-    state = training.train(
-        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)), mixed.steps(),
-        jax.random.key(1), steps, lambda done, state, means: metrics.append(means),
-    )  # fmt: skip
-    return agent, state, metrics
+    return agent, *toy.learn(agent, mixed.steps(), steps)
 
 
 def acts(agent, params, past=0):
@@ -172,15 +167,12 @@ def test_decision_transformer_does_what_leads_to_the_return_that_is_asked_for():
     )
     rng = np.random.default_rng(0)
     walks = [mixed.walk(rng, int(x), share, 6) for x in mixed.PLACES for share in (0.0, 1.0)]
-    data = jax.tree.map(jnp.asarray, mixed.windows.concatenate(walks))
+    data = mixed.windows.concatenate(walks)
     agents = {
         target: dt.make_agent(Setup(mixed.DOMAIN, 2, 1, model, learn, dt.Settings(target)))
         for target in (1.0, 0.0)
     }
-    state = training.train(
-        training.make_train_step(agents[1.0]), jax.jit(agents[1.0].init)(jax.random.key(0)), data,
-        jax.random.key(1), learn.steps, lambda done, state, means: None,
-    )  # fmt: skip
+    state, _ = toy.learn(agents[1.0], data, learn.steps)
     good, bad = (acts(agents[target], state.params, 2) for target in (1.0, 0.0))
     np.testing.assert_array_equal(good, mixed.best_actions())
     np.testing.assert_array_equal(bad, np.where(good == LEFT, RIGHT, LEFT))

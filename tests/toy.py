@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax import training
 from leapjax.domain import Domain
 from leapjax.types import Demonstration
 
@@ -59,6 +60,17 @@ DOMAIN = Domain(
     encoders={"leapjax": lambda model, context: Token(model.width)},
     augmentations=(mirror,),
 )
+
+
+def learn(agent, data, steps):
+    """A state after so many steps of training, and the metrics on the way."""
+    metrics = []
+    state = training.train(
+        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)),
+        jax.tree.map(jnp.asarray, data), jax.random.key(1), steps,
+        lambda done, state, means: metrics.append(means),
+    )  # fmt: skip
+    return state, metrics
 
 
 def demonstrations():
