@@ -428,6 +428,19 @@ def test_the_restart_of_least_energy_is_kept(restarts):
     np.testing.assert_allclose(plan.energy, joint_energies(plan.actions), rtol=1e-4)
 
 
+def test_of_several_filled_plans_the_one_of_least_energy_is_kept():
+    config = GibbsConfig(
+        HORIZON, HORIZON, fill="confident", temperature=1.0, restarts=3, score_trace=True
+    )
+    plan = plans_of(ENUMERABLE, config)
+    counts = plan_counts(plan.actions, ACTIONS)
+    assert fit_p_value(counts, best_of(JOINT, -np.log(JOINT), 3)) > ACCEPTED
+    assert fit_p_value(counts, JOINT) < REJECTED
+    # What is not complete has no energy yet.
+    assert np.isposinf(plan.trace_energies[:, :-1]).all()
+    np.testing.assert_allclose(plan.trace_energies[:, -1], joint_energies(plan.actions), rtol=1e-4)
+
+
 def test_greedy_search_from_the_total_alone_solves_an_additive_energy():
     additive = np.random.default_rng(4).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
     energy = from_total(
