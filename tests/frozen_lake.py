@@ -8,10 +8,9 @@ import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.data import seeds
-from leapjax.domain import Collection, Domain, DomainType
+from leapjax.data.solved import collect_solved
+from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
-from leapjax.types import Demonstration
 
 LEVEL = "FrozenLake-v1"
 CELLS, GOAL = 16, 15
@@ -50,22 +49,9 @@ def make_environment():
 
 
 def collect(count, seed, progress):
-    adapter, found = GymnasiumAdapter(make_environment()), []
-    level_seeds = seeds.training_seeds(seed)
-    for done in range(count):
-        level_seed = next(level_seeds)
-        states, actions = [adapter.reset(level_seed)], shortest_way(adapter.env.unwrapped.P)
-        played = [adapter.step(action) for action in actions]
-        states += [step.observation for step in played]
-        found.append(
-            Demonstration(
-                np.array(states, np.int64), np.array(actions, np.int32),
-                np.array([step.reward for step in played], np.float32),
-                played[-1].terminated, played[-1].truncated, level_seed,
-            )
-        )  # fmt: skip
-        progress(done + 1)
-    return Collection(found, {})
+    adapter = GymnasiumAdapter(make_environment())
+    way = shortest_way(adapter.env.unwrapped.P)
+    return collect_solved(adapter, lambda: way, count, seed, progress)
 
 
 def make(level: str, settings: Settings) -> Domain:

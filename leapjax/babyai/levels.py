@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import difflib
 import io
 
 import gymnasium as gym
@@ -11,7 +10,7 @@ from minigrid.envs import babyai
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 
 from leapjax.babyai import vocabulary
-from leapjax.errors import UserError
+from leapjax.errors import UserError, did_you_mean
 
 DOORS = ("none", "open", "closed")
 
@@ -97,12 +96,9 @@ def find_level(name: str) -> Level:
     if name in registered_levels():
         return Level(name)
     known = [*LEVELS, *registered_levels()]
-    lowered = {candidate.lower(): candidate for candidate in known}
-    near = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)
-    hint = f"did you mean {', '.join(lowered[match] for match in near)}?" if near else ""
     raise UserError(
         f"unknown level {name!r}: expected one of {', '.join(LEVELS)}, "
-        f"or the id of a registered BabyAI level; {hint}".rstrip("; ")
+        f"or the id of a registered BabyAI level{did_you_mean(name, known)}"
     )
 
 

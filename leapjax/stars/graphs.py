@@ -6,8 +6,6 @@ its goal, the end of one arm. Which first step is right can only be told by foll
 step from the steps before it do not learn to look ahead.
 """
 
-import difflib
-import itertools
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.data import seeds
+from leapjax.data.solved import collect_solved
 from leapjax.domain import Collection
 from leapjax.environments import Transition
-from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, Window
+from leapjax.errors import UserError, did_you_mean
+from leapjax.types import Array, Window
 
 LEVELS = ("Star3x5", "Star5x5")
 MOST_NODES = 1000
@@ -59,11 +57,9 @@ def find_level(name: str) -> Star:
     """
     found = re.fullmatch(r"Star([1-9]\d{0,3})x([1-9]\d{0,3})", name)
     if found is None:
-        near = difflib.get_close_matches(name, LEVELS, n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]}?" if near else ""
         raise UserError(
             f"unknown level {name!r}: expected Star<arms>x<edges of an arm>, such as "
-            f"{', '.join(LEVELS)}{hint}"
+            f"{', '.join(LEVELS)}{did_you_mean(name, LEVELS)}"
         )
     star = Star(int(found[1]), int(found[2]))
     if star.nodes > MOST_NODES:
@@ -114,28 +110,8 @@ def collect(star: Star, count: int, seed: int, progress: Callable[[int], None]) 
     Raises:
         UserError: none are asked for.
     """
-    if count < 1:
-        raise UserError(f"at least one demonstration is needed, got {count}")
     adapter = StarAdapter(star)
-    level_seeds = itertools.islice(seeds.training_seeds(seed), count)
-    found = [demonstrate(adapter, level_seed) for level_seed in level_seeds]
-    progress(count)
-    return Collection(found, {})
-
-
-def demonstrate(adapter: StarAdapter, seed: int) -> Demonstration:
-    """The way to the goal of one graph."""
-    first = adapter.reset(seed)
-    played = [adapter.step(int(node)) for node in adapter.path]
-    states = [first, *(transition.observation for transition in played)]
-    return Demonstration(
-        Graph(*(np.stack(parts) for parts in zip(*states, strict=True))),
-        adapter.path,
-        np.array([transition.reward for transition in played], np.float32),
-        played[-1].terminated,
-        False,
-        seed,
-    )
+    return collect_solved(adapter, lambda: adapter.path, count, seed, progress)
 
 
 def relabel(key: jax.Array, window: Window, labels: int) -> Window:

@@ -4,9 +4,7 @@ A board has `side` cells in a row, a column and a box. It is read row by row: ac
 an episode is the digit of cell t, and a clue must be repeated.
 """
 
-import difflib
 import functools
-import itertools
 import math
 import re
 from collections.abc import Callable
@@ -16,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.data import seeds
+from leapjax.data.solved import collect_solved
 from leapjax.domain import Collection
 from leapjax.environments import Transition
-from leapjax.errors import UserError
+from leapjax.errors import UserError, did_you_mean
 from leapjax.types import Array, Demonstration, Window, pad_token
 
 LEVELS = ("Sudoku4x6", "Sudoku9x36")
@@ -53,11 +51,9 @@ def find_level(name: str) -> Size:
     """
     found = re.fullmatch(r"Sudoku(4|9)x([1-9]\d?)", name)
     if found is None:
-        near = difflib.get_close_matches(name, LEVELS, n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]}?" if near else ""
         raise UserError(
             f"unknown level {name!r}: expected Sudoku<4 or 9>x<clues>, such as "
-            f"{', '.join(LEVELS)}{hint}"
+            f"{', '.join(LEVELS)}{did_you_mean(name, LEVELS)}"
         )
     size = Size(int(found[1]), int(found[2]))
     fewest, most = FEWEST_CLUES[size.side], size.cells
@@ -195,29 +191,13 @@ class SudokuAdapter:
 
 
 def collect(size: Size, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
-    """`count` boards of a training seed, solved.
+    """`count` demonstrations of boards, solved cell by cell, of a training seed.
 
     Raises:
         UserError: none are asked for.
     """
-    if count < 1:
-        raise UserError(f"at least one demonstration is needed, got {count}")
-    adapter, found = SudokuAdapter(size), []
-    for level_seed in itertools.islice(seeds.training_seeds(seed), count):
-        found.append(demonstrate(adapter, level_seed))
-        progress(len(found))
-    return Collection(found, {})
-
-
-def demonstrate(adapter: SudokuAdapter, seed: int) -> Demonstration:
-    """One board, solved cell by cell."""
-    first = adapter.reset(seed)
-    actions = adapter.solution - 1
-    played = [adapter.step(int(action)) for action in actions]
-    states = [first, *(transition.observation for transition in played)]
-    rewards = np.array([transition.reward for transition in played], np.float32)
-    board = Board(*(np.stack(parts) for parts in zip(*states, strict=True)))
-    return Demonstration(board, actions, rewards, True, False, seed)
+    adapter = SudokuAdapter(size)
+    return collect_solved(adapter, lambda: adapter.solution - 1, count, seed, progress)
 
 
 class Puzzle(NamedTuple):
