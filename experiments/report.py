@@ -413,6 +413,8 @@ def _rate(rows: Sequence[Row]) -> str:
     low, high = scores.interval_over_seeds(successes, episodes)
     rate = f"{_mean_rate(rows):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
     earlier = " \\*" if rows[0]["first_episode_seed"] == EARLIER["test_seed"] else ""
+    if rows[0]["method"] == "rules":  # nothing was trained
+        return rate
     return f"{rate}, {len(rows)} seed{'s' if len(rows) > 1 else ''}{earlier}"
 
 
