@@ -27,7 +27,7 @@ GLYPHS = dict(zip(range(len(ACTIONS)), ["L", "R", "F", "pick", "drop", "open", "
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws one episode per level seed, one after the other, with MiniGrid's renderer."""
-    level = levels.find_level(run.config.level)
+    level = levels.find_level(run.domain.level)
     frames: list[Frame] = []
     for level_seed in seeds:
         frames += episode_frames(planner, level, level_seed, run.seed)

@@ -28,7 +28,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     """Draws the passes over one graph per level seed; nothing for methods of one action."""
     if not searches(run.config):
         return
-    star = find_level(run.config.level)
+    star = find_level(run.domain.level)
     chosen = {s.name: s for s in SEARCHES if s.name in SHOWN and s.passes == 1}
     frames: list[Frame] = []
     for seed in seeds:

@@ -165,6 +165,7 @@ def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
     chunk_sizes: Sequence[int] = CHUNK_SIZES,
+    level: str | None = None,
 ) -> Pretrained:
     """A trained planner from the folder of its run, or one that comes with the library.
 
@@ -173,9 +174,11 @@ def load(
             folder: the published planner, trained on it with seed 0 (README, "Results").
         planner: search settings, of the same horizon; None for those it was trained with.
         chunk_sizes: see `leapjax.compile_planner`.
+        level: to plan for, where it is another than it was trained on, and its network serves both.
 
     Raises:
-        UserError: no such run, one that cannot be read, or another horizon.
+        UserError: no such run, one that cannot be read, another horizon, or a level that needs
+            another network.
     """
     folder = find(path)
     specification = read_specification(folder)
@@ -186,6 +189,16 @@ def load(
     for name, value in domain.signature.items():
         if specification.signature.get(name) != value:
             raise UserError(f"{folder}: trained with another {name}; train it again")
+    if level is not None:
+        kind = find_domain(specification.domain)
+        other = kind.make(level, specification.domain_settings)
+        for name, value in other.signature.items():
+            if domain.signature.get(name) != value:
+                raise UserError(
+                    f"{folder} was trained on {domain.level}, whose {name} is "
+                    f"{domain.signature.get(name)}: it cannot play {level}, where it is {value}"
+                )
+        domain = other
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
     whose = identity(specification)

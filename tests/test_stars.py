@@ -164,7 +164,7 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.check(states._replace(goal=np.full(5, 50)), "here")
 
 
-def test_every_planner_has_a_row(tmp_path, monkeypatch):
+def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]
     monkeypatch.setattr(searches, "SEARCHES", few)
@@ -181,7 +181,19 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch):
         (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
     ]  # fmt: skip
     assert rows[0]["successes"] == rows[2]["successes"]  # the same planner, played again
-    assert (
-        stars.main([*arguments, "--method", "bc", "--no-pictures"]) == 0
-    )  # one action at a time: one row
+    # What has learned graphs of two arms plans for more of them, as they are as long.
+    again = [*arguments, "--no-pictures", "--checkpoint", str(folder), "--play"]
+    assert stars.main([*again, "Star5x2"]) == 0
+    (*_, row) = results.read(tmp_path / "runs" / "stars.jsonl")
+    assert (row["level"], row["played"]) == ("Star2x2", "Star5x2")
+    assert results.planner_name(row) == "N = 2, confident, on Star5x2"
+    rows.append(row)
+    for arms, message in (("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
+                          ("Star30x2", "whose labels is 50"), ("Star", "unknown level")):  # fmt: skip
+        assert stars.main([*again, arms]) == 2
+        assert message in capsys.readouterr().err
+    assert stars.main([*arguments, "--play", "Star5x2"]) == 2
+    assert "with a --checkpoint, and there is none" in capsys.readouterr().err
+    # One action at a time: one row, and nothing to animate.
+    assert stars.main([*arguments, "--method", "bc", "--no-pictures"]) == 0
     assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1

@@ -64,6 +64,8 @@ class Config(Generic[M, D, P]):
     """Weight of the domain's rules, which are added to what was learned while planning."""
     checkpoint: Path | None = None
     """Folder of an earlier run to evaluate instead of training; brings its settings along."""
+    play: str | None = None
+    """Another level to play with a checkpoint than the one that it was trained on."""
     pretrained: bool = False
     """Evaluate the planner that comes with the library for each level; trains nothing."""
     record: bool = False
@@ -218,6 +220,10 @@ def check(config: AnyConfig) -> None:
         raise UserError(f"--context must be at least 0, got {config.context}")
     check_executed(config.executed, config.planner.horizon)
     checkpoints.check_path(config.runs)
+    if config.play is not None and config.checkpoint is None:
+        raise UserError(
+            "--play plays another level with a --checkpoint: there is none to play with"
+        )
     domain = make_domain(config)
     if not 0 <= config.rules < float("inf"):  # false for NaN too
         raise UserError(f"--rules must be a number, at least 0, got {config.rules}")
@@ -267,8 +273,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
 
 
 def make_domain(config: AnyConfig) -> Domain:
-    """The level of a configuration."""
-    return find_domain(config.domain).make(config.level, config.domain_settings)
+    """The level of a configuration: the one that is played."""
+    return find_domain(config.domain).make(config.play or config.level, config.domain_settings)
 
 
 def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:

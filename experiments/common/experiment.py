@@ -162,6 +162,7 @@ def make_row(
         "experiment": experiment.name,
         "domain": config.domain,
         "level": config.level,
+        "played": this.domain.level,
         "method": config.method,
         "preset": config.preset,
         "seed": this.seed,

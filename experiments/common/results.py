@@ -133,6 +133,7 @@ def planner_name(row: Row) -> str:
         f"N = {planner.get('iterations')}": "iterations" in planner,
         str(planner.get("fill")): planner.get("fill", "together") != "together",
         f"rules {rules}": bool(rules),
+        f"on {row.get('played')}": row.get("played", row["level"]) != row["level"],
     }
     return ", ".join(part for part, said in parts.items() if said)
 

@@ -285,7 +285,7 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
                 f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
                 f"not {wanted[name]}"
             )
-    return pretrained.load(checkpoint, run.config.planner, CHUNK_SIZES)
+    return pretrained.load(checkpoint, run.config.planner, CHUNK_SIZES, run.config.play)
 
 
 def _training_settings(specification: Specification) -> dict[str, Any]:
