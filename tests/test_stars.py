@@ -188,9 +188,12 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys):
     assert (row["level"], row["played"]) == ("Star2x2", "Star5x2")
     assert results.planner_name(row) == "N = 2, confident, on Star5x2"
     rows.append(row)
-    for arms, message in (("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
-                          ("Star30x2", "whose labels is 50"), ("Star", "unknown level")):  # fmt: skip
-        assert stars.main([*again, arms]) == 2
+    for other, message in (
+        ("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
+        ("Star30x2", "whose labels is 50"),
+        ("Star", "unknown level"),
+    ):
+        assert stars.main([*again, other]) == 2
         assert message in capsys.readouterr().err
     assert stars.main([*arguments, "--play", "Star5x2"]) == 2
     assert "with a --checkpoint, and there is none" in capsys.readouterr().err

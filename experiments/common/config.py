@@ -221,9 +221,7 @@ def check(config: AnyConfig) -> None:
     check_executed(config.executed, config.planner.horizon)
     checkpoints.check_path(config.runs)
     if config.play is not None and config.checkpoint is None:
-        raise UserError(
-            "--play plays another level with a --checkpoint: there is none to play with"
-        )
+        raise UserError("--play: another level is played with a --checkpoint, and there is none")
     domain = make_domain(config)
     if not 0 <= config.rules < float("inf"):  # false for NaN too
         raise UserError(f"--rules must be a number, at least 0, got {config.rules}")
