@@ -98,7 +98,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     return {
         "horizon": size.cells, "iterations": size.cells, "fill": "confident",
         "demos": 500 if small else 2000, "episodes": 500,
-        "steps": 2000 if small else 3000, "batch": 64 if small else 32, "learning_rate": 1e-3,
+        "steps": 2000 if small else 1500, "batch": 64 if small else 32, "learning_rate": 1e-3,
     }  # fmt: skip
 
 
