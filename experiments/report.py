@@ -61,6 +61,7 @@ ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
 # Where plans are executed whole: what is minimised, and methods of one action.
 LEARNED = ", learned"
+ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
 MINIMISED = {
     LEARNED: Setting("learned", "leapjax"),
     ", rules": Setting("rules", "leapjax", "rules"),
@@ -108,6 +109,7 @@ def documents(root: Path) -> dict[Path, str]:
         "methods": (methods, "babyai"),
         "acting": (acting, "babyai"),
         "searches": (searches, "puzzles"),
+        "arms": (arms, "puzzles"),
         "quality": (quality, "quality"),
     }
     written = {}
@@ -171,7 +173,8 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 def is_used(row: Row) -> bool:
     """Whether a row is in a table; one that is in none is stale."""
     if row["domain"] in PUZZLES:
-        return any(row in of for each in rows_by_search([row]).values() for _, _, of in each)
+        searched = any(of for each in rows_by_search([row]).values() for _, _, of in each)
+        return searched or any(of for _, _, of in rows_by_arms([row]))
     changes = ({}, EARLIER, *({"iterations": n} for n in ITERATIONS))
     settings = (*SETTINGS, *ITERATED, *(s for each in BY_METHOD.values() for s in each.values()))
     return any(setting.has(row, **change) for setting in settings for change in changes)
@@ -300,6 +303,35 @@ def searches(rows: Sequence[Row]) -> str:
         name, passes, _ = each[0]
         lines.append([name, passes, *(_rate(of) for _, _, of in each)])
     return _table(" | ".join(["planner", "passes", *found]), lines)
+
+
+def rows_by_arms(rows: Sequence[Row]) -> list[tuple[str, int, list[Row]]]:
+    """Of what has learned graphs of three arms: the search, arms that it was played on, rows."""
+    trained = [row for row in rows if row["level"] == ARMS_LEVEL]
+    horizon = config_of_preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
+    found = []
+    for search in SEARCHES:
+        for count in ARMS:
+            level = f"Star{count}x{horizon}"
+            play = {} if level == ARMS_LEVEL else {"play": level}
+            setting = dataclasses.replace(
+                MINIMISED[LEARNED], options={**search.of(horizon), **play}
+            )
+            found.append((f"{search.name}, {search.cost}", count, _of_setting(trained, setting)))
+    return found
+
+
+def arms(rows: Sequence[Row]) -> str:
+    """Success on star graphs of other numbers of arms than were learned."""
+    by_search: dict[str, list[list[Row]]] = {}
+    for name, _, of in rows_by_arms(rows):
+        by_search.setdefault(name, []).append(of)
+    lines = [
+        [name, *(_rate(of) for of in each)]
+        for name, each in by_search.items()
+        if sum(map(bool, each)) > 1
+    ]
+    return _table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
 
 
 def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:

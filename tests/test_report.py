@@ -139,9 +139,10 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
         puzzle_row(method="bc", rate=0.4),
         puzzle_row("Sudoku4x6", "rules", rate=0.6, fill="together", iterations=1),
         puzzle_row("Sudoku4x6", rate=0.7, rules=1.0),
+        puzzle_row(rate=0.2, play="Star9x5"),
         puzzle_row(rate=0.8, fill="margin", iterations=9),  # of no table
     ]  # fmt: skip
-    assert [report.is_used(row) for row in rows] == [True] * 6 + [False]
+    assert [report.is_used(row) for row in rows] == [True] * 7 + [False]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in
              report.searches(rows).splitlines()]  # fmt: skip
     assert lines[0] == [
@@ -153,6 +154,10 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     assert found["`--method bc`", "T"] == ["40.0%", "-", "-"]
     assert found["all at once", "1"] == ["-", "60.0%", "-"]
     assert found["most certain first, best of 16", "16 T"] == ["-"] * 3
+    header, _, line = report.arms(rows).splitlines()
+    assert header == "| planner, passes | 2 arms | 3 arms | 5 arms | 7 arms | 9 arms |"
+    told = [cell.strip().split(" ")[0] for cell in line.split("|")[2:-1]]
+    assert told == ["-", "95.0%", "-", "-", "20.0%"]
     by_passes = report.success_by_passes(rows)
     assert list(by_passes) == ["Star3x5, learned"]
     assert by_passes["Star3x5, learned"] == {
