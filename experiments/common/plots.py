@@ -66,16 +66,23 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         for label, by_count in by_label.items():
             rates = [100 * row["successes"] / row["episodes"] for row in by_count.values()]
             colour = drawn[label].get_color() if label in drawn else f"C{len(drawn)}"
-            (drawn[label],) = axis.plot(list(by_count), rates, "o-", color=colour)
+            size = (
+                max(4.5, 10 - 0.7 * len(drawn))
+                if label not in drawn
+                else drawn[label].get_markersize()
+            )
+            (drawn[label],) = axis.plot(
+                list(by_count), rates, "o-", color=colour, markersize=size
+            )  # smaller and smaller, so that none hides another
         axis.set_title(level, fontsize=9)
         axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
         ticks = sorted({count for by_count in by_label.values() for count in by_count})
         axis.set_xticks(ticks, [str(count) for count in ticks])
         axis.minorticks_off()
     labels = [label.replace("`", "") for label in drawn]
-    figure.legend(
-        drawn.values(), labels, loc="outside lower center", ncols=min(4, max(1, len(drawn)))
-    )
+    columns = max(1, min(len(rows), 4, len(drawn)))
+    figure.set_figheight(figure.get_figheight() + 0.2 * len(drawn) / columns)
+    figure.legend(drawn.values(), labels, loc="outside lower center", fontsize=8, ncols=columns)
     _save(figure, path)
 
 
