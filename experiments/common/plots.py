@@ -61,28 +61,27 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         path: to write.
     """
     figure, axes = _panels(len(rows), columns=4, width=2.7 if len(rows) > 1 else 5)
+    labels = list(dict.fromkeys(label for by_label in rows.values() for label in by_label))
     drawn: dict[str, Line2D] = {}  # one of each label, for the legend
     for axis, (level, by_label) in zip(axes, rows.items(), strict=False):
         for label, by_count in by_label.items():
             rates = [100 * row["successes"] / row["episodes"] for row in by_count.values()]
-            colour = drawn[label].get_color() if label in drawn else f"C{len(drawn)}"
-            size = (
-                max(4.5, 10 - 0.7 * len(drawn))
-                if label not in drawn
-                else drawn[label].get_markersize()
-            )
+            index = labels.index(label)
             (drawn[label],) = axis.plot(
-                list(by_count), rates, "o-", color=colour, markersize=size
-            )  # smaller and smaller, so that none hides another
+                list(by_count), rates, "o-", color=f"C{index}",
+                markersize=max(4.5, 10 - 0.7 * index),  # so that none hides another
+            )  # fmt: skip
         axis.set_title(level, fontsize=9)
         axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
         ticks = sorted({count for by_count in by_label.values() for count in by_count})
         axis.set_xticks(ticks, [str(count) for count in ticks])
         axis.minorticks_off()
-    labels = [label.replace("`", "") for label in drawn]
-    columns = max(1, min(len(rows), 4, len(drawn)))
-    figure.set_figheight(figure.get_figheight() + 0.2 * len(drawn) / columns)
-    figure.legend(drawn.values(), labels, loc="outside lower center", fontsize=8, ncols=columns)
+    columns = max(1, min(len(rows), 4, len(labels)))
+    figure.set_figheight(figure.get_figheight() + 0.2 * len(labels) / columns)
+    figure.legend(
+        [drawn[label] for label in labels], [label.replace("`", "") for label in labels],
+        loc="outside lower center", fontsize=8, ncols=columns,
+    )  # fmt: skip
     _save(figure, path)
 
 
