@@ -302,7 +302,7 @@ def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) ->
     return draw(jax.random.key(key), steps, batch, context, horizon, by)
 
 
-@pytest.mark.parametrize("by", ["episode", "step"])
+@pytest.mark.parametrize("by", windows.SAMPLINGS)
 def test_a_batch_is_a_function_of_its_key(by):
     first, same, other = (sample(key, 16, by) for key in (3, 3, 4))
     jax.tree.map(np.testing.assert_array_equal, first, same)
@@ -311,7 +311,7 @@ def test_a_batch_is_a_function_of_its_key(by):
     assert first.context.past.grid.shape == (16, 2, SIDE, SIDE, 3)
 
 
-@pytest.mark.parametrize("by", ["episode", "step"])
+@pytest.mark.parametrize("by", windows.SAMPLINGS)
 def test_a_batch_holds_windows_of_the_data(by):
     demonstrations = toy_demonstrations()
     batch = jax.device_get(sample(5, 32, by))
@@ -347,12 +347,18 @@ def test_by_step_every_step_counts_the_same():
     assert not is_uniform([c.sum() for c in found])
 
 
+def test_by_start_every_demonstration_counts_the_same_and_none_but_its_first_step():
+    found = counts("start", 20_000)
+    assert is_uniform([c[0] for c in found])
+    assert not any(c[1:].any() for c in found)
+
+
 def test_padding_changes_no_window():
     steps = laid_out(toy_demonstrations())
     padded = windows.padded(steps)
     assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
     assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
-    for by in ("step", "episode"):
+    for by in windows.SAMPLINGS:
         same = [draw(jax.random.key(0), on_device(data), 64, 2, 5, by) for data in (steps, padded)]
         jax.tree.map(np.testing.assert_array_equal, *same)
 
