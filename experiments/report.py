@@ -1,6 +1,7 @@
 """Tables in the documents, made from the committed rows: `python -m experiments.report`."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,10 +33,24 @@ class Setting:
         """Whether a row is of this setting as it is today, trained or played again."""
         if (row["method"], row["preset"]) != (self.method, self.preset):
             return False
-        config = config_of_preset(row["domain"], row["level"], self.method, self.preset)
-        config = with_options(config, {**self.options, **options})
-        again = dataclasses.replace(config, checkpoint=Path())
-        return row["hash"] in (configuration_hash(c, row["seed"]) for c in (config, again))
+        changed = tuple(sorted({**self.options, **options}.items()))
+        of = row["domain"], row["level"], self.method, self.preset
+        return row["hash"] in _names(*of, changed, row["seed"])
+
+
+@functools.cache  # many rows are asked whether they are of the same settings
+def _names(
+    domain: str,
+    level: str,
+    method: str,
+    preset: str,
+    options: tuple[tuple[str, Any], ...],
+    seed: int,
+) -> tuple[str, str]:
+    """What rows of a configuration are called: of its training, and of its checkpoint played."""
+    config = with_options(config_of_preset(domain, level, method, preset), dict(options))
+    again = dataclasses.replace(config, checkpoint=Path())
+    return configuration_hash(config, seed), configuration_hash(again, seed)
 
 
 OURS = Setting("preset `leapjax`", "leapjax")
