@@ -29,7 +29,14 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     if not searches(run.config):
         return
     star = find_level(run.domain.level)
-    chosen = {s.name: s for s in SEARCHES if s.name in SHOWN and s.passes == 1}
+    chosen = {s.name: s.of(star.length) for s in SEARCHES if s.name in SHOWN and s.passes == 1}
+    plans = {
+        name: compile_planner(
+            planner.energy, dataclasses.replace(run.config.planner, **chosen[name]),
+            (1,), jax.devices()[:1],
+        )
+        for name in SHOWN
+    }  # fmt: skip
     frames: list[Frame] = []
     for seed in seeds:
         adapter = StarAdapter(star)
@@ -37,12 +44,10 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
         history = rollouts.History(graph, planner.specification.context, adapter.num_actions)
         contexts = rollouts.stack_contexts([history])
         keys = plan_keys(run.seed, np.array([seed]), np.array([0]))
-        traces = {}
-        for name in SHOWN:
-            options = chosen[name].of(star.length)
-            config = dataclasses.replace(run.config.planner, **options)
-            plan = compile_planner(planner.energy, config, (1,), jax.devices()[:1])
-            traces[name] = np.asarray(plan(planner.params, keys, contexts).trace[0])
+        traces = {
+            name: np.asarray(plan(planner.params, keys, contexts).trace[0])
+            for name, plan in plans.items()
+        }
         frames += _frames(star, graph, adapter.path, traces)
     save_animation(frames, path)
 
