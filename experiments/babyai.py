@@ -7,7 +7,7 @@ beside the paper's.
 import sys
 from collections.abc import Sequence
 
-from experiments.animation import animate
+from experiments.babyai_animation import animate
 from experiments.common import experiment
 from experiments.common.experiment import Experiment
 

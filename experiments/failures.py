@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from experiments import animation
+from experiments import babyai_animation
 from experiments.common import program, runtime
 from experiments.common.config import check_executed
 from leapjax import files, pretrained, rollouts
@@ -231,7 +231,9 @@ def draw(failed: Sequence[Recorder], path: Path) -> None:
         UserError: the picture cannot be written.
     """
     pictures = [
-        animation.picture(r, r.env.mission, f"{len(r.cells) - 1} steps: {cause(r).value}", r.cells)
+        babyai_animation.picture(
+            r, r.env.mission, f"{len(r.cells) - 1} steps: {cause(r).value}", r.cells
+        )
         for r in failed
     ]
     width, height = pictures[0].size
