@@ -5,6 +5,7 @@ A domain is a family of levels: BabyAI's, the games of Atari, one environment of
 of each, in a folder of its own, and a line in `leapjax.domains`.
 """
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ import jax
 import numpy as np
 
 from leapjax.environments import Adapter
-from leapjax.errors import UserError
+from leapjax.errors import UserError, did_you_mean
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window
 
@@ -26,6 +27,27 @@ class Collection(NamedTuple):
 
     demonstrations: list[Demonstration]
     dropped: Mapping[str, int]  # how many, by the reason
+
+
+def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
+    """The two numbers of a level's name, such as 3 and 5 of Star3x5.
+
+    Args:
+        name: of the level.
+        pattern: a regular expression with a group for each number.
+        expected: what names are like, for whoever gives another.
+        known: examples.
+
+    Raises:
+        UserError: the name is not like that.
+    """
+    found = re.fullmatch(pattern, name)
+    if found is None:
+        raise UserError(
+            f"unknown level {name!r}: expected {expected}, such as "
+            f"{', '.join(known)}{did_you_mean(name, known)}"
+        )
+    return int(found[1]), int(found[2])
 
 
 def _nothing_to_check(observations: PyTree, where: str) -> None:

@@ -6,7 +6,6 @@ its goal, the end of one arm. Which first step is right can only be told by foll
 step from the steps before it do not learn to look ahead.
 """
 
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.data.solved import collect_solved
-from leapjax.domain import Collection
+from leapjax.domain import Collection, level_numbers
 from leapjax.environments import Transition
-from leapjax.errors import UserError, did_you_mean
+from leapjax.errors import UserError
 from leapjax.types import Array, Window
 
 LEVELS = ("Star3x5", "Star5x5")
@@ -55,13 +54,8 @@ def find_level(name: str) -> Star:
     Raises:
         UserError: it is none.
     """
-    found = re.fullmatch(r"Star([1-9]\d{0,3})x([1-9]\d{0,3})", name)
-    if found is None:
-        raise UserError(
-            f"unknown level {name!r}: expected Star<arms>x<edges of an arm>, such as "
-            f"{', '.join(LEVELS)}{did_you_mean(name, LEVELS)}"
-        )
-    star = Star(int(found[1]), int(found[2]))
+    pattern, expected = r"Star([1-9]\d{0,3})x([1-9]\d{0,3})", "Star<arms>x<edges of an arm>"
+    star = Star(*level_numbers(name, pattern, expected, LEVELS))
     if star.nodes > MOST_NODES:
         raise UserError(f"level {name} has {star.nodes} nodes: at most {MOST_NODES} are possible")
     return star

@@ -6,7 +6,6 @@ an episode is the digit of cell t, and a clue must be repeated.
 
 import functools
 import math
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.data.solved import collect_solved
-from leapjax.domain import Collection
+from leapjax.domain import Collection, level_numbers
 from leapjax.environments import Transition
-from leapjax.errors import UserError, did_you_mean
+from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration, Window, pad_token
 
 LEVELS = ("Sudoku4x6", "Sudoku9x36")
@@ -49,13 +48,8 @@ def find_level(name: str) -> Size:
     Raises:
         UserError: it is none.
     """
-    found = re.fullmatch(r"Sudoku(4|9)x([1-9]\d?)", name)
-    if found is None:
-        raise UserError(
-            f"unknown level {name!r}: expected Sudoku<4 or 9>x<clues>, such as "
-            f"{', '.join(LEVELS)}{did_you_mean(name, LEVELS)}"
-        )
-    size = Size(int(found[1]), int(found[2]))
+    pattern, expected = r"Sudoku(4|9)x([1-9]\d?)", "Sudoku<4 or 9>x<clues>"
+    size = Size(*level_numbers(name, pattern, expected, LEVELS))
     fewest, most = FEWEST_CLUES[size.side], size.cells
     if not fewest <= size.clues <= most:
         raise UserError(f"level {name}: clues must be in {fewest} .. {most}, got {size.clues}")
