@@ -11,6 +11,8 @@ from leapjax.environments import Transition
 ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "end")
 NUM_ACTIONS = len(ACTIONS)
 END = ACTIONS.index("end")
+TURNS = (ACTIONS.index("left"), ACTIONS.index("right"))
+SLIPS = 1  # which of a level seed's streams of random numbers
 
 
 class BabyAIAdapter:
@@ -26,13 +28,16 @@ class BabyAIAdapter:
         # and it costs more than the step itself.
         self.env.gen_obs = lambda: {}  # type: ignore[method-assign]
         self.goal = observations.NO_GOAL
+        self.taken = END  # the last action as it was executed
         self._instruction = np.zeros(level.words, np.int32)
+        self._random = np.random.default_rng()
 
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""
         with levels.silenced():
             self.env.reset(seed=seed)
         self.goal = observations.nearest_goal(self.env)
+        self._random = np.random.default_rng([seed, SLIPS])
         self._instruction = vocabulary.encode(self.env.mission, self.level.words)
         return self.observe()
 
@@ -41,7 +46,10 @@ class BabyAIAdapter:
         return observations.observe(self.env, self.side, self.goal, self._instruction)
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions."""
-        _, reward, terminated, truncated, _ = self.env.step(action)
+        """Takes one of MiniGrid's first six actions; where turns slip, maybe another one."""
+        self.taken = action
+        if action in TURNS and self._random.random() < self.level.slip:
+            self.taken = int(self._random.choice([a for a in range(END) if a != action]))
+        _, reward, terminated, truncated, _ = self.env.step(self.taken)
         success = bool(terminated and float(reward) > 0)
         return Transition(self.observe(), float(reward), terminated, truncated, success)

@@ -18,6 +18,7 @@ from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
 MOST_LOOKS = 200  # at its subgoals, before a bot that has not chosen an action never will
+MISTAKES = 2  # which of a level seed's streams of random numbers; the adapter has another
 FAILED = "failed"  # the bot gave up, crashed or ran out of time
 OTHER_GOAL = "ended at another match than the nearest"
 
@@ -128,7 +129,12 @@ def collect(
 
 
 def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Demonstration | None:
-    """One episode of the bot; None, counted in `dropped`, where it is no use."""
+    """One episode of the bot; None, counted in `dropped`, where it is no use.
+
+    Where it makes mistakes, they are executed, and it goes on from where they lead. The actions
+    are those that were executed, unless the level says that some are mislabelled.
+    """
+    level, random = adapter.level, np.random.default_rng([seed, MISTAKES])
     states, actions, rewards = [adapter.reset(seed)], [], []
     bot = make_bot(adapter.env)
     bot.stack = _Subgoals(bot.stack)
@@ -139,7 +145,10 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
             action = int(bot.replan(action))
             if action == END:  # `done`: the bot believes the mission over, and it is not
                 break
+            if random.random() < level.mistakes:
+                action = int(random.integers(END))
             observation, reward, terminated, truncated, success = adapter.step(action)
+            action = adapter.taken
             states.append(observation)
             actions.append(action)
             rewards.append(reward)
@@ -154,9 +163,11 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
     ):
         dropped[OTHER_GOAL] += 1
         return None
+    wrong = random.random(len(actions)) < level.mislabelled
+    labels = np.where(wrong, random.integers(END, size=len(actions)), actions)
     return Demonstration(
         Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
-        np.array(actions, np.int32),
+        labels.astype(np.int32),
         np.array(rewards, np.float32),
         terminated,
         truncated,

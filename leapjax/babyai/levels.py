@@ -3,13 +3,14 @@
 import contextlib
 import dataclasses
 import io
+from typing import Any
 
 import gymnasium as gym
 import minigrid  # noqa: F401  (registers the levels)
 from minigrid.envs import babyai
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 
-from leapjax.babyai import vocabulary
+from leapjax.babyai import vocabulary, worlds
 from leapjax.errors import UserError, did_you_mean
 
 DOORS = ("none", "open", "closed")
@@ -20,7 +21,7 @@ class Level:
     """A level, and the settings of the paper for it (appendix, tables 4 and 7)."""
 
     name: str
-    task: str = ""  # class in minigrid.envs.babyai; empty: `name` is a registered id
+    task: str = ""  # class in .worlds or minigrid.envs.babyai; empty: `name` is a registered id
     room_size: int = 0  # side of a room, walls included
     rows: int = 1  # rooms
     columns: int = 1  # rooms
@@ -32,6 +33,10 @@ class Level:
     states: int = 5  # in the context of methods of single actions, the current one included
     words: int = vocabulary.LONGEST  # the longest instruction, in tokens
     sequence: bool = True  # an instruction may join several tasks, with "and" and "then"
+    lava: int = 0  # cells, where the task has them
+    slip: float = 0.0  # probability that a turn becomes one of the five other actions
+    mistakes: float = 0.0  # share of a demonstrator's actions that are random ones
+    mislabelled: float = 0.0  # share of a demonstration's actions that are not what was done
 
 
 _GO_TO, _WITH_PLACE = 5, 9  # "go to the red ball", "pick up the red ball in front of you"
@@ -63,6 +68,47 @@ LEVELS = {
 }  # fmt: skip
 
 
+def _room(name: str, task: str, side: int, objects: int = 1, **options: Any) -> Level:
+    """One room, with the settings of the paper's."""
+    return Level(
+        name, task, side, distractors=objects, words=_GO_TO, sequence=False, **options
+    )
+
+
+def _like(name: str, paper: str, **options: Any) -> Level:
+    """A level of the paper, and what differs from it."""
+    return dataclasses.replace(LEVELS[paper], name=name, **options)
+
+
+# Of the paper's analyses (section 5 and appendix): a maze of side 10 wants plans of ten actions.
+_LONG = {"horizon": 10, "iterations": 30, "states": 10}
+MODIFIED = {
+    level.name: level
+    for level in (
+        # Online adaptation: what is learned has no lava.
+        _room("GoToLocalS8N1", "GoToLocal", 8),
+        _room("GoToLavaEasy", "GoToBehindLava", 8, lava=2),
+        _room("GoToLavaMedium", "GoToBehindLava", 8, lava=worlds.MOST_LAVA),
+        _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),
+        # Generalisation: learned in one room.
+        _room("GoToLocalS8N15", "GoToLocal", 8, 15),
+        _room("GoToLocalS7N1", "GoToLocal", 7),
+        _like("GoToObjMazeS4R2", "GoToObjMazeS4R2Close", doors="open"),
+        _room("GoToLocalS10N1", "GoToLocal", 10, **_LONG),
+        # Composition: of views of obstacles, and of tasks.
+        _room("GoToBehindObstacles", "GoToBehindObstacles", 10, 6, **_LONG),
+        _room("PickUpLocalS10N1", "PickUpLocal", 10, **_LONG),
+        _like("PickUpObjMazeS4", "GoToObjMazeS4", task="PickUp"),
+        # Stochastic dynamics, and imperfect demonstrations.
+        *(_like(f"{name}Slip", name, slip=0.2) for name in ("GoToObjMazeS4", "GoToObjMazeS7")),
+        *(
+            _like(f"{name}{suffix}", name, **{what: 0.25})
+            for name in ("GoToObjMazeS4", "GoToObjMazeS7", "GoToSeqS5R2")
+            for suffix, what in (("Mistakes", "mistakes"), ("Mislabelled", "mislabelled"))
+        ),
+    )
+}
+
 _PAPER_METHODS = ("bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 _PAPER_SUCCESS = {
     "GoToLocalS7N5": (71.0, 71.5, 84.5, 73.0, 42.5, 87.0, 91.0),
@@ -91,11 +137,12 @@ def find_level(name: str) -> Level:
     Raises:
         UserError: there is none; names the nearest.
     """
-    if name in LEVELS:
-        return LEVELS[name]
+    own = {**LEVELS, **MODIFIED}
+    if name in own:
+        return own[name]
     if name in registered_levels():
         return Level(name)
-    known = [*LEVELS, *registered_levels()]
+    known = [*own, *registered_levels()]
     raise UserError(
         f"unknown level {name!r}: expected one of {', '.join(LEVELS)}, "
         f"or the id of a registered BabyAI level{did_you_mean(name, known)}"
@@ -115,8 +162,14 @@ def make_environment(level: Level) -> RoomGridLevel:
         "GoTo": {**rooms, **distractors, "doors_open": level.doors == "open"},
         "PickupLoc": {"room_size": level.room_size},
         "GoToSeq": {**rooms, **distractors},
+        "GoToBehindLava": {"room_size": level.room_size, "wide": level.lava > 2},
+        "GoToAmongLava": {**rooms, **distractors, "cells": level.lava},
+        "GoToBehindObstacles": {"room_size": level.room_size, "obstacles": level.distractors},
+        "PickUpLocal": {"room_size": level.room_size, **distractors},
+        "PickUp": {**rooms, **distractors, "doors_open": level.doors == "open"},
     }[level.task]
-    return getattr(babyai, level.task)(**arguments)
+    home = worlds if hasattr(worlds, level.task) else babyai
+    return getattr(home, level.task)(**arguments)
 
 
 def silenced() -> contextlib.redirect_stdout:
