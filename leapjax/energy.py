@@ -231,7 +231,9 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     return Energy(encode, conditional, total, energies[0].num_actions, accepts_mask, violation)
 
 
-def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array]) -> Energy:
+def constrain(
+    energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array], partial: bool = False
+) -> Energy:
     """Adds a test-time constraint (paper, section 4, online adaptation).
 
     While a plan still holds MASK outside the position in question the penalty is not
@@ -239,11 +241,24 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
     ignores it and every later one obeys it. A penalty that grows with the number of
     violations leads the search out of them one by one; +inf only filters.
 
+    A `partial` penalty also judges plans that hold MASK, by what is certain of them already. A
+    plan that is filled from left to right, by `gibbs` or `beam_search`, then never begins in a
+    way that is not allowed.
+
     Args:
         energy: the energy to constrain.
         penalty: (context, actions `[T]`) -> `[]`: 0 or less where the plan is allowed,
             positive (+inf for never) where it is not.
+        partial: the penalty takes plans that hold MASK, the number of actions, too.
     """
+    complete = energy.num_actions - 1  # the last action
+
+    def known(context: PyTree, plan: jax.Array) -> jax.Array:
+        """The penalty of what a plan says so far."""
+        if partial:
+            return penalty(context, plan)
+        judged = penalty(context, jnp.minimum(plan, complete))
+        return jnp.where(jnp.all(plan <= complete), judged, 0.0)
 
     def encode(params: Params, context: PyTree) -> PyTree:
         return energy.encode(params, context), context
@@ -254,14 +269,7 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
         inner, context = memory
         base = energy.conditional(params, inner, actions, positions)
         extra = _try_every_action(
-            lambda plan: jnp.where(
-                jnp.all(plan < energy.num_actions),
-                penalty(context, jnp.minimum(plan, energy.num_actions - 1)),
-                0.0,
-            ),
-            actions,
-            positions,
-            energy.num_actions,
+            lambda plan: known(context, plan), actions, positions, energy.num_actions
         )
         # Where no action at a position makes the plan allowed, another position has to
         # change: the constraint then says nothing about this one.
@@ -284,6 +292,51 @@ def constrain(energy: Energy, penalty: Callable[[PyTree, jax.Array], jax.Array])
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
     """Puts `function(context)` in front of an energy: what this energy may see."""
     return energy._replace(encode=lambda params, context: energy.encode(params, function(context)))
+
+
+def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
+    """An energy without an opinion on some actions: each is as good as the best of the others.
+
+    For `compose`, where a model's data never showed actions that another model needs: going to an
+    object says nothing against picking it up. In the rest of a plan such an action is MASK to the
+    model, which does not know it.
+
+    Args:
+        energy: one that accepts MASK.
+        actions: that it should say nothing of; at least one is left.
+
+    Raises:
+        ValueError: the energy accepts no MASK, or the actions are none, all, or none of its own.
+    """
+    chosen = sorted(set(actions))
+    if not energy.accepts_mask:
+        raise ValueError("neutral needs an energy that accepts MASK (accepts_mask is False)")
+    if not chosen or len(chosen) >= energy.num_actions:
+        raise ValueError(f"neutral actions {chosen}: expected some of {energy.num_actions} actions")
+    if chosen[0] < 0 or chosen[-1] >= energy.num_actions:
+        raise ValueError(f"neutral actions {chosen} are not all in 0 .. {energy.num_actions - 1}")
+    unknown = np.isin(np.arange(energy.num_actions), chosen)
+    mask = mask_token(energy.num_actions)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        seen = jnp.where(jnp.isin(actions, jnp.array(chosen)), mask, actions)
+        energies = energy.conditional(params, memory, seen, positions)
+        best = jnp.min(jnp.where(unknown, jnp.inf, energies), axis=-1, keepdims=True)
+        return jnp.where(unknown, best, energies)
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = jnp.asarray(actions)
+
+        def term(position: jax.Array) -> jax.Array:
+            energies = conditional(params, memory, actions, position[None])[0]
+            return energies[jnp.minimum(actions[position], energy.num_actions - 1)]
+
+        terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
+        return _infinite_if_incomplete(_check_total(jnp.sum(terms)), actions, energy.num_actions)
+
+    return energy._replace(conditional=conditional, total=total)
 
 
 def _try_every_action(

@@ -126,15 +126,7 @@ def run_one(
         if config.checkpoint is not None:
             planner = run.reuse(this, config.checkpoint)
         else:
-            mesh = run.training_mesh(config)
-            wait = None
-            if run.must_collect(this):
-                wait = run.compile_ahead(this, mesh)  # programs compile meanwhile
-                run.collect(this)
-            data = run.load(this)
-            seeds.check_disjoint([d.seed for d in data], played)
-            processes.first_does(lambda: stack.enter_context(files.only_process_in(folder)))
-            planner, metrics = run.fit(this, data, mesh, wait)
+            planner, metrics = train(this, played, stack)
         planner = run.with_rules(planner, this)
         episodes = run.measure(planner, this, played)
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
@@ -151,6 +143,24 @@ def run_one(
     paper = "" if row["paper_success"] is None else f", paper {row['paper_success']}%"
     console.print(f"success {results.percent(row)}, mean length {row['mean_length']:.1f}{paper}")
     return row
+
+
+def train(this: Run, played: range, stack: contextlib.ExitStack) -> tuple[Pretrained, run.Metrics]:
+    """What one run learns, from demonstrations on.
+
+    Args:
+        this: run to do.
+        played: level seeds that it may not learn from.
+        stack: keeps other processes out of its folder, until it is closed.
+    """
+    mesh, wait = run.training_mesh(this.config), None
+    if run.must_collect(this):
+        wait = run.compile_ahead(this, mesh)  # programs compile meanwhile
+        run.collect(this)
+    data = run.load(this)
+    seeds.check_disjoint([d.seed for d in data], played)
+    processes.first_does(lambda: stack.enter_context(files.only_process_in(this.folder)))
+    return run.fit(this, data, mesh, wait)
 
 
 def make_row(

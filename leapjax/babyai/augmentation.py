@@ -12,10 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.babyai import symmetries, vocabulary
+from leapjax.babyai.dynamics import FORWARD, passable
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
+from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.domain import Augmentation
 from leapjax.types import Array, Demonstration, Window
+
+FALSE_MOVES = 3  # at most, at the beginning of a window
 
 
 class GridWords(NamedTuple):
@@ -43,6 +47,8 @@ def chosen(settings: Settings) -> list[Augmentation]:
     found: list[Augmentation] = []
     if settings.augment:
         found.append(lambda key, w: augment(key, w, grid_words(), settings.exchange_objects))
+    if settings.false_starts:
+        found.append(lambda key, w: false_start(key, w, settings.false_starts))
     if settings.clutter:
         found.append(lambda key, w: clutter(key, w, settings.clutter))
     return found
@@ -101,6 +107,72 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
     observation = context.observation._replace(grid=fill(grid))
     before = context.past._replace(grid=jax.vmap(fill)(past))
     return window._replace(context=context._replace(observation=observation, past=before))
+
+
+def false_start(key: jax.Array, window: Window, share: float) -> Window:
+    """A window that begins with up to three random moves, and then does what it did.
+
+    The moves lead from another pose, which is found backwards, to the one that the window
+    began in. So it shows where a plan has got to that did not begin well, which plans under a
+    constraint must know, and demonstrations, being optimal, never show.
+
+    Windows stay as they are where the moves would lead through things, past the goal or out of a
+    doorway, of which the agent's mark hides the door, and where there are past states.
+
+    Args:
+        key: chooses.
+        window: one training example.
+        share: of the windows that begin so.
+    """
+    context, length = window.context, window.context.actions.shape[0]
+    if length:
+        return window
+    take_key, count_key, moves_key = jax.random.split(key, 3)
+    horizon = window.actions.shape[0]
+    longest = min(FALSE_MOVES, horizon - 1)
+    if longest < 1:
+        return window
+    count = jax.random.randint(count_key, (), 1, longest + 1)
+    moves = jax.random.randint(moves_key, (longest,), LEFT, FORWARD + 1)
+    observation = context.observation
+    grid, pose = jnp.asarray(observation.grid), jnp.asarray(observation.pose)
+    free = passable(grid)
+    vectors = jnp.asarray(DIRECTION_VECTORS)
+
+    def undo(
+        carry: tuple[jax.Array, jax.Array], place: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        """The pose before a move, and whether the move leads from it to the one after."""
+        pose, possible = carry
+        move, made = moves[place], place < count
+        turn = (move == RIGHT).astype(jnp.int32) - (move == LEFT)
+        behind = pose[:2] - vectors[pose[2]] * (move == FORWARD)
+        before = jnp.append(behind, (pose[2] - turn) % 4)
+        pose = jnp.where(made, before, pose)
+        facing = pose[:2] + vectors[pose[2]]
+        possible &= free[pose[0], pose[1]] & ~(facing == observation.goal).all()
+        return (pose, possible), pose
+
+    around = jnp.pad(~free, 1, constant_values=True)
+    x, y = pose[0] + 1, pose[1] + 1
+    doorway = (around[x - 1, y] & around[x + 1, y]) | (around[x, y - 1] & around[x, y + 1])
+    places = jnp.arange(longest)[::-1]
+    (start, possible), visited = jax.lax.scan(undo, (pose, ~doorway), places)
+    possible &= jax.random.bernoulli(take_key, share)
+
+    # The agent's mark, whose state is its direction, moves to where it begins.
+    empty = jnp.array([EMPTY, 0, 0], grid.dtype)
+    mark = grid[pose[0], pose[1]].at[2].set(start[2].astype(grid.dtype))
+    moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
+    place = jnp.arange(horizon)
+    later = window.actions[jnp.maximum(place - count, 0)]
+    actions = jnp.where(place < count, moves[jnp.minimum(place, longest - 1)], later)
+    way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
+    began = observation._replace(grid=moved, pose=start)
+    changed = window._replace(
+        context=context._replace(observation=began), actions=actions, extras=way
+    )
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), changed, window)
 
 
 def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:

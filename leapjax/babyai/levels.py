@@ -70,9 +70,7 @@ LEVELS = {
 
 def _room(name: str, task: str, side: int, objects: int = 1, **options: Any) -> Level:
     """One room, with the settings of the paper's."""
-    return Level(
-        name, task, side, distractors=objects, words=_GO_TO, sequence=False, **options
-    )
+    return Level(name, task, side, distractors=objects, words=_GO_TO, sequence=False, **options)
 
 
 def _like(name: str, paper: str, **options: Any) -> Level:
@@ -86,7 +84,7 @@ MODIFIED = {
     level.name: level
     for level in (
         # Online adaptation: what is learned has no lava.
-        _room("GoToLocalS8N1", "GoToLocal", 8),
+        _room("GoToLocalS8N1", "GoToLocal", 8, **_LONG),
         _room("GoToLavaEasy", "GoToBehindLava", 8, lava=2),
         _room("GoToLavaMedium", "GoToBehindLava", 8, lava=worlds.MOST_LAVA),
         _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),

@@ -15,6 +15,7 @@ class Settings:
     augment: bool = False  # mirror, recolour, rename, restate at random
     exchange_objects: bool = False  # with augment: key, ball and box are alike
     clutter: float = 0.0  # fill up to this share of the cells that nobody needs
+    false_starts: float = 0.0  # share of windows that begin with random moves (no past states)
     channels: int = 32  # features per grid cell
     rounds: int = 2  # rounds of convolution over the grid
     fields: int = 8  # learned distance fields; 0: convolutions alone
@@ -25,8 +26,9 @@ class Settings:
     def __post_init__(self) -> None:
         check_at_least(self, 1, "channels", "sweeps")
         check_at_least(self, 0, "rounds", "fields", "radius", "word_heads")
-        if not 0 <= self.clutter <= 1:  # false for NaN too
-            raise ValueError(f"clutter must be in 0 .. 1, got {self.clutter}")
+        for name in ("clutter", "false_starts"):
+            if not 0 <= getattr(self, name) <= 1:  # false for NaN too
+                raise ValueError(f"{name} must be in 0 .. 1, got {getattr(self, name)}")
 
 
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place

@@ -110,7 +110,7 @@ class PickUpLocal(GoToLocal):
     def gen_mission(self) -> None:
         """Places everything."""
         super().gen_mission()
-        self.instrs = PickupInstr(self.instrs.desc)
+        self.instrs = PickupInstr(self.instrs.desc)  # type: ignore[assignment]
 
 
 class PickUp(GoTo):
@@ -119,7 +119,7 @@ class PickUp(GoTo):
     def gen_mission(self) -> None:
         """Places everything."""
         super().gen_mission()
-        self.instrs = PickupInstr(self.instrs.desc)
+        self.instrs = PickupInstr(self.instrs.desc)  # type: ignore[assignment]
 
 
 def require_a_way(env: RoomGridLevel) -> None:

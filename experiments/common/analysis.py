@@ -1,0 +1,361 @@
+"""An analysis: what was trained on some levels is asked to plan on others, in several ways.
+
+Each way of asking is a row beside the paper's number. What must be trained is what
+`experiments.babyai` would train, in the same folder, and is trained once.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.common import config as configs
+from experiments.common import experiment, program, results, run, runtime
+from experiments.common.config import AnyConfig, check_counts, configuration_hash, with_options
+from experiments.common.experiment import Experiment
+from experiments.common.interruption import Interruption, interruptible
+from experiments.common.results import Row
+from experiments.common.run import Run
+from leapjax import pretrained, rollouts
+from leapjax.babyai import levels
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.levels import Level
+from leapjax.batching import compile_planner
+from leapjax.data import seeds
+from leapjax.data.seeds import UNSEEN
+from leapjax.energy import compose
+from leapjax.errors import UserError, did_you_mean
+from leapjax.planners import GibbsConfig, PlannerConfig
+from leapjax.pretrained import Pretrained
+from leapjax.types import Energy
+
+DOMAIN = "babyai"
+TRAINING = Experiment(DOMAIN, DOMAIN)  # whose runs are used, or made
+
+
+class Model(NamedTuple):
+    """What is trained: a method on a level, with what differs from the preset."""
+
+    level: str
+    options: Mapping[str, Any] = {}
+
+
+class Way(NamedTuple):
+    """A way to ask what was trained for plans."""
+
+    name: str
+    method: str = "leap"
+    minimise: Callable[[Sequence[Energy]], Energy] = lambda energies: energies[0]
+    # (energies of the case's models) -> what the planner minimises
+    search: Callable[[Any], PlannerConfig] = lambda trained: trained
+    # (settings that it was trained with) -> settings of how it searches
+    executed: int | None = None  # actions before replanning; None: all
+    paper: float | None = None  # the paper's success, in percent
+
+
+class Case(NamedTuple):
+    """Models, and the level that they are asked to plan on."""
+
+    name: str
+    models: Sequence[Model]
+    level: str
+    ways: Sequence[Way]
+    adapter: Callable[[Level], BabyAIAdapter] = BabyAIAdapter
+    # one with `violations`, a number, counts them over all episodes
+
+
+class Analysis(NamedTuple):
+    """The cases of one program."""
+
+    name: str  # of its module, and of its file of rows
+    cases: Sequence[Case]
+    changes: Mapping[str, Any] = {}  # of every model's options, for tests
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Ask what was trained for plans on levels that it was not trained for."""
+
+    only: tuple[str, ...] = ()
+    """Cases by name; none: all of them."""
+    methods: tuple[str, ...] = ()
+    """Methods; none: all that a case has."""
+    preset: str = "leapjax"
+    """"leapjax": ours; "paper": the paper's appendix. Of what is trained."""
+    seeds: tuple[int, ...] = (0,)
+    """Training seeds."""
+    episodes: int = 200
+    """Held-out episodes to measure success on, for each row."""
+    test_seed: int = UNSEEN
+    """Level seed of the first of them."""
+    validation: bool = False
+    """Measure on validation levels instead: for choosing settings."""
+    record: bool = False
+    """Append rows to results/, which is committed, and skip what is recorded already."""
+    force: bool = False
+    """With --record: do again what is recorded, and replace its rows."""
+    runs: Path = Path("runs")
+    """Where what is trained, and unrecorded rows, go."""
+
+    @property
+    def played(self) -> range:
+        """The level seeds of the episodes."""
+        first = seeds.validation_seeds if self.validation else seeds.test_seeds
+        return first(self.test_seed, self.episodes)
+
+
+def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
+    """Trains what is missing and does every way of every case; the exit code."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given, description=f"The cases: {_names(analysis.cases)}.")
+    module = f"experiments.{analysis.name}"
+
+    def work() -> None:
+        with interruptible(lambda stopped: program.stop(module, given, stopped)) as interruption:
+            run_all(analysis, options, interruption)
+
+    return program.guarded(module, given, work)
+
+
+def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
+    """Every case, method and seed asked for, and their table."""
+    wanted = check(analysis, options)
+    versions = results.versions()
+    runtime.start()
+    console = Console()
+    rows = []
+    for case in wanted:
+        for method in methods_of(case, options.methods):
+            for seed in options.seeds:
+                rows += run_case(analysis, case, method, seed, options, console, interruption)
+    for row in rows:
+        row.setdefault("versions", versions)
+    record(analysis, options, rows)
+    console.print(table(rows))
+
+
+def check(analysis: Analysis, options: Options) -> list[Case]:
+    """The cases that are asked for.
+
+    Raises:
+        UserError: an unknown case, method or preset, or options that cannot be.
+    """
+    check_counts(options, "episodes")
+    if not options.seeds:
+        raise UserError("--seeds needs at least one seed")
+    known = [case.name for case in analysis.cases]
+    for name in options.only:
+        if name not in known:
+            expected = f"expected some of {', '.join(known)}"
+            raise UserError(f"unknown case {name!r}: {expected}{did_you_mean(name, known)}")
+    wanted = [case for case in analysis.cases if not options.only or case.name in options.only]
+    methods = sorted({way.method for case in wanted for way in case.ways})
+    for name in options.methods:
+        if name not in methods:
+            raise UserError(f"--methods {name}: expected some of {', '.join(methods)}")
+    for case in wanted:
+        for method in methods_of(case, options.methods):
+            for seed in options.seeds:
+                for model in case.models:
+                    configs.check(training_config(analysis, model, method, seed, options))
+    return wanted
+
+
+def _names(cases: Sequence[Case]) -> str:
+    return ", ".join(case.name for case in cases)
+
+
+def methods_of(case: Case, wanted: Sequence[str] = ()) -> list[str]:
+    """The methods that a case has ways of, in their order; those wanted, or all."""
+    found = dict.fromkeys(way.method for way in case.ways)
+    return [method for method in found if not wanted or method in wanted]
+
+
+def training_config(
+    analysis: Analysis, model: Model, method: str, seed: int, options: Options
+) -> AnyConfig:
+    """The configuration of a run of `experiments.babyai` that trains a model."""
+    default = configs.preset(DOMAIN, model.level, method, options.preset)
+    changed = with_options(default, {**model.options, **analysis.changes})
+    return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
+
+
+def run_case(
+    analysis: Analysis,
+    case: Case,
+    method: str,
+    seed: int,
+    options: Options,
+    console: Console,
+    interruption: Interruption,
+) -> list[Row]:
+    """The rows of one case, method and training seed."""
+    ways = [way for way in case.ways if way.method == method]
+    settings = [training_config(analysis, m, method, seed, options) for m in case.models]
+    names = {way.name: row_name(analysis, case, way, settings, seed, options) for way in ways}
+    path = rows_path(analysis, options)
+    recorded = {} if options.force or not options.record else _recorded(path)
+    missing = [way for way in ways if names[way.name] not in recorded]
+    if not missing:
+        console.print(f"{case.name}, {method}, seed {seed}: recorded already", highlight=False)
+        return [recorded[name] for name in names.values()]
+    models = [trained(each, seed, options, console, interruption) for each in settings]
+    rows = []
+    for way in ways:
+        row = recorded.get(names[way.name])
+        if row is None:
+            row = play(case, way, models, seed, options, interruption)
+            row |= {
+                "experiment": analysis.name,
+                "hash": names[way.name],
+                "trained": [configuration_hash(each, seed) for each in settings],
+            }
+            console.print(f"{case.name}, {way.name}: {results.percent(row)}", highlight=False)
+            record(analysis, options, [{**row, "versions": results.versions()}])
+        rows.append(row)
+    return rows
+
+
+def _recorded(path: Path) -> dict[str, Row]:
+    return {row["hash"]: row for row in results.read(path)}
+
+
+def rows_path(analysis: Analysis, options: Options) -> Path:
+    """Where the rows of an analysis are."""
+    return (Path("results") if options.record else options.runs) / f"{analysis.name}.jsonl"
+
+
+def record(analysis: Analysis, options: Options, rows: Sequence[Row]) -> None:
+    """Writes rows."""
+    for row in rows:
+        results.record(rows_path(analysis, options), row)
+
+
+def row_name(
+    analysis: Analysis,
+    case: Case,
+    way: Way,
+    settings: Sequence[AnyConfig],
+    seed: int,
+    options: Options,
+) -> str:
+    """Twelve hexadecimal digits that name a row: what was trained, how it plans, and where."""
+    described = {
+        "experiment": analysis.name, "case": case.name, "way": way.name, "method": way.method,
+        "level": case.level, "seed": seed, "executed": way.executed,
+        "episodes": options.episodes, "first": options.played[0],
+        "planner": dataclasses.asdict(way.search(settings[0].planner)),
+        "trained": [configuration_hash(each, seed) for each in settings],
+    }  # fmt: skip
+    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def trained(
+    config: AnyConfig, seed: int, options: Options, console: Console, interruption: Interruption
+) -> Pretrained:
+    """A model, trained where it is not there yet."""
+    folder = experiment.run_folder(TRAINING, config, seed)
+    domain = configs.make_domain(config)
+    this = Run(config, domain, configs.specify(config, seed, domain), folder, console, interruption)
+    steps = [entry["step"] for entry in run.read_metrics(folder)]
+    if steps and steps[-1] >= config.training.steps:
+        return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
+    console.print(f"training {folder}", highlight=False, markup=False)
+    with contextlib.ExitStack() as stack:
+        return experiment.train(this, options.played, stack)[0]
+
+
+def play(
+    case: Case,
+    way: Way,
+    models: Sequence[Pretrained],
+    seed: int,
+    options: Options,
+    interruption: Interruption,
+) -> Row:
+    """What one way of asking gives."""
+    level = levels.find_level(case.level)
+    energy = way.minimise([model.energy for model in models])
+    params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
+    specification = models[0].specification
+    search = way.search(specification.planner)
+    domain = configs.find_domain(DOMAIN).make(case.level, specification.domain_settings)
+    adapters: list[BabyAIAdapter] = []
+
+    def make_adapter() -> BabyAIAdapter:
+        adapters.append(case.adapter(level))
+        return adapters[-1]
+
+    def episodes(config: PlannerConfig) -> rollouts.Episodes:
+        plan = compile_planner(energy, config, run.CHUNK_SIZES)
+        run.warm_up(Pretrained(specification, energy, params, plan), domain, options.episodes)
+        adapters.clear()
+        return rollouts.evaluate(
+            make_adapter, options.played, plan, params, context=specification.context, seed=seed,
+            executed=way.executed, progress=lambda over, good: interruption.check(),
+        )  # fmt: skip
+
+    first_pass = None
+    if isinstance(search, GibbsConfig) and search.horizon > 1:
+        one = dataclasses.replace(search, iterations=1, fill="together", restarts=1)
+        first_pass = int(episodes(one).successes.sum())
+    found = episodes(search)
+    violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
+    good = found.lengths[found.successes]
+    return {
+        "domain": DOMAIN,
+        "level": case.level,
+        "case": case.name,
+        "way": way.name,
+        "method": way.method,
+        "preset": options.preset,
+        "seed": seed,
+        "episodes": options.episodes,
+        "first_episode_seed": options.played[0],
+        "validation": options.validation,
+        "successes": int(found.successes.sum()),
+        "first_pass_successes": first_pass,
+        "violations": sum(violations) if violations else None,
+        "mean_length": float(found.lengths.mean()),
+        "mean_success_length": float(good.mean()) if len(good) else None,
+        "planner": {"kind": type(search).__name__, **dataclasses.asdict(search)},
+        "executed": way.executed or search.horizon,
+        "demos_seconds": 0.0,
+        "compile_seconds": 0.0,
+        "train_seconds": 0.0,
+        "eval_seconds": round(found.seconds, 3),
+        "plans": found.plans,
+        "plans_per_second": found.plans / found.planning_seconds,
+        "paper_success": way.paper,
+        "date": results.today(),
+    }
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows for a terminal."""
+    shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
+    for row in rows:
+        paper, first = row["paper_success"], row["first_pass_successes"]
+        shown.add_row(
+            row["case"],
+            row["way"],
+            f"{row['method']} ({row['preset']})",
+            str(row["seed"]),
+            "" if first is None else f"{first / row['episodes']:.1%}",
+            results.percent(row),
+            f"{1e3 / row['plans_per_second']:.2f}",
+            "-" if paper is None else f"{paper:.1f}%",
+        )
+    return shown
+
+
+def summed(weights: Sequence[float] | None = None) -> Callable[[Sequence[Energy]], Energy]:
+    """Every model's energy, added up."""
+    return lambda energies: compose(energies, weights)

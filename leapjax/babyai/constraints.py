@@ -1,0 +1,82 @@
+"""Constraints on plans in a grid world that no model has learned, and views that hide things.
+
+Each penalty is `(context, actions [T]) -> []`, for `leapjax.constrain` with `partial`: the number
+of violations in what is certain of the plan.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.babyai import vocabulary
+from leapjax.babyai.dynamics import LAVA, roll
+from leapjax.babyai.encoders import one_cell
+from leapjax.babyai.observations import Observation
+from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE
+from leapjax.types import Context
+
+
+def lava(context: Context, actions: jax.Array) -> jax.Array:
+    """Steps onto lava, of the whole plan."""
+    return _lava_steps(context.observation, actions)
+
+
+def immediate_lava(context: Context, actions: jax.Array) -> jax.Array:
+    """The same of the first action alone, which is all that the paper penalises."""
+    return _lava_steps(context.observation, actions[:1])
+
+
+def _lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
+    cells = roll(observation, actions)[:, :2]
+    entered = (cells[1:] != cells[:-1]).any(axis=1)
+    on_lava = jnp.asarray(observation.grid)[cells[1:, 0], cells[1:, 1], 0] == LAVA
+    return jnp.sum(entered & on_lava).astype(jnp.float32)
+
+
+def without_lava(context: Context) -> Context:
+    """A context in which lava cells look empty."""
+    return _hiding(context, lambda grid, goal: grid[..., 0] == LAVA)
+
+
+def half_of_obstacles(context: Context, part: int) -> Context:
+    """A context in which every second object that is not the goal is seen: part 0 or 1."""
+
+    def hidden(grid: jax.Array, goal: jax.Array) -> jax.Array:
+        kinds = grid[..., 0]
+        objects = (kinds >= INTERCHANGEABLE[0]) & (kinds <= INTERCHANGEABLE[-1])
+        obstacles = objects & (one_cell(goal, grid.shape[0]) == 0)
+        count = jnp.cumsum(obstacles.reshape(-1)).reshape(obstacles.shape)
+        return obstacles & (count % 2 != part)
+
+    return _hiding(context, hidden)
+
+
+def _hiding(context: Context, which: Callable[[jax.Array, jax.Array], jax.Array]) -> Context:
+    """A context in which some cells look empty, now and in the past.
+
+    Args:
+        context: of one trajectory.
+        which: (grid `[S, S, 3]`, goal `[2]`) -> `[S, S]` bool.
+    """
+
+    def hide(observation: Observation) -> Observation:
+        grid = jnp.asarray(observation.grid)
+        hidden = which(grid, jnp.asarray(observation.goal))
+        empty = jnp.array([EMPTY, 0, 0], grid.dtype)
+        return observation._replace(grid=jnp.where(hidden[..., None], empty, grid))
+
+    observation = hide(context.observation)
+    return context._replace(observation=observation, past=jax.vmap(hide)(context.past))
+
+
+def told_to_go(context: Context) -> Context:
+    """A context whose instruction, to pick something up, is to go to it."""
+    words = jnp.arange(vocabulary.SIZE)
+    for said, instead in (("pick", "go"), ("up", "to")):
+        words = words.at[vocabulary.WORD_IDS[said]].set(vocabulary.WORD_IDS[instead])
+
+    def tell(observation: Observation) -> Observation:
+        return observation._replace(instruction=words[jnp.asarray(observation.instruction)])
+
+    return context._replace(observation=tell(context.observation), past=tell(context.past))
