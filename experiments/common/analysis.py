@@ -41,10 +41,11 @@ TRAINING = Experiment(DOMAIN, DOMAIN)  # whose runs are used, or made
 
 
 class Model(NamedTuple):
-    """What is trained: a method on a level, with what differs from the preset."""
+    """What is trained: a method on a level. Options change preset `leapjax` alone."""
 
     level: str
     options: Mapping[str, Any] = {}
+    planning: Mapping[str, Any] = {}  # more of them, for methods that plan several actions
 
 
 class Way(NamedTuple):
@@ -124,21 +125,34 @@ def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     return program.guarded(module, given, work)
 
 
+class Work(NamedTuple):
+    """What every step of an analysis needs."""
+
+    analysis: Analysis
+    options: Options
+    versions: dict[str, str]  # of the code that runs, whatever is committed meanwhile
+    console: Console
+    interruption: Interruption
+
+    @property
+    def rows(self) -> Path:
+        """The file of its rows."""
+        folder = Path("results") if self.options.record else self.options.runs
+        return folder / f"{self.analysis.name}.jsonl"
+
+
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
     """Every case, method and seed asked for, and their table."""
     wanted = check(analysis, options)
     versions = results.versions()
     runtime.start()
-    console = Console()
-    rows = []
+    work = Work(analysis, options, versions, Console(), interruption)
+    rows: list[Row] = []
     for case in wanted:
         for method in methods_of(case, options.methods):
             for seed in options.seeds:
-                rows += run_case(analysis, case, method, seed, options, console, interruption)
-    for row in rows:
-        row.setdefault("versions", versions)
-    record(analysis, options, rows)
-    console.print(table(rows))
+                rows += run_case(work, case, method, seed)
+    work.console.print(table(rows))
 
 
 def check(analysis: Analysis, options: Options) -> list[Case]:
@@ -183,59 +197,43 @@ def training_config(
 ) -> AnyConfig:
     """The configuration of a run of `experiments.babyai` that trains a model."""
     default = configs.preset(DOMAIN, model.level, method, options.preset)
-    changed = with_options(default, {**model.options, **analysis.changes})
+    options_of = dict(analysis.changes)
+    if options.preset == "leapjax":
+        options_of |= model.options
+        options_of |= model.planning if default.planner.horizon > 1 else {}
+    changed = with_options(default, options_of)
     return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
 
 
-def run_case(
-    analysis: Analysis,
-    case: Case,
-    method: str,
-    seed: int,
-    options: Options,
-    console: Console,
-    interruption: Interruption,
-) -> list[Row]:
+def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     """The rows of one case, method and training seed."""
-    ways = [way for way in case.ways if way.method == method]
+    analysis, options = work.analysis, work.options
     settings = [training_config(analysis, m, method, seed, options) for m in case.models]
-    names = {way.name: row_name(analysis, case, way, settings, seed, options) for way in ways}
-    path = rows_path(analysis, options)
-    recorded = {} if options.force or not options.record else _recorded(path)
-    missing = [way for way in ways if names[way.name] not in recorded]
-    if not missing:
-        console.print(f"{case.name}, {method}, seed {seed}: recorded already", highlight=False)
-        return [recorded[name] for name in names.values()]
-    models = [trained(each, seed, options, console, interruption) for each in settings]
-    rows = []
-    for way in ways:
-        row = recorded.get(names[way.name])
-        if row is None:
-            row = play(case, way, models, seed, options, interruption)
-            row |= {
-                "experiment": analysis.name,
-                "hash": names[way.name],
-                "trained": [configuration_hash(each, seed) for each in settings],
-            }
-            console.print(f"{case.name}, {way.name}: {results.percent(row)}", highlight=False)
-            record(analysis, options, [{**row, "versions": results.versions()}])
-        rows.append(row)
-    return rows
-
-
-def _recorded(path: Path) -> dict[str, Row]:
-    return {row["hash"]: row for row in results.read(path)}
-
-
-def rows_path(analysis: Analysis, options: Options) -> Path:
-    """Where the rows of an analysis are."""
-    return (Path("results") if options.record else options.runs) / f"{analysis.name}.jsonl"
-
-
-def record(analysis: Analysis, options: Options, rows: Sequence[Row]) -> None:
-    """Writes rows."""
-    for row in rows:
-        results.record(rows_path(analysis, options), row)
+    ways = {
+        row_name(analysis, case, way, settings, seed, options): way
+        for way in case.ways
+        if way.method == method
+    }
+    # Read even where nothing is looked for: a damaged file is better found now than later.
+    found = {row["hash"]: row for row in results.read(work.rows)}
+    rows = found if options.record and not options.force else {}
+    missing = [name for name in ways if name not in rows]
+    models = [trained(work, each, seed) for each in settings] if missing else []
+    for name in missing:
+        row = {
+            "experiment": analysis.name,
+            "hash": name,
+            "trained": [configuration_hash(each, seed) for each in settings],
+            "versions": work.versions,
+            **play(case, ways[name], models, seed, options, work.interruption),
+        }
+        results.record(work.rows, row)
+        rows[name] = row
+    for name, way in ways.items():
+        before = "" if name in missing else ", recorded already"
+        said = f"{case.name}, {way.name}: {results.percent(rows[name])}{before}"
+        work.console.print(said, highlight=False)
+    return [rows[name] for name in ways]
 
 
 def row_name(
@@ -257,19 +255,18 @@ def row_name(
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def trained(
-    config: AnyConfig, seed: int, options: Options, console: Console, interruption: Interruption
-) -> Pretrained:
+def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
     folder = experiment.run_folder(TRAINING, config, seed)
-    domain = configs.make_domain(config)
-    this = Run(config, domain, configs.specify(config, seed, domain), folder, console, interruption)
     steps = [entry["step"] for entry in run.read_metrics(folder)]
     if steps and steps[-1] >= config.training.steps:
         return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
-    console.print(f"training {folder}", highlight=False, markup=False)
+    work.console.print(f"training {folder}", highlight=False, markup=False)
+    domain = configs.make_domain(config)
+    specification = configs.specify(config, seed, domain)
+    this = Run(config, domain, specification, folder, work.console, work.interruption)
     with contextlib.ExitStack() as stack:
-        return experiment.train(this, options.played, stack)[0]
+        return experiment.train(this, work.options.played, stack)[0]
 
 
 def play(

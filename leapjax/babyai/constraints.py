@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
+from leapjax.babyai.adapter import END
 from leapjax.babyai.dynamics import LAVA, roll
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE
+from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
 from leapjax.types import Context
 
 
@@ -32,6 +33,13 @@ def _lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
     entered = (cells[1:] != cells[:-1]).any(axis=1)
     on_lava = jnp.asarray(observation.grid)[cells[1:, 0], cells[1:, 1], 0] == LAVA
     return jnp.sum(entered & on_lava).astype(jnp.float32)
+
+
+def left_turns(context: Context, actions: jax.Array) -> jax.Array:
+    """Turns to the left before the plan ends, as if they were forbidden."""
+    del context
+    done = jnp.cumsum(actions >= END) == 0
+    return jnp.sum((actions == LEFT) & done).astype(jnp.float32)
 
 
 def without_lava(context: Context) -> Context:

@@ -1,0 +1,37 @@
+"""Turns that fail (paper, appendix): `python -m experiments.stochastic --help`.
+
+A turn becomes one of the five other actions with probability 0.2, in demonstrations and in tests.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from experiments.common import analysis
+from experiments.common.analysis import Analysis, Case, Model, Way
+
+
+def _case(level: str, leap: float, dt: float) -> Case:
+    return Case(
+        level,
+        [Model(f"{level}Slip")],
+        f"{level}Slip",
+        [
+            Way("whole plans", paper=leap),
+            Way("replanned after each action", executed=1, paper=leap),
+            Way("dt", "dt", paper=dt),
+        ],
+    )
+
+
+ANALYSIS = Analysis(
+    "stochastic", (_case("GoToObjMazeS4", 57.5, 30.8), _case("GoToObjMazeS7", 33.3, 28.3))
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Every case asked for; the exit code."""
+    return analysis.main(ANALYSIS, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,42 @@
+"""Imperfect demonstrations (paper, appendix): `python -m experiments.suboptimal --help`.
+
+A quarter of the demonstrator's actions are random. They are executed, and it goes on from where
+they lead; or, as the file of the paper's authors suggests, only what is recorded is wrong.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from experiments.common import analysis
+from experiments.common.analysis import Analysis, Case, Model, Way
+
+# The paper's success of LEAP and DT, from optimal demonstrations and from others.
+PAPER = {
+    "GoToObjMazeS4": ((65.0, 46.5), (63.0, 45.0)),
+    "GoToObjMazeS7": ((45.5, 22.0), (44.0, 19.5)),
+    "GoToSeqS5R2": ((38.0, 26.5), (37.5, 29.5)),
+}
+
+
+def _case(level: str, suffix: str, leap: float, dt: float) -> Case:
+    ways = [Way("leap", paper=leap), Way("dt", "dt", paper=dt)]
+    return Case(f"{level}{suffix}", [Model(f"{level}{suffix}")], level, ways)
+
+
+ANALYSIS = Analysis(
+    "suboptimal",
+    [
+        _case(level, suffix, *paper)
+        for level, (optimal, mistaken) in PAPER.items()
+        for suffix, paper in {"": optimal, "Mistakes": mistaken, "Mislabelled": mistaken}.items()
+    ],
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Every case asked for; the exit code."""
+    return analysis.main(ANALYSIS, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
