@@ -33,7 +33,7 @@ Penalty = Callable[[Context, jax.Array], jax.Array]
 WEIGHT = 20.0  # of a violation, in nats: more than any detour costs
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
-FALSE_STARTS = {"false_starts": 0.3}
+DETOURS = {"detours": 0.5}
 
 
 class Watched(BabyAIAdapter):
@@ -100,7 +100,7 @@ def _adaptation(name: str, learned: str, level: str, paper: tuple[float, float, 
     leap, dt, iql = paper
     return Case(
         f"adaptation-{name}",
-        [Model(learned, planning=FALSE_STARTS)],
+        [Model(learned, planning=DETOURS)],
         level,
         [
             Way("next action", minimise=unseen(immediate_lava), executed=1, paper=leap),
@@ -116,7 +116,7 @@ def _constraints(name: str, learned: str, level: str) -> Case:
     both = masked(immediate_lava, left_turns)
     return Case(
         f"constraints-{name}",
-        [Model(learned, planning=FALSE_STARTS)],
+        [Model(learned, planning=DETOURS)],
         level,
         [
             Way("whole plan", minimise=unseen(lava, left_turns), search=left_to_right),

@@ -19,7 +19,9 @@ from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.domain import Augmentation
 from leapjax.types import Array, Demonstration, Window
 
-FALSE_MOVES = 3  # at most, at the beginning of a window
+FALSE_MOVES = 8  # at most, at the beginning of a window
+WALL, GREY = 2, 5  # MiniGrid's indices
+_KINDS = (symmetries.INTERCHANGEABLE[0], symmetries.INTERCHANGEABLE[-1] + 1)
 
 
 class GridWords(NamedTuple):
@@ -47,8 +49,8 @@ def chosen(settings: Settings) -> list[Augmentation]:
     found: list[Augmentation] = []
     if settings.augment:
         found.append(lambda key, w: augment(key, w, grid_words(), settings.exchange_objects))
-    if settings.false_starts:
-        found.append(lambda key, w: false_start(key, w, settings.false_starts))
+    if settings.detours:
+        found.append(lambda key, w: detour(key, w, settings.detours))
     if settings.clutter:
         found.append(lambda key, w: clutter(key, w, settings.clutter))
     return found
@@ -109,31 +111,76 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
     return window._replace(context=context._replace(observation=observation, past=before))
 
 
-def false_start(key: jax.Array, window: Window, share: float) -> Window:
-    """A window that begins with up to three random moves, and then does what it did.
+def detour(key: jax.Array, window: Window, share: float) -> Window:
+    """A window that takes a longer way, in a world where it is the shortest.
 
-    The moves lead from another pose, which is found backwards, to the one that the window
-    began in. So it shows where a plan has got to that did not begin well, which plans under a
-    constraint must know, and demonstrations, being optimal, never show.
+    It begins with up to eight random moves, which lead from another pose, found backwards, to the
+    one that it began in; objects and walls are put beside the way, many or few; and it is taken
+    where no shorter way is left. So it shows that ways lead around things, even where
+    demonstrations are of empty rooms; and, its first turns being anything, where a plan has got
+    to that did not begin well, which matters under a constraint.
 
-    Windows stay as they are where the moves would lead through things, past the goal or out of a
-    doorway, of which the agent's mark hides the door, and where there are past states.
+    Windows stay as they are where that does not work out, and where there are past states.
 
     Args:
         key: chooses.
         window: one training example.
-        share: of the windows that begin so.
+        share: of the windows, in which it is tried.
     """
-    context, length = window.context, window.context.actions.shape[0]
-    if length:
+    if window.context.actions.shape[0]:
         return window
-    take_key, count_key, moves_key = jax.random.split(key, 3)
-    horizon = window.actions.shape[0]
+    take_key, start_key, share_key, where_key, kind_key = jax.random.split(key, 5)
+    longer, possible = _false_start(start_key, window)
+    observation = longer.context.observation
+    grid, goal = observation.grid, observation.goal
+    cells = grid.shape[:2]
+    probability = jax.random.uniform(share_key)
+    filled = (grid[..., 0] == EMPTY) & ~longer.extras
+    filled &= jax.random.uniform(where_key, cells) < probability
+    # A grey wall, a key, a ball or a box; not of the target's colour, so that none is meant.
+    target = grid[goal[0], goal[1]].astype(jnp.int32)
+    kind_key, colour_key, wall_key = jax.random.split(kind_key, 3)
+    kinds = jax.random.randint(kind_key, cells, *_KINDS)
+    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
+    colours = (target[1] + shift) % symmetries.COLOURS
+    walls = jax.random.bernoulli(wall_key, shape=cells)
+    kinds, colours = jnp.where(walls, WALL, kinds), jnp.where(walls, GREY, colours)
+    things = jnp.stack([kinds, colours, jnp.zeros_like(kinds)], axis=-1).astype(grid.dtype)
+    grid = jnp.where(filled[..., None], things, grid)
+    free = passable(grid).at[goal[0], goal[1]].set(True)
+    # A way without a cell twice has as many cells, but for the goal, as moves lead to the goal.
+    shortest = distance(free, observation.pose[:2], goal) == longer.extras.sum()
+    possible &= shortest & (goal[0] >= 0) & jax.random.bernoulli(take_key, share)
+    context = longer.context._replace(observation=observation._replace(grid=grid))
+    changed = longer._replace(context=context)
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), changed, window)
+
+
+def distance(free: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    """Moves from a cell `[2]` to another through free cells `[S, S]`; inf where there is no way."""
+    cells = free.shape
+
+    def spread(_: jax.Array, found: jax.Array) -> jax.Array:
+        around = jnp.pad(found, 1, constant_values=jnp.inf)
+        near = jnp.stack([around[2:, 1:-1], around[:-2, 1:-1], around[1:-1, 2:], around[1:-1, :-2]])
+        return jnp.where(free, jnp.minimum(found, near.min(axis=0) + 1), jnp.inf)
+
+    begun = jnp.full(cells, jnp.inf).at[start[0], start[1]].set(0.0)
+    found = jax.lax.fori_loop(0, 4 * cells[0], spread, begun)
+    return found[goal[0], goal[1]]
+
+
+def _false_start(key: jax.Array, window: Window) -> tuple[Window, jax.Array]:
+    """A window with random moves before its own, and whether they are possible.
+
+    They are not where they lead through things, past the goal, or out of a doorway, of which the
+    agent's mark hides the door; nor where turns undo each other, or one would do for three.
+    """
+    context, horizon = window.context, window.actions.shape[0]
+    count_key, moves_key = jax.random.split(key)
     longest = min(FALSE_MOVES, horizon - 1)
-    if longest < 1:
-        return window
-    count = jax.random.randint(count_key, (), 1, longest + 1)
-    moves = jax.random.randint(moves_key, (longest,), LEFT, FORWARD + 1)
+    count = jax.random.randint(count_key, (), 0, longest + 1)
+    moves = jax.random.randint(moves_key, (max(longest, 1),), LEFT, FORWARD + 1)
     observation = context.observation
     grid, pose = jnp.asarray(observation.grid), jnp.asarray(observation.pose)
     free = passable(grid)
@@ -148,31 +195,32 @@ def false_start(key: jax.Array, window: Window, share: float) -> Window:
         turn = (move == RIGHT).astype(jnp.int32) - (move == LEFT)
         behind = pose[:2] - vectors[pose[2]] * (move == FORWARD)
         before = jnp.append(behind, (pose[2] - turn) % 4)
+        facing = before[:2] + vectors[before[2]]
+        possible &= ~made | (free[behind[0], behind[1]] & (facing != observation.goal).any())
         pose = jnp.where(made, before, pose)
-        facing = pose[:2] + vectors[pose[2]]
-        possible &= free[pose[0], pose[1]] & ~(facing == observation.goal).all()
         return (pose, possible), pose
 
     around = jnp.pad(~free, 1, constant_values=True)
     x, y = pose[0] + 1, pose[1] + 1
     doorway = (around[x - 1, y] & around[x + 1, y]) | (around[x, y - 1] & around[x, y + 1])
     places = jnp.arange(longest)[::-1]
-    (start, possible), visited = jax.lax.scan(undo, (pose, ~doorway), places)
-    possible &= jax.random.bernoulli(take_key, share)
-
+    (start, possible), visited = jax.lax.scan(undo, (pose, ~doorway | (count == 0)), places)
     # The agent's mark, whose state is its direction, moves to where it begins.
     empty = jnp.array([EMPTY, 0, 0], grid.dtype)
     mark = grid[pose[0], pose[1]].at[2].set(start[2].astype(grid.dtype))
     moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
     place = jnp.arange(horizon)
     later = window.actions[jnp.maximum(place - count, 0)]
-    actions = jnp.where(place < count, moves[jnp.minimum(place, longest - 1)], later)
+    actions = jnp.where(place < count, moves[jnp.minimum(place, len(moves) - 1)], later)
+    turning = jnp.where(actions == LEFT, -1, jnp.where(actions == RIGHT, 1, 0))
+    undone = (turning[1:] * turning[:-1] == -1).any()
+    undone |= (jnp.abs(turning[2:] + turning[1:-1] + turning[:-2]) == 3).any()
     way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
     began = observation._replace(grid=moved, pose=start)
-    changed = window._replace(
+    longer = window._replace(
         context=context._replace(observation=began), actions=actions, extras=way
     )
-    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), changed, window)
+    return longer, possible & ~undone
 
 
 def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:
