@@ -145,13 +145,16 @@ def run_one(
     return row
 
 
-def train(this: Run, played: range, stack: contextlib.ExitStack) -> tuple[Pretrained, run.Metrics]:
+def train(
+    this: Run, played: range, stack: contextlib.ExitStack, watch: run.Watch | None = None
+) -> tuple[Pretrained, run.Metrics]:
     """What one run learns, from demonstrations on.
 
     Args:
         this: run to do.
         played: level seeds that it may not learn from.
         stack: keeps other processes out of its folder, until it is closed.
+        watch: see `run.fit`.
     """
     mesh, wait = run.training_mesh(this.config), None
     if run.must_collect(this):
@@ -160,7 +163,7 @@ def train(this: Run, played: range, stack: contextlib.ExitStack) -> tuple[Pretra
     data = run.load(this)
     seeds.check_disjoint([d.seed for d in data], played)
     processes.first_does(lambda: stack.enter_context(files.only_process_in(this.folder)))
-    return run.fit(this, data, mesh, wait)
+    return run.fit(this, data, mesh, wait, watch)
 
 
 def make_row(

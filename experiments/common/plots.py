@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -106,6 +107,38 @@ def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], pat
     if rates:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    _save(figure, path)
+
+
+def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Energies of good and bad plans over training, and of plans over iterations.
+
+    Args:
+        found: of each preset, as `experiments.landscape` has it.
+        path: to write.
+    """
+    figure, axes = plt.subplots(
+        len(found), 2, figsize=(9, 3 * len(found)), layout="constrained", squeeze=False
+    )
+    for (left, right), each in zip(axes, found, strict=True):
+        names = [name for name in each["training"][0] if name != "step"]
+        steps = [entry["step"] for entry in each["training"]]
+        for index, name in enumerate(names):
+            share = name.removeprefix("random_")
+            colour = plt.get_cmap("viridis")(index / max(1, len(names) - 1))
+            values = [entry[name] for entry in each["training"]]
+            left.plot(steps, values, color=colour, label=f"{share}% random")
+        left.set(xlabel="training step", ylabel="energy", yscale="log")
+        left.set_title(f"{each['level']}, preset {each['preset']}", fontsize=9)
+        left.legend(fontsize=7)
+        passes = range(1, len(each["planning"]["mean"]) + 1)
+        for index, single in enumerate(each["planning"]["single"]):
+            label = "single plans" if index == 0 else None
+            right.plot(passes, single, color="0.7", linewidth=1, label=label)
+        right.plot(passes, each["planning"]["mean"], "o-", label="mean of all plans")
+        right.set(xlabel="passes N", ylabel="energy", yscale="log")
+        right.set_title("of plans being refined", fontsize=9)
+        right.legend(fontsize=7)
     _save(figure, path)
 
 

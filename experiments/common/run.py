@@ -36,9 +36,10 @@ from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
 from leapjax.training import TrainStep
-from leapjax.types import Agent, Demonstration, TrainState
+from leapjax.types import Agent, Demonstration, Energy, Params, TrainState
 
 Metrics = list[dict[str, float]]
+Watch = Callable[[Energy, Params], dict[str, float]]
 # One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
 # evaluation would rather have smaller ones.
 CHUNK_SIZES = (32,)
@@ -167,6 +168,7 @@ def fit(
     data: Sequence[Demonstration],
     mesh: Mesh,
     wait: Callable[[], Programs] | None = None,
+    watch: Watch | None = None,
 ) -> tuple[Pretrained, Metrics]:
     """Trains, or continues; what was learned and how it went.
 
@@ -175,6 +177,7 @@ def fit(
         data: to train on.
         mesh: to train on.
         wait: from `compile_ahead`, where that was called already.
+        watch: measures more of what is being learned, whenever its progress is reported.
     """
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
@@ -210,7 +213,8 @@ def fit(
         def report(done: int, now: TrainState, means: dict[str, float]) -> bool:
             nonlocal last_saved
             elapsed = time.perf_counter() - begun
-            metrics.append({"step": done, "seconds": before + elapsed, **means})
+            seen = watch(agent.energy, now.params) if watch else {}
+            metrics.append({"step": done, "seconds": before + elapsed, **means, **seen})
             meter.update(done, " ".join(f"{name} {mean:.3g}" for name, mean in means.items()))
             due = time.perf_counter() - last_saved > config.checkpoint_seconds
             # Processes have their own clocks and signals, and must agree on what to do.

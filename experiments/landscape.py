@@ -1,0 +1,193 @@
+"""What energies training gives to good and bad plans: `python -m experiments.landscape --help`.
+
+The paper's 'Energy Landscape Verification' (section 4, figure 6, right): the energy of
+demonstrations that were never learned from, as they are and with a share of their actions replaced
+at random, over training. Beside it, the energy of plans over the iterations that refine them.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.common import config as configs
+from experiments.common import experiment, plots, program, results, run, runtime
+from experiments.common.config import check_counts
+from experiments.common.experiment import Experiment
+from experiments.common.interruption import Interruption, interruptible
+from experiments.common.run import Run
+from leapjax import files
+from leapjax.batching import compile_planner
+from leapjax.data import seeds, windows
+from leapjax.domain import Domain
+from leapjax.planners import GibbsConfig
+from leapjax.pretrained import Pretrained
+from leapjax.rollouts import History, stack_contexts
+from leapjax.types import Context, Energy, Params
+
+CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
+EXPERIMENT = Experiment("landscape", "babyai")
+RESULTS = Path("landscape.json")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train, and watch the energies of good and bad plans."""
+
+    level: str = "GoToLocalS7N5"
+    """A level of BabyAI; the paper's is this one."""
+    presets: tuple[str, ...] = ("paper", "leapjax")
+    """What is trained."""
+    seed: int = 0
+    """Training seed."""
+    trajectories: int = 200
+    """Demonstrations to take the energy of, and contexts to plan for."""
+    steps: int | None = None
+    """Train for so many steps; None: as long as the preset says."""
+    record: bool = False
+    """Write what was found to results/, which is committed."""
+    runs: Path = Path("runs")
+    """Where what is trained, and what is not recorded, goes."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Trains with each preset and says what was found; the exit code."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    module = "experiments.landscape"
+
+    def work() -> None:
+        with interruptible(lambda stopped: program.stop(module, given, stopped)) as interruption:
+            report(options, interruption)
+
+    return program.guarded(module, given, work)
+
+
+def report(options: Options, interruption: Interruption) -> None:
+    """Trains with each preset; the table, the file and the figure of what was found."""
+    check_counts(options, "trajectories")
+    console = Console()
+    wanted = []
+    for preset in options.presets:
+        config = configs.preset("babyai", options.level, "leap", preset)
+        if options.steps is not None:
+            config = configs.with_options(config, {"steps": options.steps})
+        config = dataclasses.replace(config, seeds=(options.seed,), runs=options.runs)
+        configs.check(config)
+        wanted.append(config)
+    runtime.start()
+    found = []
+    for config in wanted:
+        domain = configs.make_domain(config)
+        folder = experiment.run_folder(EXPERIMENT, config, options.seed)
+        specification = configs.specify(config, options.seed, domain)
+        this = Run(config, domain, specification, folder, console, interruption)
+        found.append(landscape(this, options.trajectories))
+    console.print(table(found))
+    folder = Path("results") if options.record else options.runs
+    files.write_text(folder / RESULTS, json.dumps(found, indent=1) + "\n")
+    plots.landscape(found, options.runs / "landscape.png")
+    console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False, markup=False)
+
+
+def landscape(this: Run, count: int) -> dict[str, Any]:
+    """One training, watched; and plans of what was learned."""
+    measure = energies_of(this.domain, this.specification.planner.horizon, count)
+    with contextlib.ExitStack() as stack:
+        played = seeds.validation_seeds(0, count)
+        planner, metrics = experiment.train(this, played, stack, measure)
+    last = measure(planner.energy, planner.params)
+    watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in metrics]
+    return {
+        "level": this.config.level,
+        "preset": this.config.preset,
+        "seed": this.seed,
+        "trajectories": count,
+        "training": watched,
+        "planning": refinement(planner, this.domain, played),
+        "versions": results.versions(),
+        "date": results.today(),
+    }
+
+
+def energies_of(
+    domain: Domain, horizon: int, count: int
+) -> Callable[[Energy, Params], dict[str, float]]:
+    """A function that takes the mean energy of demonstrations, corrupted more and more.
+
+    They are of a training seed that nothing else uses, each from its beginning.
+    """
+    data = domain.collect(count, seeds.MAX_TRAINING_SEED - 1, lambda done: None).demonstrations
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
+    begins = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
+    end = domain.num_actions - 1
+
+    def corrupted(key: jax.Array, actions: jax.Array, share: float) -> jax.Array:
+        where_key, action_key = jax.random.split(key)
+        wrong = jax.random.uniform(where_key, actions.shape) < share
+        # Never the end action, which would be possible in few places and absurd in others.
+        return jnp.where(wrong, jax.random.randint(action_key, actions.shape, 0, end), actions)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def mean(energy: Energy, params: Params, share: float) -> jax.Array:
+        def one(place: jax.Array, begin: jax.Array) -> jax.Array:
+            window = windows.window(steps, begin, 0, horizon, end)
+            actions = corrupted(jax.random.key(place), window.actions, share)
+            return energy.total(params, energy.encode(params, window.context), actions)
+
+        return jax.vmap(one)(jnp.arange(len(begins)), begins).mean()
+
+    def measure(energy: Energy, params: Params) -> dict[str, float]:
+        return {f"random_{n}": float(mean(energy, params, n / 100)) for n in CORRUPTED}
+
+    return measure
+
+
+def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, list[Any]]:
+    """The energy of plans after every iteration, with the paper's N: their mean, and some."""
+    trained = planner.specification.planner
+    assert isinstance(trained, GibbsConfig)  # as of every energy over plans of several actions
+    config = dataclasses.replace(trained, iterations=max(10, trained.iterations), score_trace=True)
+    plan = compile_planner(planner.energy, config, run.CHUNK_SIZES)
+    plans = plan(
+        planner.params, jax.random.split(jax.random.key(0), len(played)), firsts(domain, played)
+    )
+    energies = np.asarray(plans.trace_energies)  # [B, N]
+    return {
+        "mean": energies.mean(axis=0).tolist(),
+        "single": energies[:8].tolist(),
+    }
+
+
+def firsts(domain: Domain, played: range) -> Context:
+    """The contexts that episodes begin with."""
+    adapter = domain.make_adapter()
+    histories = [History(adapter.reset(seed), 0, domain.num_actions) for seed in played]
+    return stack_contexts(histories)
+
+
+def table(found: Sequence[dict[str, Any]]) -> Table:
+    """Energies at the end of training, for a terminal."""
+    names = [f"{share}% random" for share in CORRUPTED]
+    shown = Table("level", "preset", *names, "plans, N = 1", "last")
+    for each in found:
+        last, planned = each["training"][-1], each["planning"]["mean"]
+        energies = (last[f"random_{share}"] for share in CORRUPTED)
+        cells = (f"{value:.2f}" for value in (*energies, planned[0], planned[-1]))
+        shown.add_row(each["level"], each["preset"], *cells)
+    return shown
+
+
+if __name__ == "__main__":
+    sys.exit(main())
