@@ -19,9 +19,8 @@ from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.domain import Augmentation
 from leapjax.types import Array, Demonstration, Window
 
-FALSE_MOVES = 8  # at most, at the beginning of a window
+FALSE_MOVES, DETOUR_MOVES = 3, 8  # at most, at the beginning of a window
 WALL, GREY = 2, 5  # MiniGrid's indices
-_KINDS = (symmetries.INTERCHANGEABLE[0], symmetries.INTERCHANGEABLE[-1] + 1)
 
 
 class GridWords(NamedTuple):
@@ -49,10 +48,13 @@ def chosen(settings: Settings) -> list[Augmentation]:
     found: list[Augmentation] = []
     if settings.augment:
         found.append(lambda key, w: augment(key, w, grid_words(), settings.exchange_objects))
+    if settings.false_starts:
+        found.append(lambda key, w: false_start(key, w, settings.false_starts))
     if settings.detours:
-        found.append(lambda key, w: detour(key, w, settings.detours))
+        found.append(lambda key, w: detour(key, w, settings.detours, grid_words()))
     if settings.clutter:
-        found.append(lambda key, w: clutter(key, w, settings.clutter))
+        lookalikes = grid_words() if settings.lookalikes else None
+        found.append(lambda key, w: clutter(key, w, settings.clutter, lookalikes))
     return found
 
 
@@ -68,7 +70,9 @@ def way(demonstration: Demonstration) -> np.ndarray:
     return np.logical_or.accumulate(needed[::-1])[::-1][:-1]
 
 
-def clutter(key: jax.Array, window: Window, share: float) -> Window:
+def clutter(
+    key: jax.Array, window: Window, share: float, lookalikes: GridWords | None = None
+) -> Window:
     """A window with objects where the demonstration never goes.
 
     The shortest way stays the shortest when others are blocked, so the demonstration stays as
@@ -76,13 +80,15 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
 
     Half of the windows stay as they are; in the others each free cell gets an object with a
     probability that is drawn for the window, in 0 .. `share`. Kind and colour both differ from
-    the target's, so that no instruction means the new object. Windows without a goal stay as
-    they are, because what their instruction means is not known here.
+    the target's, so that no instruction means the new object; with `lookalikes`, where the
+    instruction names both, one of them may be the same. Windows without a goal stay as they are,
+    because what their instruction means is not known here.
 
     Args:
         key: chooses.
         window: one training example.
         share: of the cells that nobody needs, in 0 .. 1.
+        lookalikes: the words that name kinds and colours; None for none.
     """
     share_key, where_key, kind_key, colour_key = jax.random.split(key, 4)
     context = window.context
@@ -94,12 +100,13 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
     filled = jax.random.uniform(where_key, cells) < probability
     filled &= free & ~window.extras & (goal[0] >= 0)
     target = grid[goal[0], goal[1]].astype(jnp.int32)
-    kinds = jnp.array(symmetries.INTERCHANGEABLE)
-    # Not the target's: a shift by at least one, around a circle.
-    shift = jax.random.randint(kind_key, cells, 1, len(kinds))
-    kind = kinds[(target[0] - kinds[0] + shift) % len(kinds)]
-    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
-    colour = (target[1] + shift) % symmetries.COLOURS
+    if lookalikes is None:
+        kind, colour = _unlike(kind_key, colour_key, target, cells)
+    else:
+        said = context.observation.instruction
+        kind, colour = _other(
+            kind_key, colour_key, target, cells, _in_full(said, target, lookalikes)
+        )
     objects = jnp.stack([kind, colour, jnp.zeros_like(kind)], axis=-1).astype(grid.dtype)
 
     def fill(image: jax.Array) -> jax.Array:
@@ -111,14 +118,75 @@ def clutter(key: jax.Array, window: Window, share: float) -> Window:
     return window._replace(context=context._replace(observation=observation, past=before))
 
 
-def detour(key: jax.Array, window: Window, share: float) -> Window:
+def _unlike(
+    kind_key: jax.Array, colour_key: jax.Array, target: jax.Array, cells: tuple[int, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Kinds and colours `[S, S]`, none of them that of the target `[3]`."""
+    kinds = jnp.array(symmetries.INTERCHANGEABLE)
+    # Not the target's: a shift by at least one, around a circle.
+    shift = jax.random.randint(kind_key, cells, 1, len(kinds))
+    kind = kinds[(target[0] - kinds[0] + shift) % len(kinds)]
+    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
+    return kind, (target[1] + shift) % symmetries.COLOURS
+
+
+def _other(
+    kind_key: jax.Array,
+    colour_key: jax.Array,
+    target: jax.Array,
+    cells: tuple[int, ...],
+    in_full: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The same, but that one of the two may be the target's where the instruction names both."""
+    kinds, count = jnp.array(symmetries.INTERCHANGEABLE), len(symmetries.INTERCHANGEABLE)
+    # Any pair but the target's, all alike.
+    pair = (target[0] - kinds[0]) * symmetries.COLOURS + target[1]
+    every = count * symmetries.COLOURS
+    other = (pair + jax.random.randint(kind_key, cells, 1, every)) % every
+    kind, colour = _unlike(kind_key, colour_key, target, cells)
+    return (
+        jnp.where(in_full, kinds[other // symmetries.COLOURS], kind),
+        jnp.where(in_full, other % symmetries.COLOURS, colour),
+    )
+
+
+def _in_full(instruction: jax.Array, target: jax.Array, words: GridWords) -> jax.Array:
+    """Whether an instruction `[L]` names both the kind and the colour of the target `[3]`."""
+    kinds = jnp.array(symmetries.INTERCHANGEABLE)
+    kind = jnp.asarray(words.objects)[jnp.argmax(kinds == target[0])]
+    colour = jnp.asarray(words.colours)[target[1]]
+    known = (kinds == target[0]).any()
+    return known & (instruction == kind).any() & (instruction == colour).any()
+
+
+def false_start(key: jax.Array, window: Window, share: float) -> Window:
+    """A window that begins with up to three random moves, and then does what it did.
+
+    The moves lead from another pose, which is found backwards, to the one that the window
+    began in. So it shows where a plan has got to that did not begin well, which plans under a
+    constraint must know, and demonstrations, being optimal, never show.
+
+    Windows stay as they are where the moves are not possible, and where there are past states.
+
+    Args:
+        key: chooses.
+        window: one training example.
+        share: of the windows that begin so.
+    """
+    if window.context.actions.shape[0]:
+        return window
+    take_key, start_key = jax.random.split(key)
+    later, possible = begin_earlier(start_key, window, FALSE_MOVES)
+    possible &= jax.random.bernoulli(take_key, share)
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), later, window)
+
+
+def detour(key: jax.Array, window: Window, share: float, words: GridWords) -> Window:
     """A window that takes a longer way, in a world where it is the shortest.
 
-    It begins with up to eight random moves, which lead from another pose, found backwards, to the
-    one that it began in; objects and walls are put beside the way, many or few; and it is taken
-    where no shorter way is left. So it shows that ways lead around things, even where
-    demonstrations are of empty rooms; and, its first turns being anything, where a plan has got
-    to that did not begin well, which matters under a constraint.
+    It begins with up to eight random moves, as `false_start` has them; objects and walls are put
+    beside the way, many or few; and it is taken where no shorter way is left. So it shows that
+    ways lead around things, even where demonstrations are of empty rooms.
 
     Windows stay as they are where that does not work out, and where there are past states.
 
@@ -126,23 +194,24 @@ def detour(key: jax.Array, window: Window, share: float) -> Window:
         key: chooses.
         window: one training example.
         share: of the windows, in which it is tried.
+        words: which word names what.
     """
     if window.context.actions.shape[0]:
         return window
     take_key, start_key, share_key, where_key, kind_key = jax.random.split(key, 5)
-    longer, possible = _false_start(start_key, window)
+    longer, possible = begin_earlier(start_key, window, DETOUR_MOVES)
+    possible &= ~_wasteful(longer.actions)
     observation = longer.context.observation
     grid, goal = observation.grid, observation.goal
     cells = grid.shape[:2]
     probability = jax.random.uniform(share_key)
     filled = (grid[..., 0] == EMPTY) & ~longer.extras
     filled &= jax.random.uniform(where_key, cells) < probability
-    # A grey wall, a key, a ball or a box; not of the target's colour, so that none is meant.
+    # Grey walls, and objects that are not meant.
     target = grid[goal[0], goal[1]].astype(jnp.int32)
     kind_key, colour_key, wall_key = jax.random.split(kind_key, 3)
-    kinds = jax.random.randint(kind_key, cells, *_KINDS)
-    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
-    colours = (target[1] + shift) % symmetries.COLOURS
+    in_full = _in_full(observation.instruction, target, words)
+    kinds, colours = _other(kind_key, colour_key, target, cells, in_full)
     walls = jax.random.bernoulli(wall_key, shape=cells)
     kinds, colours = jnp.where(walls, WALL, kinds), jnp.where(walls, GREY, colours)
     things = jnp.stack([kinds, colours, jnp.zeros_like(kinds)], axis=-1).astype(grid.dtype)
@@ -170,15 +239,27 @@ def distance(free: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
     return found[goal[0], goal[1]]
 
 
-def _false_start(key: jax.Array, window: Window) -> tuple[Window, jax.Array]:
+def _wasteful(actions: jax.Array) -> jax.Array:
+    """Whether turns of a plan `[T]` undo each other, or one would do for three."""
+    turning = jnp.where(actions == LEFT, -1, jnp.where(actions == RIGHT, 1, 0))
+    undone = (turning[1:] * turning[:-1] == -1).any()
+    return undone | (jnp.abs(turning[2:] + turning[1:-1] + turning[:-2]) == 3).any()
+
+
+def begin_earlier(key: jax.Array, window: Window, most: int) -> tuple[Window, jax.Array]:
     """A window with random moves before its own, and whether they are possible.
 
     They are not where they lead through things, past the goal, or out of a doorway, of which the
-    agent's mark hides the door; nor where turns undo each other, or one would do for three.
+    agent's mark hides the door.
+
+    Args:
+        key: chooses the moves.
+        window: one training example, without past states.
+        most: so many moves; one is left of the plan.
     """
     context, horizon = window.context, window.actions.shape[0]
     count_key, moves_key = jax.random.split(key)
-    longest = min(FALSE_MOVES, horizon - 1)
+    longest = min(most, horizon - 1)
     count = jax.random.randint(count_key, (), 0, longest + 1)
     moves = jax.random.randint(moves_key, (max(longest, 1),), LEFT, FORWARD + 1)
     observation = context.observation
@@ -212,15 +293,12 @@ def _false_start(key: jax.Array, window: Window) -> tuple[Window, jax.Array]:
     place = jnp.arange(horizon)
     later = window.actions[jnp.maximum(place - count, 0)]
     actions = jnp.where(place < count, moves[jnp.minimum(place, len(moves) - 1)], later)
-    turning = jnp.where(actions == LEFT, -1, jnp.where(actions == RIGHT, 1, 0))
-    undone = (turning[1:] * turning[:-1] == -1).any()
-    undone |= (jnp.abs(turning[2:] + turning[1:-1] + turning[:-2]) == 3).any()
     way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
     began = observation._replace(grid=moved, pose=start)
     longer = window._replace(
         context=context._replace(observation=began), actions=actions, extras=way
     )
-    return longer, possible & ~undone
+    return longer, possible
 
 
 def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:

@@ -15,6 +15,8 @@ class Settings:
     augment: bool = False  # mirror, recolour, rename, restate at random
     exchange_objects: bool = False  # with augment: key, ball and box are alike
     clutter: float = 0.0  # fill up to this share of the cells that nobody needs
+    lookalikes: bool = False  # clutter may be like the target in kind or in colour
+    false_starts: float = 0.0  # share of windows that begin with random moves (no past states)
     detours: float = 0.0  # share of windows that are to lead around things (no past states)
     channels: int = 32  # features per grid cell
     rounds: int = 2  # rounds of convolution over the grid
@@ -26,7 +28,7 @@ class Settings:
     def __post_init__(self) -> None:
         check_at_least(self, 1, "channels", "sweeps")
         check_at_least(self, 0, "rounds", "fields", "radius", "word_heads")
-        for name in ("clutter", "detours"):
+        for name in ("clutter", "false_starts", "detours"):
             if not 0 <= getattr(self, name) <= 1:  # false for NaN too
                 raise ValueError(f"{name} must be in 0 .. 1, got {getattr(self, name)}")
 
