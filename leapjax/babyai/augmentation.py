@@ -176,7 +176,7 @@ def false_start(key: jax.Array, window: Window, share: float) -> Window:
     if window.context.actions.shape[0]:
         return window
     take_key, start_key = jax.random.split(key)
-    later, possible = begin_earlier(start_key, window, FALSE_MOVES)
+    later, possible = begin_earlier(start_key, window, FALSE_MOVES, 1 / 3)
     possible &= jax.random.bernoulli(take_key, share)
     return jax.tree.map(lambda a, b: jnp.where(possible, a, b), later, window)
 
@@ -199,7 +199,7 @@ def detour(key: jax.Array, window: Window, share: float, words: GridWords) -> Wi
     if window.context.actions.shape[0]:
         return window
     take_key, start_key, share_key, where_key, kind_key = jax.random.split(key, 5)
-    longer, possible = begin_earlier(start_key, window, DETOUR_MOVES)
+    longer, possible = begin_earlier(start_key, window, DETOUR_MOVES, 2 / 3)
     possible &= ~_wasteful(longer.actions)
     observation = longer.context.observation
     grid, goal = observation.grid, observation.goal
@@ -246,7 +246,9 @@ def _wasteful(actions: jax.Array) -> jax.Array:
     return undone | (jnp.abs(turning[2:] + turning[1:-1] + turning[:-2]) == 3).any()
 
 
-def begin_earlier(key: jax.Array, window: Window, most: int) -> tuple[Window, jax.Array]:
+def begin_earlier(
+    key: jax.Array, window: Window, most: int, forward: float
+) -> tuple[Window, jax.Array]:
     """A window with random moves before its own, and whether they are possible.
 
     They are not where they lead through things, past the goal, or out of a doorway, of which the
@@ -256,12 +258,15 @@ def begin_earlier(key: jax.Array, window: Window, most: int) -> tuple[Window, ja
         key: chooses the moves.
         window: one training example, without past states.
         most: so many moves; one is left of the plan.
+        forward: how likely a move is one, and not a turn.
     """
     context, horizon = window.context, window.actions.shape[0]
-    count_key, moves_key = jax.random.split(key)
+    count_key, turn_key, forward_key = jax.random.split(key, 3)
     longest = min(most, horizon - 1)
     count = jax.random.randint(count_key, (), 0, longest + 1)
-    moves = jax.random.randint(moves_key, (max(longest, 1),), LEFT, FORWARD + 1)
+    shape = (max(longest, 1),)
+    turns = jnp.where(jax.random.bernoulli(turn_key, shape=shape), LEFT, RIGHT)
+    moves = jnp.where(jax.random.bernoulli(forward_key, forward, shape), FORWARD, turns)
     observation = context.observation
     grid, pose = jnp.asarray(observation.grid), jnp.asarray(observation.pose)
     free = passable(grid)
