@@ -22,7 +22,7 @@ from leapjax.babyai.constraints import (
     told_to_go,
     without_lava,
 )
-from leapjax.babyai.levels import Level
+from leapjax.babyai.levels import find_level
 from leapjax.babyai.symmetries import LEFT
 from leapjax.energy import compose, constrain, neutral, view
 from leapjax.environments import Transition
@@ -39,8 +39,8 @@ DETOURS = {"detours": 0.5}
 class Watched(BabyAIAdapter):
     """Counts steps onto lava."""
 
-    def __init__(self, level: Level) -> None:
-        super().__init__(level)
+    def __init__(self, level: str) -> None:
+        super().__init__(find_level(level))
         self.violations = 0
 
     def step(self, action: int) -> Transition:

@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import plots, program, results
+from experiments import ablation, properties, stochastic, suboptimal
+from experiments.common import analysis, plots, program, results
+from experiments.common.analysis import Analysis
 from experiments.common.config import configuration_hash, with_options
 from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
@@ -83,7 +85,11 @@ MINIMISED = {
     ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
 }
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
-DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md")
+DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
+ANALYSES = {
+    program.ANALYSIS.name: program.ANALYSIS
+    for program in (properties, stochastic, suboptimal, ablation)
+}
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
 SEARCHES_FIGURE = Path("docs/searches.png")
 
@@ -111,6 +117,8 @@ def rows_of(root: Path, *names: str) -> list[Row]:
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
+    for name in ANALYSES:
+        rows[name] = rows_of(root, name)
     for name in ("planning", "training", "quality"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
@@ -126,6 +134,7 @@ def documents(root: Path) -> dict[Path, str]:
         "searches": (searches, "puzzles"),
         "arms": (arms, "puzzles"),
         "quality": (quality, "quality"),
+        **{name: (functools.partial(analysed, each), name) for name, each in ANALYSES.items()},
     }
     written = {}
     for path in (root / name for name in DOCUMENTS):
@@ -187,6 +196,13 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 
 def is_used(row: Row) -> bool:
     """Whether a row is in a table; one that is in none is stale."""
+    if row["experiment"] in ANALYSES:
+        of = ANALYSES[row["experiment"]]
+        return any(
+            analysis.rows_of_way(of, [row], case, way, row["preset"])
+            for case in of.cases
+            for way in case.ways
+        )
     if row["domain"] in PUZZLES:
         searched = any(of for each in rows_by_search([row]).values() for _, _, of in each)
         return searched or any(of for _, _, of in rows_by_arms([row]))
@@ -359,6 +375,46 @@ def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
                 added.setdefault(level, {}).setdefault(name, {})[of[0]["iterations"]] = sums
     return added
+
+
+def analysed(of: Analysis, rows: Sequence[Row]) -> str:
+    """Every way to plan of every case, beside the paper's number; the best of a case in bold."""
+    watched = any(row["violations"] is not None for row in rows)
+    lines = []
+    for case in of.cases:
+        found = [
+            (way, preset, mine)
+            for way in case.ways
+            for preset in ("paper", "leapjax")
+            if (mine := analysis.rows_of_way(of, rows, case, way, preset))
+        ]
+        best = max((_mean_rate(mine) for _, _, mine in found), default=None)
+        for way, preset, mine in found:
+            rate = f"**{_rate(mine)}**" if _mean_rate(mine) == best else _rate(mine)
+            first = [row["first_pass_successes"] for row in mine]
+            episodes = sum(row["episodes"] for row in mine)
+            cells = [
+                case.name,
+                way.name if way.method in ("leap", way.name) else f"{way.method}: {way.name}",
+                f"`{preset}`",
+                "-" if way.paper is None else f"{way.paper:.1f}%",
+                "-" if None in first else f"{100 * sum(first) / episodes:.1f}%",
+                rate,
+                _mean_length(mine),
+                f"{_milliseconds(mine):.2f}",
+            ]
+            if watched:
+                counts = [row["violations"] for row in mine]
+                cells.append("-" if None in counts else f"{sum(counts) / episodes:.2f}")
+            lines.append(cells)
+    header = "case | planner | preset | paper | N = 1 | success | steps | ms per plan"
+    return _table(f"{header} | violations" if watched else header, lines)
+
+
+def _milliseconds(rows: Sequence[Row]) -> float:
+    """What a plan costs, hundreds at once."""
+    plans = sum(row["plans"] for row in rows)
+    return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
 
 
 def speed(rows: Sequence[Row]) -> str:

@@ -24,20 +24,15 @@ from experiments.common.interruption import Interruption, interruptible
 from experiments.common.results import Row
 from experiments.common.run import Run
 from leapjax import pretrained, rollouts
-from leapjax.babyai import levels
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.levels import Level
 from leapjax.batching import compile_planner
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
 from leapjax.energy import compose
+from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
 from leapjax.planners import GibbsConfig, PlannerConfig
 from leapjax.pretrained import Pretrained
 from leapjax.types import Energy
-
-DOMAIN = "babyai"
-TRAINING = Experiment(DOMAIN, DOMAIN)  # whose runs are used, or made
 
 
 class Model(NamedTuple):
@@ -68,8 +63,8 @@ class Case(NamedTuple):
     models: Sequence[Model]
     level: str
     ways: Sequence[Way]
-    adapter: Callable[[Level], BabyAIAdapter] = BabyAIAdapter
-    # one with `violations`, a number, counts them over all episodes
+    adapter: Callable[[str], Adapter] | None = None
+    # makes one of a level; its `violations`, a number, are counted over all episodes
 
 
 class Analysis(NamedTuple):
@@ -77,6 +72,7 @@ class Analysis(NamedTuple):
 
     name: str  # of its module, and of its file of rows
     cases: Sequence[Case]
+    domain: str = "babyai"
     changes: Mapping[str, Any] = {}  # of every model's options, for tests
 
 
@@ -196,12 +192,12 @@ def training_config(
     analysis: Analysis, model: Model, method: str, seed: int, options: Options
 ) -> AnyConfig:
     """The configuration of a run of `experiments.babyai` that trains a model."""
-    default = configs.preset(DOMAIN, model.level, method, options.preset)
-    options_of = dict(analysis.changes)
+    default = configs.preset(analysis.domain, model.level, method, options.preset)
+    ours: dict[str, Any] = {}
     if options.preset == "leapjax":
-        options_of |= model.options
-        options_of |= model.planning if default.planner.horizon > 1 else {}
-    changed = with_options(default, options_of)
+        several = default.planner.horizon > 1
+        ours = {**model.options, **(model.planning if several else {})}
+    changed = with_options(default, {**ours, **analysis.changes})
     return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
 
 
@@ -257,7 +253,8 @@ def row_name(
 
 def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
-    folder = experiment.run_folder(TRAINING, config, seed)
+    training = Experiment(config.domain, config.domain)  # whose runs are used, or made
+    folder = experiment.run_folder(training, config, seed)
     steps = [entry["step"] for entry in run.read_metrics(folder)]
     if steps and steps[-1] >= config.training.steps:
         return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
@@ -278,16 +275,16 @@ def play(
     interruption: Interruption,
 ) -> Row:
     """What one way of asking gives."""
-    level = levels.find_level(case.level)
     energy = way.minimise([model.energy for model in models])
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     specification = models[0].specification
     search = way.search(specification.planner)
-    domain = configs.find_domain(DOMAIN).make(case.level, specification.domain_settings)
-    adapters: list[BabyAIAdapter] = []
+    kind = configs.find_domain(specification.domain)
+    domain = kind.make(case.level, specification.domain_settings)
+    adapters: list[Adapter] = []
 
-    def make_adapter() -> BabyAIAdapter:
-        adapters.append(case.adapter(level))
+    def make_adapter() -> Adapter:
+        adapters.append(case.adapter(case.level) if case.adapter else domain.make_adapter())
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> rollouts.Episodes:
@@ -307,7 +304,7 @@ def play(
     violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
     good = found.lengths[found.successes]
     return {
-        "domain": DOMAIN,
+        "domain": specification.domain,
         "level": case.level,
         "case": case.name,
         "way": way.name,
@@ -333,6 +330,24 @@ def play(
         "paper_success": way.paper,
         "date": results.today(),
     }
+
+
+def rows_of_way(
+    analysis: Analysis, rows: Sequence[Row], case: Case, way: Way, preset: str
+) -> list[Row]:
+    """The rows of a way to plan as it is today, one for each training seed."""
+    found = []
+    for row in rows:
+        if (row["case"], row["way"], row["preset"]) != (case.name, way.name, preset):
+            continue
+        options = Options(preset=preset)
+        settings = [
+            training_config(analysis, model, way.method, row["seed"], options)
+            for model in case.models
+        ]
+        if row["hash"] == row_name(analysis, case, way, settings, row["seed"], options):
+            found.append(row)
+    return found
 
 
 def table(rows: Sequence[Row]) -> Table:

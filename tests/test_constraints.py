@@ -1,0 +1,95 @@
+"""Plans rolled through a grid world, and penalties on them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
+from leapjax.babyai.constraints import immediate_lava, lava, left_turns, told_to_go
+from leapjax.babyai.dynamics import FORWARD, roll
+from leapjax.babyai.levels import find_level
+from leapjax.babyai.vocabulary import decode
+from leapjax.rollouts import History
+from leapjax.types import mask_token
+
+LEFT, RIGHT, MASK = 0, 1, mask_token(NUM_ACTIONS)
+rolled = jax.jit(roll)
+steps_onto_lava = jax.jit(lava)
+
+
+def context_of(adapter, observation):
+    return History(observation, 0, adapter.num_actions).context()
+
+
+@pytest.mark.parametrize(
+    "name", ["GoToLocalS8N7", "GoToObjMazeS4", "GoToObjMazeS4R2Close", "GoToLavaHard", "PickUpLoc"]
+)
+def test_a_plan_of_turns_and_moves_is_rolled_as_minigrid_does(name):
+    """Step by step, until the episode ends; and lava ends it where the penalty says so."""
+    adapter, rng = BabyAIAdapter(find_level(name)), np.random.default_rng(0)
+    entered = 0
+    for seed in range(12):
+        observation = adapter.reset(seed)
+        actions = rng.choice([LEFT, RIGHT, FORWARD, FORWARD, FORWARD, FORWARD], 40)
+        poses = np.asarray(rolled(observation, actions))
+        np.testing.assert_array_equal(poses[0], observation.pose)
+        for step, action in enumerate(actions.tolist(), start=1):
+            transition = adapter.step(action)
+            np.testing.assert_array_equal(transition.observation.pose, poses[step])
+            if transition.terminated or transition.truncated:
+                break
+        died = transition.terminated and not transition.success
+        entered += died
+        tried = np.where(np.arange(40) < step, actions, END)
+        found = float(steps_onto_lava(context_of(adapter, observation), tried))
+        assert found == died
+    assert (entered > 0) == (name == "GoToLavaHard")
+
+
+def test_nothing_moves_after_the_end_nor_after_what_is_not_chosen_yet():
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    observation = adapter.reset(0)
+    for stop in (END, MASK):
+        poses = np.asarray(rolled(observation, jnp.array([LEFT, stop, LEFT, RIGHT, RIGHT])))
+        assert poses[1, 2] == (observation.pose[2] - 1) % 4
+        assert (poses[1:] == poses[1]).all()
+
+
+def beside_lava(seed=0):
+    """A context whose agent faces lava."""
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    observation = adapter.reset(seed)
+    ahead = (observation.pose[:2] + np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]))[
+        observation.pose[2]
+    ]
+    grid = observation.grid.copy()
+    grid[1:-1, 1:-1][grid[1:-1, 1:-1, 0] == 1] = [9, 0, 0]
+    assert tuple(grid[tuple(ahead)]) != (1, 0, 0)
+    return context_of(adapter, observation._replace(grid=grid))
+
+
+def test_the_immediate_penalty_sees_one_step_and_the_other_all():
+    context = beside_lava(seed=1)
+    walk = jnp.array([FORWARD, FORWARD, FORWARD])
+    later = jnp.array([LEFT, RIGHT, FORWARD])
+    assert float(immediate_lava(context, walk)) == 1 and float(lava(context, walk)) >= 1
+    assert float(immediate_lava(context, later)) == 0 and float(lava(context, later)) == 1
+    assert float(lava(context, jnp.array([MASK, FORWARD, FORWARD]))) == 0
+    turned = jnp.array([LEFT, RIGHT, RIGHT])  # stays in its cell
+    assert float(lava(context, turned)) == 0
+
+
+def test_left_turns_count_until_the_plan_ends():
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    context = context_of(adapter, adapter.reset(0))
+    assert float(left_turns(context, jnp.array([LEFT, RIGHT, LEFT, END, LEFT]))) == 2
+    assert float(left_turns(context, jnp.array([MASK, LEFT, LEFT]))) == 0
+
+
+def test_who_should_pick_something_up_is_told_to_go_to_it():
+    adapter = BabyAIAdapter(find_level("PickUpObjMazeS4"))
+    context = context_of(adapter, adapter.reset(0))
+    said = decode(context.observation.instruction)
+    told = decode(np.asarray(told_to_go(context).observation.instruction))
+    assert said.startswith("pick up the ") and told == said.replace("pick up", "go to")

@@ -1,0 +1,167 @@
+"""Levels of the paper's analyses are what they are said to be."""
+
+from collections import Counter
+
+import jax
+import numpy as np
+import pytest
+
+from leapjax.babyai import demonstrations, observations
+from leapjax.babyai.adapter import END, TURNS, BabyAIAdapter
+from leapjax.babyai.constraints import half_of_obstacles, without_lava
+from leapjax.babyai.dynamics import LAVA
+from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
+from leapjax.rollouts import History
+
+LAVA_LEVELS = {"GoToLavaEasy": (0, 2), "GoToLavaMedium": (0, 5), "GoToLavaHard": (4, 4)}
+EPISODES = range(60)
+
+
+def first(name, seed, past=0):
+    """An adapter after reset, and the context that its episode begins with."""
+    adapter = BabyAIAdapter(find_level(name))
+    return adapter, History(adapter.reset(seed), past, adapter.num_actions).context()
+
+
+def cells_of(observation, kind):
+    return {tuple(map(int, cell)) for cell in np.argwhere(observation.grid[..., 0] == kind)}
+
+
+@pytest.mark.parametrize("name", LAVA_LEVELS)
+def test_there_is_as_much_lava_as_said_and_a_way_around_it(name):
+    counts = Counter()
+    for seed in EPISODES:
+        adapter, context = first(name, seed)
+        lava = cells_of(context.observation, LAVA)
+        counts[len(lava)] += 1
+        ways = observations.path_lengths(
+            adapter.env.grid, observations.agent_cell(adapter.env), through_objects=False
+        )
+        assert adapter.goal in ways
+        if name != "GoToLavaHard":
+            straight(context.observation, adapter.goal, lava, wide=name == "GoToLavaMedium")
+    low, high = LAVA_LEVELS[name]
+    assert low <= min(counts) and max(counts) == high
+
+
+def straight(observation, goal, lava, wide):
+    """Lava is on the straight ways of agent and object, or beside them where it is wide."""
+    x, y = map(int, observation.pose[:2])
+    columns = range(min(x, goal[0]) + 1, max(x, goal[0]))
+    rows = range(min(y, goal[1]) + 1, max(y, goal[1]))
+    on_row = {(a, b) for a, b in lava if a in columns and abs(b - y) <= wide}
+    on_column = {(a, b) for a, b in lava if b in rows and abs(a - x) <= wide}
+    assert lava == on_row | on_column
+    if not wide:
+        assert len(on_row) <= 1 and len(on_column) <= 1
+        assert len(columns) == 0 or on_row or (goal in [(a, y) for a in columns])
+
+
+def test_the_planner_sees_no_lava_and_everything_else():
+    _, context = first("GoToLavaHard", 3, past=2)
+    lava = cells_of(context.observation, LAVA)
+    seen = without_lava(context).observation
+    assert lava and not cells_of(jax.device_get(seen), LAVA)
+    other = np.asarray(context.observation.grid[..., 0] != LAVA)
+    np.testing.assert_array_equal(np.asarray(seen.grid)[other], context.observation.grid[other])
+    assert (np.asarray(seen.grid)[~other] == [1, 0, 0]).all()
+
+
+def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():
+    for seed in EPISODES:
+        adapter, context = first("GoToBehindObstacles", seed)
+        pose, goal = context.observation.pose, np.array(adapter.goal)
+        assert (abs(goal - pose[:2]) == 3).all()
+        objects = {c for kind in (5, 6, 7) for c in cells_of(context.observation, kind)}
+        obstacles = objects - {adapter.goal}
+        assert len(obstacles) == 6
+        low, high = np.minimum(goal, pose[:2]), np.maximum(goal, pose[:2])
+        assert all(
+            (low <= cell).all() and (cell <= high).all() for cell in map(np.array, obstacles)
+        )
+        halves = []
+        for part in (0, 1):
+            seen = jax.device_get(half_of_obstacles(context, part).observation)
+            halves.append({c for kind in (5, 6, 7) for c in cells_of(seen, kind)})
+            assert adapter.goal in halves[-1] and len(halves[-1]) == 4
+        assert halves[0] | halves[1] == objects and halves[0] & halves[1] == {adapter.goal}
+
+
+def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
+    adapter = BabyAIAdapter(find_level("GoToObjMazeS4Slip"))
+    asked, slipped = Counter(), Counter()
+    rng = np.random.default_rng(0)
+    for seed in range(40):
+        adapter.reset(seed)
+        for action in rng.integers(0, END, 100).tolist():
+            transition = adapter.step(action)
+            asked[action] += 1
+            slipped[action, adapter.taken] += 1
+            if transition.terminated or transition.truncated:
+                break
+    for action in range(END):
+        others = [slipped[action, taken] for taken in range(END) if taken != action]
+        share = sum(others) / asked[action]
+        assert (0.15 < share < 0.25) if action in TURNS else share == 0
+        if action in TURNS:
+            assert min(others) > 0.1 * sum(others)  # each is a fifth of them
+
+
+def test_an_episode_slips_the_same_way_each_time():
+    def played():
+        adapter = BabyAIAdapter(find_level("GoToObjMazeS4Slip"))
+        adapter.reset(7)
+        return [(adapter.step(0).truncated, adapter.taken)[1] for _ in range(30)]
+
+    assert played() == played()
+    assert len(set(played())) > 1
+
+
+@pytest.mark.parametrize("name", ["GoToObjMazeS4Slip", "GoToObjMazeS4Mistakes"])
+def test_what_is_recorded_is_what_was_done(name):
+    """The actions of a demonstration lead, on the plain level, through its states."""
+    plain = BabyAIAdapter(LEVELS["GoToObjMazeS4"])
+    for demonstration in demonstrations.collect(find_level(name), 5, 0).demonstrations:
+        plain.reset(demonstration.seed)
+        for step, action in enumerate(demonstration.actions.tolist(), start=1):
+            transition = plain.step(action)
+            wanted = demonstration.observations.grid[step]
+            np.testing.assert_array_equal(transition.observation.grid, wanted)
+        assert transition.success
+
+
+def test_a_quarter_of_the_actions_are_mistakes():
+    """Half of them pick up, drop or toggle, which a demonstrator without mistakes never does."""
+    good = demonstrations.collect(LEVELS["GoToObjMazeS4"], 20, 0).demonstrations
+    bad = demonstrations.collect(find_level("GoToObjMazeS4Mistakes"), 60, 0).demonstrations
+    odd = [np.isin(np.concatenate([d.actions for d in data]), (3, 4, 5)) for data in (good, bad)]
+    assert not odd[0].any()
+    assert 0.09 < odd[1].mean() < 0.18  # an eighth, and what puts them right
+
+
+def test_mislabelled_demonstrations_are_the_same_but_for_labels():
+    good = demonstrations.collect(LEVELS["GoToObjMazeS4"], 60, 0).demonstrations
+    bad = demonstrations.collect(find_level("GoToObjMazeS4Mislabelled"), 60, 0).demonstrations
+    for a, b in zip(good, bad, strict=True):
+        np.testing.assert_array_equal(a.observations.grid, b.observations.grid)
+    wrong = np.concatenate([a.actions != b.actions for a, b in zip(good, bad, strict=True)])
+    assert abs(wrong.mean() - 0.25 * 5 / 6) < 0.05
+
+
+def test_something_is_picked_up_in_a_room_and_in_a_maze():
+    for name in ("PickUpLocalS10N1", "PickUpObjMazeS4"):
+        (demonstration,) = demonstrations.collect(find_level(name), 1, 0).demonstrations
+        assert demonstration.actions[-1] == 3
+        assert not (demonstration.actions[:-1] == 3).any()
+
+
+def test_levels_that_models_share_have_the_same_side_and_plans():
+    for together in (
+        ("GoToLocalS8N1", "GoToLavaEasy", "GoToLavaMedium", "GoToLocalS8N15"),
+        ("GoToObjMazeS4", "GoToLavaHard", "GoToLocalS10N1", "PickUpLocalS10N1", "PickUpObjMazeS4"),
+        ("GoToLocalS7N1", "GoToObjMazeS4R2"),
+    ):
+        shapes = {first(name, 0)[1].observation.grid.shape for name in together}
+        words = {find_level(name).words for name in together}
+        assert len(shapes) == len(words) == 1
+    assert not set(MODIFIED) & set(LEVELS)
