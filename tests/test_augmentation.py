@@ -265,3 +265,87 @@ def test_settings_choose_augmentations_and_clutter_comes_first():
     assert objects(augmented) == [count] * 8  # the same things, elsewhere
     assert max(objects(cluttered)) > count
     assert all((w.actions == window.actions).all() for w in cluttered)
+
+
+def plain_windows(horizon=10):
+    """Windows of an empty room, from every step."""
+    level = levels.find_level("GoToLocalS8N1")
+    data = demonstrations.collect(level, 6, seed=1).demonstrations
+    steps = jax.tree.map(jnp.asarray, lay_out(data))
+    return [window_at(steps, i, 0, horizon, END) for i in range(steps.actions.shape[0])]
+
+
+def changed_by(augmentation_of, windows_of, keys=12):
+    """Pairs of windows that an augmentation changed: before and after."""
+    for number, window in enumerate(windows_of):
+        for key in range(keys):
+            after = jax.device_get(augmentation_of(jax.random.key(100 * number + key), window))
+            if not np.array_equal(after.context.observation.grid, window.context.observation.grid):
+                yield jax.device_get(window), after
+
+
+def test_a_false_start_leads_to_where_the_window_began():
+    change = jax.jit(lambda key, window: augmentation.false_start(key, window, 1.0))
+    lengths = Counter()
+    for before, after in changed_by(change, plain_windows()):
+        state = after.context.observation
+        began = before.context.observation.grid
+        moves = next(
+            n for n in range(4) if np.array_equal(after.actions[n:], before.actions[: 10 - n])
+            and np.array_equal(walked(state, after.actions[:n]).grid, began)
+        )  # fmt: skip
+        lengths[moves] += 1
+        assert after.extras[tuple(state.pose[:2])]
+    assert set(lengths) == {1, 2, 3}
+
+
+def walked(state, actions):
+    for action in actions:
+        state = stepped(state, int(action))
+    return state
+
+
+def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
+    change = jax.jit(lambda key, window: augmentation.detour(key, window, 1.0, GRID_WORDS))
+    longer = things = 0
+    for before, after in changed_by(change, plain_windows(horizon=24)):
+        state = after.context.observation
+        goal = tuple(map(int, state.goal))
+        end = walked(state, after.actions[after.actions != END])
+        x, y, direction = map(int, end.pose)
+        assert (x + FRONT[direction][0], y + FRONT[direction][1]) == goal
+        grid, _ = Grid.decode(np.asarray(state.grid))
+        start = tuple(map(int, state.pose[:2]))
+        moves = int((after.actions == 2).sum())
+        assert slow_path_lengths(grid, start, through_objects=False)[goal] == moves + 1
+        straight = abs(start[0] - goal[0]) + abs(start[1] - goal[1])
+        longer += moves + 1 > straight
+        things += int((state.grid[..., 0] != before.context.observation.grid[..., 0]).sum() > 4)
+    assert longer > 10 and things > 10
+
+
+def test_lookalikes_share_kind_or_colour_with_the_target_but_never_both():
+    fill = jax.jit(lambda key, window: augmentation.clutter(key, window, 1.0, GRID_WORDS))
+    kinds = colours = 0
+    for before, after in changed_by(fill, plain_windows()[:4]):
+        grid, goal = after.context.observation.grid, tuple(before.context.observation.goal)
+        target = grid[goal][:2]
+        new = (grid != before.context.observation.grid).any(axis=-1)
+        same = grid[new][:, :2] == target
+        assert not same.all(axis=1).any()
+        kinds, colours = kinds + same[:, 0].sum(), colours + same[:, 1].sum()
+    assert kinds > 0 and colours > 0
+
+
+def test_without_its_name_in_full_nothing_looks_like_the_target():
+    fill = jax.jit(lambda key, window: augmentation.clutter(key, window, 1.0, GRID_WORDS))
+
+    def unnamed(window):  # "go to the box"
+        said = jnp.asarray(vocabulary.encode("go to the box", 5))
+        seen = window.context.observation._replace(instruction=said)
+        return window._replace(context=window.context._replace(observation=seen))
+
+    for before, after in changed_by(fill, map(unnamed, plain_windows()[:3])):
+        grid, goal = after.context.observation.grid, tuple(before.context.observation.goal)
+        new = (grid != before.context.observation.grid).any(axis=-1)
+        assert not (grid[new][:, :2] == grid[goal][:2]).any()

@@ -10,11 +10,12 @@ from leapjax.energy import (
     compose,
     constrain,
     from_total,
+    neutral,
     pseudo_likelihood,
     single_action,
     view,
 )
-from leapjax.planners import GibbsConfig, bind
+from leapjax.planners import GibbsConfig, bind, gibbs
 from leapjax.types import Energy, mask_token, pad_token
 from tests.enumerable import (
     all_plans,
@@ -419,6 +420,52 @@ def test_constraint_waits_for_a_complete_plan():
     np.testing.assert_array_equal(constrained[1, :2], free[1, :2])
     assert np.isposinf(constrained[1, 2, 1])
     np.testing.assert_array_equal(constrained[1, 2, [0, 2]], free[1, 2, [0, 2]])
+
+
+def test_a_partial_penalty_judges_what_is_certain_already():
+    """Filled from left to right, no plan begins as it may not, though the likeliest would."""
+
+    def starts_with_zero(context, actions):  # known once the first action is
+        return jnp.where(actions[0] == 0, 50.0, 0.0)
+
+    tilted = NO_TILT.copy()
+    tilted[0, 0] = 9.0  # it is by far the best first action
+    waits = constrain(ENUMERABLE, starts_with_zero)
+    judges = constrain(ENUMERABLE, starts_with_zero, partial=True)
+    blank = np.full((1, HORIZON), MASK, np.int32)
+    free = conditionals(ENUMERABLE, TABLE, tilted, blank)
+    np.testing.assert_array_equal(conditionals(waits, TABLE, tilted, blank), free)
+    np.testing.assert_allclose(
+        conditionals(judges, TABLE, tilted, blank)[0, 0] - free[0, 0], [50.0, 0.0, 0.0], rtol=1e-4
+    )
+    np.testing.assert_array_equal(
+        conditionals(judges, TABLE, tilted), conditionals(waits, TABLE, tilted)
+    )
+    config = GibbsConfig(HORIZON, HORIZON, fill="sequential")
+    first = [gibbs(e, TABLE, jax.random.key(0), tilted, config).actions[0] for e in (waits, judges)]
+    assert first[0] == 0 and first[1] != 0
+
+
+def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_rest():
+    energy = neutral(ENUMERABLE, [2])
+    for plan in PLANS:
+        seen = np.where(plan == 2, MASK, plan)[None]
+        expected = conditionals(ENUMERABLE, TABLE, NO_TILT, seen.astype(np.int32))[0].copy()
+        expected[:, 2] = expected[:, :2].min(axis=1)
+        found = conditionals(energy, TABLE, NO_TILT, plan[None])[0]
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+        total = totals(energy, TABLE, NO_TILT, plan[None])[0]
+        np.testing.assert_allclose(total, expected[np.arange(HORIZON), plan].sum(), rtol=1e-5)
+
+
+def test_neutral_refuses_what_it_cannot_do():
+    with pytest.raises(ValueError, match="accepts MASK"):
+        neutral(from_total(lambda params, context: context, lambda p, m, a: 0.0, 3), [0])
+    for actions in ([], [0, 1, 2]):
+        with pytest.raises(ValueError, match="expected some of 3 actions"):
+            neutral(ENUMERABLE, actions)
+    with pytest.raises(ValueError, match="not all in 0 .. 2"):
+        neutral(ENUMERABLE, [3])
 
 
 def test_nothing_is_nan_where_everything_is_forbidden():

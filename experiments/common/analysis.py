@@ -40,7 +40,7 @@ class Model(NamedTuple):
 
     level: str
     options: Mapping[str, Any] = {}
-    planning: Mapping[str, Any] = {}  # more of them, for methods that plan several actions
+    more: Mapping[str, Mapping[str, Any]] = {}  # of them, by method
 
 
 class Way(NamedTuple):
@@ -195,8 +195,7 @@ def training_config(
     default = configs.preset(analysis.domain, model.level, method, options.preset)
     ours: dict[str, Any] = {}
     if options.preset == "leapjax":
-        several = default.planner.horizon > 1
-        ours = {**model.options, **(model.planning if several else {})}
+        ours = {**model.options, **model.more.get(method, {})}
     changed = with_options(default, {**ours, **analysis.changes})
     return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
 

@@ -20,6 +20,7 @@ from leapjax.domain import Augmentation
 from leapjax.types import Array, Demonstration, Window
 
 FALSE_MOVES, DETOUR_MOVES = 3, 8  # at most, at the beginning of a window
+TRIES = 8  # to find a detour
 WALL, GREY = 2, 5  # MiniGrid's indices
 
 
@@ -176,7 +177,8 @@ def false_start(key: jax.Array, window: Window, share: float) -> Window:
     if window.context.actions.shape[0]:
         return window
     take_key, start_key = jax.random.split(key)
-    later, possible = begin_earlier(start_key, window, FALSE_MOVES, 1 / 3)
+    most = min(FALSE_MOVES, window.actions.shape[0] - 1)
+    later, _, possible = begin_earlier(start_key, window, most, 1 / 3)
     possible &= jax.random.bernoulli(take_key, share)
     return jax.tree.map(lambda a, b: jnp.where(possible, a, b), later, window)
 
@@ -186,7 +188,8 @@ def detour(key: jax.Array, window: Window, share: float, words: GridWords) -> Wi
 
     It begins with up to eight random moves, as `false_start` has them; objects and walls are put
     beside the way, many or few; and it is taken where no shorter way is left. So it shows that
-    ways lead around things, even where demonstrations are of empty rooms.
+    ways lead around things, even where demonstrations are of empty rooms. Of some tries the one
+    is taken whose way is longer than it would be without the things, if there is one.
 
     Windows stay as they are where that does not work out, and where there are past states.
 
@@ -198,31 +201,44 @@ def detour(key: jax.Array, window: Window, share: float, words: GridWords) -> Wi
     """
     if window.context.actions.shape[0]:
         return window
-    take_key, start_key, share_key, where_key, kind_key = jax.random.split(key, 5)
-    longer, possible = begin_earlier(start_key, window, DETOUR_MOVES, 2 / 3)
-    possible &= ~_wasteful(longer.actions)
-    observation = longer.context.observation
+    take_key, tries_key = jax.random.split(key)
+    keys = jax.random.split(tries_key, TRIES)
+    found, possible, longer = jax.vmap(lambda k: _try_detour(k, window, words))(keys)
+    best = jnp.argmax(possible * (1 + longer))
+    taken = possible[best] & jax.random.bernoulli(take_key, share)
+    return jax.tree.map(lambda a, b: jnp.where(taken, a[best], b), found, window)
+
+
+def _try_detour(
+    key: jax.Array, window: Window, words: GridWords
+) -> tuple[Window, jax.Array, jax.Array]:
+    """A window on a way, whether it is the shortest, and whether things make it longer."""
+    start_key, share_key, where_key, kind_key, colour_key, wall_key = jax.random.split(key, 6)
+    earlier, whole, possible = begin_earlier(start_key, window, DETOUR_MOVES, 2 / 3)
+    observation, way = earlier.context.observation, earlier.extras
     grid, goal = observation.grid, observation.goal
     cells = grid.shape[:2]
-    probability = jax.random.uniform(share_key)
-    filled = (grid[..., 0] == EMPTY) & ~longer.extras
+    probability = jax.random.uniform(share_key) ** 0.5  # rather many than few
+    filled = (grid[..., 0] == EMPTY) & ~way
     filled &= jax.random.uniform(where_key, cells) < probability
     # Grey walls, and objects that are not meant.
     target = grid[goal[0], goal[1]].astype(jnp.int32)
-    kind_key, colour_key, wall_key = jax.random.split(kind_key, 3)
     in_full = _in_full(observation.instruction, target, words)
     kinds, colours = _other(kind_key, colour_key, target, cells, in_full)
     walls = jax.random.bernoulli(wall_key, shape=cells)
     kinds, colours = jnp.where(walls, WALL, kinds), jnp.where(walls, GREY, colours)
     things = jnp.stack([kinds, colours, jnp.zeros_like(kinds)], axis=-1).astype(grid.dtype)
-    grid = jnp.where(filled[..., None], things, grid)
-    free = passable(grid).at[goal[0], goal[1]].set(True)
+    filled_grid = jnp.where(filled[..., None], things, grid)
+
+    def moves(grid: jax.Array) -> jax.Array:
+        free = passable(grid).at[goal[0], goal[1]].set(True)
+        return distance(free, observation.pose[:2], goal)
+
     # A way without a cell twice has as many cells, but for the goal, as moves lead to the goal.
-    shortest = distance(free, observation.pose[:2], goal) == longer.extras.sum()
-    possible &= shortest & (goal[0] >= 0) & jax.random.bernoulli(take_key, share)
-    context = longer.context._replace(observation=observation._replace(grid=grid))
-    changed = longer._replace(context=context)
-    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), changed, window)
+    length = way.sum()
+    possible &= (moves(filled_grid) == length) & (goal[0] >= 0) & ~_wasteful(whole)
+    context = earlier.context._replace(observation=observation._replace(grid=filled_grid))
+    return earlier._replace(context=context), possible, moves(grid) < length
 
 
 def distance(free: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
@@ -248,8 +264,8 @@ def _wasteful(actions: jax.Array) -> jax.Array:
 
 def begin_earlier(
     key: jax.Array, window: Window, most: int, forward: float
-) -> tuple[Window, jax.Array]:
-    """A window with random moves before its own, and whether they are possible.
+) -> tuple[Window, jax.Array, jax.Array]:
+    """A window with random moves before its own, all of its moves, and whether they are possible.
 
     They are not where they lead through things, past the goal, or out of a doorway, of which the
     agent's mark hides the door.
@@ -257,14 +273,13 @@ def begin_earlier(
     Args:
         key: chooses the moves.
         window: one training example, without past states.
-        most: so many moves; one is left of the plan.
+        most: so many moves.
         forward: how likely a move is one, and not a turn.
     """
     context, horizon = window.context, window.actions.shape[0]
     count_key, turn_key, forward_key = jax.random.split(key, 3)
-    longest = min(most, horizon - 1)
-    count = jax.random.randint(count_key, (), 0, longest + 1)
-    shape = (max(longest, 1),)
+    count = jax.random.randint(count_key, (), 0, most + 1)
+    shape = (max(most, 1),)
     turns = jnp.where(jax.random.bernoulli(turn_key, shape=shape), LEFT, RIGHT)
     moves = jnp.where(jax.random.bernoulli(forward_key, forward, shape), FORWARD, turns)
     observation = context.observation
@@ -289,21 +304,21 @@ def begin_earlier(
     around = jnp.pad(~free, 1, constant_values=True)
     x, y = pose[0] + 1, pose[1] + 1
     doorway = (around[x - 1, y] & around[x + 1, y]) | (around[x, y - 1] & around[x, y + 1])
-    places = jnp.arange(longest)[::-1]
+    places = jnp.arange(most)[::-1]
     (start, possible), visited = jax.lax.scan(undo, (pose, ~doorway | (count == 0)), places)
     # The agent's mark, whose state is its direction, moves to where it begins.
     empty = jnp.array([EMPTY, 0, 0], grid.dtype)
     mark = grid[pose[0], pose[1]].at[2].set(start[2].astype(grid.dtype))
     moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
-    place = jnp.arange(horizon)
-    later = window.actions[jnp.maximum(place - count, 0)]
-    actions = jnp.where(place < count, moves[jnp.minimum(place, len(moves) - 1)], later)
+    place = jnp.arange(most + horizon)
+    after = window.actions[jnp.clip(place - count, 0, horizon - 1)]
+    whole = jnp.where(place < count, moves[jnp.minimum(place, len(moves) - 1)], after)
     way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
     began = observation._replace(grid=moved, pose=start)
     longer = window._replace(
-        context=context._replace(observation=began), actions=actions, extras=way
+        context=context._replace(observation=began), actions=whole[:horizon], extras=way
     )
-    return longer, possible
+    return longer, whole, possible
 
 
 def augment(key: jax.Array, window: Window, words: GridWords, exchange_objects: bool) -> Window:
