@@ -19,7 +19,11 @@ PAPER = {
 
 
 def _case(level: str, suffix: str, leap: float, dt: float) -> Case:
-    ways = [Way("leap", paper=leap), Way("dt", "dt", paper=dt)]
+    ways = [
+        Way("whole plans", paper=leap),
+        Way("three actions of each plan", executed=3, paper=leap),
+        Way("dt", "dt", paper=dt),
+    ]
     return Case(f"{level}{suffix}", [Model(f"{level}{suffix}")], level, ways)
 
 
