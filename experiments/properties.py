@@ -21,6 +21,7 @@ from leapjax.babyai.constraints import (
     left_turns,
     told_to_go,
     without_lava,
+    without_open_doors,
 )
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.symmetries import LEFT
@@ -136,6 +137,20 @@ def _plain(paper: tuple[float, float, float]) -> list[Way]:
     return [Way("leap", paper=leap), Way("dt", "dt", paper=dt), Way("iql", "iql", paper=iql)]
 
 
+def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
+    """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
+
+    def told(energies: Sequence[Energy]) -> Energy:
+        return view(energies[0], without_open_doors)
+
+    plain = _plain(paper)
+    views = [
+        Way(f"{way.name}, open doors seen as empty", way.method, told, paper=way.paper)
+        for way in plain
+    ]
+    return [*plain, *views]
+
+
 def _composed(
     minimise: Callable[[Sequence[Energy]], Energy], paper: tuple[float, float, float]
 ) -> list[Way]:
@@ -160,11 +175,11 @@ CASES = (
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
         "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28}, DETOURS)],
-        "GoToObjMazeS4R2", _plain((64.0, 37.5, 57.5)),
+        "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
     ),
     Case(
         "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40}, DETOURS)], MAZE,
-        _plain((61.0, 24.5, 65.5)),
+        _without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
         "composition-easy", [Model(OBSTACLES, more={"leap": DETOURS["leap"]})] * 2, OBSTACLES,

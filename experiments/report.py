@@ -395,7 +395,7 @@ def analysed(of: Analysis, rows: Sequence[Row]) -> str:
             episodes = sum(row["episodes"] for row in mine)
             cells = [
                 case.name,
-                way.name if way.method in ("leap", way.name) else f"{way.method}: {way.name}",
+                way.name if way.name.startswith(way.method) else f"{way.method}: {way.name}",
                 f"`{preset}`",
                 "-" if way.paper is None else f"{way.paper:.1f}%",
                 "-" if None in first else f"{100 * sum(first) / episodes:.1f}%",

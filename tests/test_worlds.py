@@ -8,7 +8,7 @@ import pytest
 
 from leapjax.babyai import demonstrations, observations
 from leapjax.babyai.adapter import END, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import half_of_obstacles, without_lava
+from leapjax.babyai.constraints import half_of_obstacles, without_lava, without_open_doors
 from leapjax.babyai.dynamics import LAVA
 from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
 from leapjax.rollouts import History
@@ -65,6 +65,15 @@ def test_the_planner_sees_no_lava_and_everything_else():
     other = np.asarray(context.observation.grid[..., 0] != LAVA)
     np.testing.assert_array_equal(np.asarray(seen.grid)[other], context.observation.grid[other])
     assert (np.asarray(seen.grid)[~other] == [1, 0, 0]).all()
+
+
+def test_open_doors_look_empty_and_closed_ones_do_not():
+    _, context = first("GoToObjMazeS4", 0)
+    doors = cells_of(context.observation, 4)
+    assert doors and not cells_of(jax.device_get(without_open_doors(context).observation), 4)
+    _, closed = first("GoToObjMazeS4R2Close", 0)
+    seen = jax.device_get(without_open_doors(closed).observation)
+    assert cells_of(seen, 4) == cells_of(closed.observation, 4) != set()
 
 
 def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
 from leapjax.babyai.adapter import END
-from leapjax.babyai.dynamics import LAVA, roll
+from leapjax.babyai.dynamics import DOOR, LAVA, OPEN, roll
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
@@ -45,6 +45,11 @@ def left_turns(context: Context, actions: jax.Array) -> jax.Array:
 def without_lava(context: Context) -> Context:
     """A context in which lava cells look empty."""
     return _hiding(context, lambda grid, goal: grid[..., 0] == LAVA)
+
+
+def without_open_doors(context: Context) -> Context:
+    """A context in which open doors look empty, for models that never saw a door."""
+    return _hiding(context, lambda grid, goal: (grid[..., 0] == DOOR) & (grid[..., 2] == OPEN))
 
 
 def half_of_obstacles(context: Context, part: int) -> Context:
