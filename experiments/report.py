@@ -203,6 +203,8 @@ def is_used(row: Row) -> bool:
             for case in of.cases
             for way in case.ways
         )
+    if row["domain"] not in PUZZLES and row["level"] not in LEVELS:
+        return False
     if row["domain"] in PUZZLES:
         searched = any(of for each in rows_by_search([row]).values() for _, _, of in each)
         return searched or any(of for _, _, of in rows_by_arms([row]))

@@ -1,0 +1,167 @@
+"""The programs of the paper's analyses, end to end at toy size, and what they refuse."""
+
+import json
+
+import pytest
+
+from experiments import ablation, landscape, properties, report, stochastic, suboptimal
+from experiments.common import analysis, results
+from experiments.common.analysis import Analysis, Options, Way
+from leapjax.babyai.levels import find_level
+from leapjax.planners import GibbsConfig
+
+TOY = {
+    "demos": 6, "steps": 2, "batch": 4, "width": 16, "heads": 2, "layers": 1, "channels": 4,
+    "rounds": 1, "fields": 2, "sweeps": 2, "horizon": 3, "iterations": 2,
+}  # fmt: skip
+ALL = (properties, stochastic, suboptimal, ablation)
+SHORT = ["--episodes", "2"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder to run in, with its own data sets."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def rows(place, name, folder="runs"):
+    return results.read(place / folder / f"{name}.jsonl")
+
+
+def small(case, *ways):
+    """An analysis of one case, at toy size, with some of its ways."""
+    kept = [way for way in case.ways if way.name in ways]
+    assert len(kept) == len(ways)
+    return Analysis("properties", [case._replace(ways=kept)], changes=TOY)
+
+
+def case_of(name):
+    return next(case for case in properties.CASES if case.name == name)
+
+
+def test_a_constraint_is_asked_for_and_counted(place, capsys):
+    of = small(case_of("adaptation-medium"), "whole plan")
+    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    (row,) = rows(place, "properties", "results")
+    assert (row["case"], row["way"], row["method"]) == ("adaptation-medium", "whole plan", "leap")
+    assert row["violations"] == 0  # an untrained model, and no step onto lava all the same
+    assert row["planner"]["fill"] == "sequential" and row["paper_success"] == 64.5
+    assert 0 <= row["first_pass_successes"] <= row["episodes"] == 2
+    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    assert "recorded already" in capsys.readouterr().out
+    assert rows(place, "properties", "results") == [row]
+
+
+def test_two_models_are_composed(place):
+    of = small(case_of("composition-medium"), "dt")
+    assert analysis.main(of._replace(changes={**TOY, "steps": 1, "horizon": 1}), SHORT) == 0
+    (row,) = rows(place, "properties")
+    assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
+
+
+def test_every_case_can_be_made():
+    """Its levels exist, and nothing of its settings is refused, with either preset."""
+    for program in ALL:
+        of = program.ANALYSIS
+        names = [case.name for case in of.cases]
+        assert len(set(names)) == len(names)
+        for preset in ("leapjax", "paper"):
+            wanted = analysis.check(of, Options(preset=preset))
+            assert [case.name for case in wanted] == names
+        for case in of.cases:
+            find_level(case.level)
+            names = [way.name for way in case.ways]
+            assert len(set(names)) == len(names)
+
+
+def test_rows_are_named_by_all_that_matters():
+    case = case_of("adaptation-medium")
+    of, options = properties.ANALYSIS, Options()
+
+    def name(way=case.ways[1], seed=0, options=options):
+        settings = [analysis.training_config(of, m, way.method, seed, options) for m in case.models]
+        return analysis.row_name(of, case, way, settings, seed, options)
+
+    others = [
+        name(case.ways[0]), name(seed=1), name(options=Options(episodes=100)),
+        name(options=Options(preset="paper")), name(options=Options(validation=True)),
+        name(case.ways[1]._replace(executed=1)), name(case.ways[1]._replace(search=lambda g: g)),
+    ]  # fmt: skip
+    assert len({name(), *others}) == 8
+    assert name(options=Options(force=True, record=True)) == name()
+
+
+def test_options_of_a_method_are_for_it_alone_and_for_ours():
+    model = case_of("generalization-hard").models[0]
+
+    def settings(method, preset="leapjax"):
+        options = Options(preset=preset)
+        config = analysis.training_config(properties.ANALYSIS, model, method, 0, options)
+        return config.domain_settings.detours, config.domain_settings.false_starts
+
+    assert settings("leap") == (0.5, 0.3)
+    assert settings("dt") == (0.5, 0.0)
+    assert settings("iql") == settings("leap", "paper") == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "adaptation-esy"], "did you mean adaptation-easy"),
+        (["--methods", "bcq"], "expected some of dt, iql, leap"),
+        (["--preset", "fast"], "unknown preset 'fast'"),
+        (["--episodes", "0"], "--episodes must be at least 1"),
+        (["--seeds"], "--seeds needs at least one seed"),
+    ],
+)
+def test_what_cannot_be_is_one_line(arguments, message, capsys):
+    assert properties.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.strip().splitlines()) == 1
+
+
+def test_tables_hold_todays_rows_beside_the_papers_numbers():
+    of = ablation.ANALYSIS
+    case, way = of.cases[0], of.cases[0].ways[2]
+    settings = [analysis.training_config(of, m, "leap", 0, Options()) for m in case.models]
+    row = {
+        "experiment": "ablation", "case": case.name, "way": way.name, "method": "leap",
+        "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
+        "first_pass_successes": 100, "violations": None, "mean_length": 9.0, "plans": 10,
+        "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
+        "hash": analysis.row_name(of, case, way, settings, 0, Options()),
+    }  # fmt: skip
+    stale = {**row, "successes": 0, "hash": "of another"}
+    table = report.analysed(of, [row, stale])
+    (line,) = (line for line in table.splitlines() if "Gibbs" in line)
+    assert "62.5%" in line and "50.0%" in line and "**75.0%" in line and "2.00" in line
+    assert report.is_used(row) and not report.is_used(stale)
+
+
+def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
+    def toy(domain, level, method, name):
+        config = analysis.configs.with_options(preset(domain, level, method, name), TOY)
+        return analysis.configs.with_options(config, {"steps": 40})
+
+    preset = landscape.configs.preset
+    monkeypatch.setattr(landscape.configs, "preset", toy)
+    arguments = ["--presets", "leapjax", "--trajectories", "4"]
+    assert landscape.main(arguments) == 0
+    (found,) = json.loads((place / "runs" / "landscape.json").read_text())
+    assert [entry["step"] for entry in found["training"]] == [20, 40]
+    last = found["training"][-1]
+    assert last["random_0"] > 0 and last["random_100"] > 0
+    assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 4
+    assert (place / "runs" / "landscape.png").stat().st_size > 10_000
+    assert landscape.main([*arguments, "--trajectories", "0"]) == 2
+
+
+def test_planners_of_the_ablation_have_the_papers_budgets():
+    trained = GibbsConfig(10, 10)
+    assert ablation.shooting(trained).candidates == 30
+    assert ablation.cross_entropy(trained).elites == 3
+    assert ablation.gibbs(trained).iterations == 30
+    assert ablation.confident(trained).fill == "confident"
+    assert Way("any").search(trained) == trained
