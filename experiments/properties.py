@@ -163,15 +163,12 @@ def _composed(
 
 
 MAZE, OBSTACLES = "GoToObjMazeS4", "GoToBehindObstacles"
-ROOM, OPEN_MAZE = (Model(name, more=FALSE_STARTS) for name in ("GoToLocalS8N1", MAZE))
+ROOM, OPEN_MAZE = Model("GoToLocalS8N1", more=DETOURS), Model(MAZE, more=FALSE_STARTS)
 CASES = (
     _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
     _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
     _adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
-    Case(
-        "generalization-easy", [Model("GoToLocalS8N1", more=DETOURS)], "GoToLocalS8N15",
-        _plain((77.5, 36.0, 60.5)),
-    ),
+    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
         "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28}, DETOURS)],
