@@ -92,6 +92,7 @@ ANALYSES = {
 }
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
 SEARCHES_FIGURE = Path("docs/searches.png")
+LANDSCAPE_FIGURE = Path("docs/landscape.png")
 
 
 def main() -> int:
@@ -107,6 +108,7 @@ def rewrite() -> None:
     plots.iterations_by_level(success_by_iterations(rows), ITERATIONS_FIGURE)
     plots.methods_by_level(success_by_method(rows), METHODS_FIGURE)
     plots.iterations_by_level(success_by_passes(rows_of(Path(), *PUZZLES)), SEARCHES_FIGURE)
+    plots.landscape(read_json(Path("results/landscape.json")), LANDSCAPE_FIGURE)
 
 
 def rows_of(root: Path, *names: str) -> list[Row]:
@@ -119,7 +121,7 @@ def documents(root: Path) -> dict[Path, str]:
     rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
     for name in ANALYSES:
         rows[name] = rows_of(root, name)
-    for name in ("planning", "training", "quality"):
+    for name in ("planning", "training", "quality", "landscape"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
         "results": (success, "babyai"),
@@ -134,6 +136,7 @@ def documents(root: Path) -> dict[Path, str]:
         "searches": (searches, "puzzles"),
         "arms": (arms, "puzzles"),
         "quality": (quality, "quality"),
+        "landscape": (landscape, "landscape"),
         **{name: (functools.partial(analysed, each), name) for name, each in ANALYSES.items()},
     }
     written = {}
@@ -377,6 +380,19 @@ def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
                 added.setdefault(level, {}).setdefault(name, {})[of[0]["iterations"]] = sums
     return added
+
+
+def landscape(found: Sequence[Row]) -> str:
+    """Energies of good and bad plans at the end of training, and of plans being refined."""
+    shares = [name for each in found[:1] for name in each["training"][-1] if name != "step"]
+    lines = []
+    for each in found:
+        last, planned = each["training"][-1], each["planning"]["mean"]
+        energies = [f"{last[share]:.2f}" for share in shares]
+        passes = [f"{planned[0]:.2f}", f"{planned[-1]:.2f}"]
+        lines.append([each["level"], f"`{each['preset']}`", *energies, *passes])
+    titles = [f"{share.removeprefix('random_')}% random" for share in shares]
+    return _table(" | ".join(["level", "preset", *titles, "plans, N = 1", "last"]), lines)
 
 
 def analysed(of: Analysis, rows: Sequence[Row]) -> str:
