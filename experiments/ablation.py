@@ -62,6 +62,7 @@ ANALYSIS = Analysis(
         ),
         _case("classifier", "classifier", (25.0, 12.5, 15.5)),
     ),
+    timed=True,
 )  # fmt: skip
 
 

@@ -419,13 +419,15 @@ def analysed(of: Analysis, rows: Sequence[Row]) -> str:
                 "-" if None in first else f"{100 * sum(first) / episodes:.1f}%",
                 rate,
                 _mean_length(mine),
-                f"{_milliseconds(mine):.2f}",
             ]
+            if of.timed:
+                cells.append(f"{_milliseconds(mine):.2f}")
             if watched:
                 counts = [row["violations"] for row in mine]
                 cells.append("-" if None in counts else f"{sum(counts) / episodes:.2f}")
             lines.append(cells)
-    header = "case | planner | preset | paper | N = 1 | success | steps | ms per plan"
+    header = "case | planner | preset | paper | N = 1 | success | steps"
+    header += " | ms per plan" if of.timed else ""
     return _table(f"{header} | violations" if watched else header, lines)
 
 

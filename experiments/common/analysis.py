@@ -73,6 +73,7 @@ class Analysis(NamedTuple):
     name: str  # of its module, and of its file of rows
     cases: Sequence[Case]
     domain: str = "babyai"
+    timed: bool = False  # what a plan costs is part of the comparison: take it on an idle machine
     changes: Mapping[str, Any] = {}  # of every model's options, for tests
 
 
