@@ -199,7 +199,7 @@ def _of_setting(rows: Sequence[Row], setting: Setting, **options: Any) -> list[R
 
 def is_used(row: Row) -> bool:
     """Whether a row is in a table; one that is in none is stale."""
-    if row["experiment"] in ANALYSES:
+    if row.get("experiment") in ANALYSES:
         of = ANALYSES[row["experiment"]]
         return any(
             analysis.rows_of_way(of, [row], case, way, row["preset"])
