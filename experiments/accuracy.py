@@ -69,7 +69,7 @@ def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstratio
     """Some demonstrations that a run has learned from."""
     count = min(count, origin.demos)
     if origin.demonstrations is not None:
-        return storage.load(origin.demonstrations, domain)[:count]
+        return storage.load(origin.demonstrations, domain, count).demonstrations
     return _collect(domain, count, origin.seed)
 
 

@@ -29,6 +29,15 @@ class Collection(NamedTuple):
     dropped: Mapping[str, int]  # how many, by the reason
 
 
+class Recording(NamedTuple):
+    """An episode of n steps as somebody else recorded it, with observations of their own."""
+
+    observations: Any  # [n + 1, ...]
+    actions: np.ndarray  # [n] int64
+    rewards: np.ndarray  # [n] float32
+    seed: int  # with which the environment was reset; negative where nobody knows
+
+
 def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
     """The two numbers of a level's name, such as 3 and 5 of Star3x5.
 
@@ -76,6 +85,9 @@ class Domain(NamedTuple):
     # what augmentations must know of each step, [n, ...]; no model sees it
     check: Callable[[PyTree, str], None] = _nothing_to_check
     # (observations [n + 1, ...], where) -> UserError if a value is out of range
+    replay: Callable[[Recording], Demonstration | str | None] | None = None
+    # what an episode of other observations is as a demonstration; or why it is none; or None,
+    # where nothing is known of such observations
     rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on

@@ -166,7 +166,7 @@ def read_data_set(whole, change):
         shutil.copytree(whole, copied)
         change(copied / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(copied))
-        return outcome(lambda: storage.load(NAME, LEVEL))
+        return outcome(lambda: storage.load(NAME, LEVEL).demonstrations)
 
 
 @cases
@@ -224,7 +224,7 @@ def change_and_load(whole, change):
         shutil.copytree(whole, Path(folder) / "datasets")
         change(Path(folder) / "datasets" / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(Path(folder) / "datasets"))
-        return storage.load(NAME, LEVEL)
+        return storage.load(NAME, LEVEL).demonstrations
 
 
 def replace_actions(replace):

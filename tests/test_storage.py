@@ -63,7 +63,7 @@ def saved(local_demonstrations) -> list[Demonstration]:
 
 
 def test_what_is_saved_is_loaded(saved):
-    assert_same(storage.load(NAME, LEVEL), saved)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
 def test_rewards_and_how_an_episode_ended_are_what_they_were(local_demonstrations):
@@ -78,7 +78,7 @@ def test_rewards_and_how_an_episode_ended_are_what_they_were(local_demonstration
         for d, (terminated, truncated) in zip(local_demonstrations, endings, strict=False)
     ]
     save(changed)
-    assert_same(storage.load(NAME, LEVEL), changed)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, changed)
 
 
 def test_minari_itself_can_read_it(saved):
@@ -117,7 +117,7 @@ def test_grids_of_any_size_are_stored_without_loss():
     )
     large = LEVEL._replace(blank=observations.blank(side, WORDS))
     save([demonstration], domain=large)
-    assert_same(storage.load(NAME, large), [demonstration])
+    assert_same(storage.load(NAME, large).demonstrations, [demonstration])
 
 
 def domain_of(blank) -> Domain:
@@ -145,7 +145,7 @@ def own_demonstration(blank) -> Demonstration:
 def test_observations_of_any_world(blank):
     demonstrations = [own_demonstration(blank)] * 2
     save(demonstrations, domain=domain_of(blank))
-    assert_same(storage.load(NAME, domain_of(blank)), demonstrations)
+    assert_same(storage.load(NAME, domain_of(blank)).demonstrations, demonstrations)
 
 
 def test_observations_of_another_world_are_refused(minari_folder):
@@ -167,18 +167,18 @@ def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
     save(saved, name)
     assert "earlier version" in refused(name)
     save(saved, name.replace("v1", "v2"))
-    assert_same(storage.load(name.replace("v1", "v2"), LEVEL), saved)
+    assert_same(storage.load(name.replace("v1", "v2"), LEVEL).demonstrations, saved)
 
 
 def test_saving_again_replaces(saved):
     save(saved[3:])
-    assert_same(storage.load(NAME, LEVEL), saved[3:])
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved[3:])
 
 
 def test_data_sets_live_side_by_side(saved):
     save(saved[:2], "leapjax/GoToLocalS7N5/other-v1")
-    assert_same(storage.load(NAME, LEVEL), saved)
-    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL), saved[:2])
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL).demonstrations, saved[:2])
 
 
 class Killed(BaseException):
@@ -204,7 +204,7 @@ def test_a_killed_save_leaves_nothing_under_the_name(
         assert list(minari.list_local_datasets()) == []
         save(local_demonstrations)
         assert list(minari.list_local_datasets()) == [NAME]
-    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, local_demonstrations)
     assert not any(minari_folder.glob(f"{storage.SCRATCH}*"))
 
 
@@ -217,7 +217,7 @@ def test_a_killed_save_leaves_what_was_there(saved, monkeypatch):
         patch.setattr(MinariStorage, "update_metadata", die)
         with pytest.raises(Killed):
             save(saved[:1])
-    assert_same(storage.load(NAME, LEVEL), saved)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
 def test_several_processes_make_the_same_data_set(local_demonstrations, minari_folder):
@@ -226,7 +226,7 @@ def test_several_processes_make_the_same_data_set(local_demonstrations, minari_f
         jobs = [pool.submit(save, local_demonstrations) for _ in range(4)]
         for job in jobs:
             job.result()
-    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, local_demonstrations)
     assert sorted(path.name for path in minari_folder.iterdir()) == [
         storage.LOCK,
         "leapjax",
@@ -261,7 +261,7 @@ def test_a_folder_of_data_sets_that_is_relative(local_demonstrations, tmp_path, 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", "sets")
     save(local_demonstrations)
-    assert_same(storage.load(NAME, LEVEL), local_demonstrations)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, local_demonstrations)
     assert (tmp_path / "sets" / NAME).is_dir()
 
 
@@ -475,7 +475,7 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
         truncated=True,
         seed=storage.UNKNOWN_SEED,
     )
-    assert_same(storage.load(NAME, LEVEL), [expected])
+    assert_same(storage.load(NAME, LEVEL).demonstrations, [expected])
 
 
 def test_fields_of_text_instead_of_numbers(local_demonstrations):

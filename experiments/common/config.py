@@ -15,7 +15,7 @@ import tyro
 from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
-from leapjax.data import seeds
+from leapjax.data import seeds, storage
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
@@ -49,7 +49,8 @@ class Config(Generic[M, D, P]):
     demos: int = 500
     """Demonstrations to train on."""
     demonstrations: str | None = None
-    """Id of a Minari data set to train on instead of those that the domain makes."""
+    """Id of a Minari data set to train on instead of those that the domain makes; --level follows
+    from it where it says of what it is."""
     episodes: int = 200
     """Held-out episodes to measure success on."""
     test_seed: int = UNSEEN
@@ -143,7 +144,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     """
     # These come first: they decide the defaults of all the rest, and of --help.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("--level", "--method", "--preset", "--checkpoint"):
+    for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
         first.add_argument(name)
     first.add_argument("--pretrained", action="store_true")
     chosen, _ = first.parse_known_args(list(arguments))
@@ -152,7 +153,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
         raise UserError("--checkpoint and --pretrained: give one of them")
     trained = None if folder is None else pretrained.read_specification(folder)
     levels = find_domain(domain).levels
-    level = chosen.level or (trained.level if trained else levels[0])
+    recorded = storage.level_of(chosen.demonstrations) if chosen.demonstrations else None
+    level = chosen.level or (trained.level if trained else recorded or levels[0])
     if chosen.method == "all" and (folder is not None or chosen.pretrained):
         raise UserError("--method all: a planner that is trained already is of one method")
     configs = []
@@ -222,6 +224,12 @@ def check(config: AnyConfig) -> None:
     checkpoints.check_path(config.runs)
     if config.play is not None and config.checkpoint is None:
         raise UserError("--play: another level is played with a --checkpoint, and there is none")
+    recorded = storage.level_of(config.demonstrations) if config.demonstrations else None
+    if recorded is not None and recorded != config.level:
+        raise UserError(
+            f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "
+            f"use --level {recorded}"
+        )
     domain = make_domain(config)
     if not 0 <= config.rules < float("inf"):  # false for NaN too
         raise UserError(f"--rules must be a number, at least 0, got {config.rules}")

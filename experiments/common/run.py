@@ -29,6 +29,7 @@ from leapjax.agents import learning
 from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
+from leapjax.data.storage import reasons
 from leapjax.domain import Domain, blank_context
 from leapjax.energy import compose
 from leapjax.errors import UserError, first_line
@@ -127,9 +128,9 @@ def collect(run: Run) -> None:
         count = run.config.demos
         with Meter(run.console, "demonstrations", count) as meter:
             collection = run.domain.collect(count, run.seed, meter.update)
-        reasons = ", ".join(f"{number} {reason}" for reason, number in collection.dropped.items())
-        dropped = f"; dropped: {reasons}" if reasons else ""
-        summary = f"{count} demonstrations of {run.domain.level}{dropped}"
+        dropped = reasons(collection)
+        summary = f"{count} demonstrations of {run.domain.level}"
+        summary += f"; dropped: {dropped}" if dropped else ""
         run.console.print(summary)
         storage.save(dataset(run), collection, run.domain, summary)
 
@@ -150,11 +151,14 @@ def load(run: Run) -> list[Demonstration]:
         return []
     begun = time.perf_counter()
     # Each process reads for itself: the data need not be on one shared disk.
-    data = processes.together(lambda: storage.load(name, run.domain))
+    loaded = processes.together(lambda: storage.load(name, run.domain, config.demos))
+    data, dropped = loaded.demonstrations, reasons(loaded)
     if len(data) < config.demos:
-        raise UserError(f"{name} has {len(data)} episodes, fewer than --demos {config.demos}")
+        also = f" that can be used ({dropped})" if dropped else ""
+        raise UserError(f"{name} has {len(data)} episodes{also}, fewer than --demos {config.demos}")
     run.seconds["demos"] += time.perf_counter() - begun
-    data = data[: config.demos]
+    if dropped:
+        run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)
     if find_method(config.method).rewards and not any(d.rewards.any() for d in data):
         raise UserError(
             f"{name} holds no rewards, from which --method {config.method} learns: give it data "

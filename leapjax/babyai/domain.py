@@ -11,6 +11,7 @@ from leapjax.babyai import (
     encoders,
     levels,
     observations,
+    replay,
     settings,
     vocabulary,
 )
@@ -57,6 +58,7 @@ def make(name: str, options: Settings) -> Domain:
         augmentations=augmentation.chosen(options),
         extras=augmentation.way,
         check=functools.partial(check, level=level),
+        replay=functools.partial(replay.replay, level=level),
         shortest_limit=levels.shortest_limit(env),
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
         paper_success=levels.paper_success(level.name),

@@ -11,6 +11,8 @@ import os
 import re
 import shutil
 import tempfile
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +22,12 @@ import jax
 import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
+from minari.dataset.episode_data import EpisodeData
 from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from leapjax import files
-from leapjax.domain import Collection, Domain
+from leapjax.domain import Collection, Domain, Recording
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
@@ -158,8 +161,14 @@ def _only_at_end(demonstration: Demonstration, value: bool) -> list[bool]:
     return [False] * (len(demonstration.actions) - 1) + [bool(value)]
 
 
-def load(name: str, domain: Domain) -> list[Demonstration]:
+def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     """The demonstrations of a Minari data set, checked against a domain.
+
+    Args:
+        name: its id.
+        domain: the level that it should be of. Where it can, it plays episodes again that were
+            recorded with other observations; what is no demonstration then is dropped.
+        most: so many are enough; None for all.
 
     Raises:
         UserError: missing, damaged, empty, or not of this domain's observations.
@@ -175,37 +184,81 @@ def load(name: str, domain: Domain) -> list[Demonstration]:
             f"the data set {name!r} is of an earlier version, which kept no rewards: without "
             "--demonstrations it is made anew"
         )
+    found: list[Demonstration] = []
+    dropped: Counter[str] = Counter()
+    for episode, seed in _episodes(name):
+        if most is not None and len(found) >= most:
+            break
+        where = f"episode {episode.id} of the Minari data set {name!r}"
+        result = _demonstration(episode, seed, domain, where)
+        if isinstance(result, str):
+            dropped[result] += 1
+        else:
+            found.append(result)
+    collection = Collection(found, dropped)
+    if not found:
+        only = f" that can be used, only {reasons(collection)}" if dropped else ""
+        raise UserError(f"the Minari data set {name!r} has no episodes{only}")
+    return collection
+
+
+def reasons(collection: Collection) -> str:
+    """What was dropped, and why, in words."""
+    return ", ".join(f"{count} {reason}" for reason, count in collection.dropped.items())
+
+
+def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
+    """The episodes of a data set, one by one, and the seeds of their resets.
+
+    Raises:
+        UserError: it is damaged.
+    """
     try:
         _inspect(get_dataset_path(name) / "data")
         dataset = minari.load_dataset(name)
-        episodes = list(dataset.iterate_episodes())
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+        for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
+            yield episode, int(details.get("seed", UNKNOWN_SEED))
     except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
         raise UserError(
             f"the Minari data set {name!r} cannot be read ({first_line(error)}): "
             "delete it and it is made again, or restore it"
         ) from None
-    if not episodes:
-        raise UserError(f"the Minari data set {name!r} has no episodes")
-    demonstrations = []
-    for episode, details in zip(episodes, metadata, strict=True):
-        where = f"episode {episode.id} of the Minari data set {name!r}"
-        actions = _actions(episode.actions, where, domain.num_actions - 2)
-        observations = _like(domain.blank, episode.observations, where)
-        _check_shapes(observations, domain, len(actions) + 1, where)
-        domain.check(observations, where)
-        narrow = functools.partial(_narrowed, where=where)
-        demonstrations.append(
-            Demonstration(
-                jax.tree.map(narrow, domain.blank, observations),
-                actions.astype(np.int32),
-                _rewards(episode.rewards, where, len(actions)),
-                bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),
-                bool(np.asarray(episode.truncations).reshape(-1)[-1:].any()),
-                int(details.get("seed", UNKNOWN_SEED)),
-            )
-        )
-    return demonstrations
+
+
+def _demonstration(
+    episode: EpisodeData, seed: int, domain: Domain, where: str
+) -> Demonstration | str:
+    """An episode as it was stored, or played again; or why it cannot be used."""
+    if domain.replay is not None:
+        actions = _numbers(np.zeros((), np.int64), episode.actions, f"{where}: actions")
+        rewards = _rewards(episode.rewards, where, len(actions))
+        again = domain.replay(Recording(episode.observations, actions, rewards, seed))
+        if again is not None:
+            return again
+    actions = _actions(episode.actions, where, domain.num_actions - 2)
+    observations = _like(domain.blank, episode.observations, where)
+    _check_shapes(observations, domain, len(actions) + 1, where)
+    domain.check(observations, where)
+    narrow = functools.partial(_narrowed, where=where)
+    return Demonstration(
+        jax.tree.map(narrow, domain.blank, observations),
+        actions.astype(np.int32),
+        _rewards(episode.rewards, where, len(actions)),
+        bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),
+        bool(np.asarray(episode.truncations).reshape(-1)[-1:].any()),
+        seed,
+    )
+
+
+def level_of(name: str) -> str | None:
+    """The id of the environment that a data set was recorded in, if it says so."""
+    try:
+        text = (datasets_folder() / name / "data" / "metadata.json").read_text(encoding="utf-8")
+        recorded = json.loads(json.loads(text)["env_spec"])["id"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # what is wrong with it is said when it is loaded
+    return recorded if isinstance(recorded, str) else None
 
 
 def _inspect(folder: Path) -> None:

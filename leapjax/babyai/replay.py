@@ -1,0 +1,64 @@
+"""Episodes that somebody recorded of MiniGrid's own observations, played again.
+
+Minari's published data sets of BabyAI hold an image, a direction and the mission, seen from the
+agent or as a whole. They hold no object carried, and no goal. Their levels follow from the seed
+of the reset, so the recorded actions lead through the same states again, whole.
+"""
+
+import numpy as np
+
+from leapjax.babyai.adapter import END, BabyAIAdapter
+from leapjax.babyai.levels import Level
+from leapjax.babyai.observations import Observation
+from leapjax.domain import Recording
+from leapjax.types import Demonstration
+
+NO_SEED = "without the seed of their reset"
+DONE = "with the action `done`"
+DIFFERENT = "that go otherwise when they are played again"
+FAILED = "that failed"
+
+
+def replay(recording: Recording, level: Level) -> Demonstration | str | None:
+    """A recorded episode as a demonstration; or why it is none; None: it is not of MiniGrid."""
+    stored = recording.observations
+    if not isinstance(stored, dict) or not {"image", "mission"} <= set(stored):
+        return None
+    if recording.seed < 0:
+        return NO_SEED
+    if (recording.actions >= END).any():
+        return DONE
+    if not (recording.rewards > 0).any():
+        return FAILED
+    adapter = BabyAIAdapter(level)
+    states = [adapter.reset(recording.seed)]
+    same = [_is(adapter, stored, 0)]
+    success = terminated = truncated = False
+    for step, action in enumerate(recording.actions, start=1):
+        if terminated or truncated or not same[-1]:
+            return DIFFERENT
+        state, reward, terminated, truncated, success = adapter.step(int(action))
+        states.append(state)
+        same.append(_is(adapter, stored, step) and np.isclose(reward, recording.rewards[step - 1]))
+    if not same[-1] or not success:
+        return DIFFERENT
+    return Demonstration(
+        Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
+        recording.actions.astype(np.int32),
+        recording.rewards.astype(np.float32),
+        terminated,
+        truncated,
+        recording.seed,
+    )
+
+
+def _is(adapter: BabyAIAdapter, stored: dict, step: int) -> bool:
+    """Whether a level is now as it was recorded after so many steps."""
+    env, image = adapter.env, np.asarray(stored["image"])[step]
+    if str(np.asarray(stored["mission"])[step]) != env.mission:
+        return False
+    whole = image.shape == (env.width, env.height, 3)
+    if not whole:  # the adapter has no use for the agent's view, so it has taken it away
+        seen = type(env).gen_obs(env)["image"]
+        return np.array_equal(seen, image)
+    return np.array_equal(adapter.observe().grid[: env.width, : env.height], image)

@@ -1,0 +1,125 @@
+"""Data sets of MiniGrid's own observations, as Minari's collector writes them."""
+
+import string
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari import DataCollector
+from minigrid.utils.baby_ai_bot import BabyAIBot
+from minigrid.wrappers import FullyObsWrapper
+
+from experiments import babyai
+from experiments.common import config
+from leapjax.babyai import demonstrations, levels, replay
+from leapjax.babyai.domain import BABYAI
+from leapjax.babyai.settings import Settings
+from leapjax.data import storage
+from leapjax.errors import UserError
+from tests.programs import TOY, only_long
+from tests.test_storage import file_of
+
+LEVEL = "BabyAI-GoToLocal-v0"
+DOMAIN = BABYAI.make(LEVEL, Settings())
+LEFT, DONE = 0, 6
+NAMES = {"partial": "minigrid/BabyAI-GoToLocal/optimal-v0", "whole": "minigrid/full/optimal-v0"}
+
+
+def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None):
+    """A data set of MiniGrid's bot, whose episode 1 is spoiled."""
+    with levels.silenced():
+        env = wrap(gym.make(level))
+    words = spaces.Text(200, charset=string.printable)
+    space = spaces.Dict({**env.observation_space.spaces, "mission": words})
+    collector = DataCollector(env, observation_space=space, jpeg_encoding=False)
+    for episode in range(episodes):
+        with levels.silenced():
+            collector.reset(seed=1000 + episode)
+        bot, action, over = BabyAIBot(env.unwrapped), None, False
+        if episode == 1 and spoil is not None:
+            collector.step(spoil)
+            for _ in range(2):  # and then it was cut off
+                collector.step(LEFT)
+            continue
+        while not over:
+            action = int(bot.replan(action))
+            _, _, terminated, truncated, _ = collector.step(action)
+            over = terminated or truncated
+    collector.create_dataset(name, algorithm_name="BabyAIBot")
+    collector.close()
+    return name
+
+
+@pytest.mark.parametrize("view", ["partial", "whole"])
+def test_what_was_recorded_is_played_again_and_seen_as_a_whole(view):
+    wrap = FullyObsWrapper if view == "whole" else lambda env: env
+    collection = storage.load(recorded(NAMES[view], wrap), DOMAIN)
+    assert not collection.dropped and len(collection.demonstrations) == 5
+    level = levels.find_level(LEVEL)
+    for number, found in enumerate(collection.demonstrations):
+        assert found.seed == 1000 + number and found.terminated and found.rewards[-1] > 0
+        adapter = demonstrations.BabyAIAdapter(level)
+        state = adapter.reset(found.seed)
+        for step, action in enumerate([*found.actions, None]):
+            for ours, expected in zip(found.observations, state, strict=True):
+                np.testing.assert_array_equal(ours[step], expected)
+            if action is not None:
+                state = adapter.step(int(action)).observation
+    few = storage.load(NAMES[view], DOMAIN, most=2).demonstrations
+    assert [d.seed for d in few] == [1000, 1001]
+
+
+@pytest.mark.parametrize(("spoil", "reason"), [(DONE, replay.DONE), (LEFT, replay.FAILED)])
+def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(spoil, reason):
+    collection = storage.load(recorded(NAMES["partial"], spoil=spoil), DOMAIN)
+    assert collection.dropped == {reason: 1}
+    assert [d.seed for d in collection.demonstrations] == [1000, 1002, 1003, 1004]
+    assert storage.reasons(collection) == f"1 {reason}"
+
+
+def test_episodes_that_go_otherwise_are_dropped_and_counted():
+    name = recorded(NAMES["partial"])
+    with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
+        file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never was
+        file["episode_2"].attrs["seed"] = 5  # of another level
+        file["episode_3/rewards"][-1] = 0.123
+        del file["episode_4"].attrs["seed"]
+    found = storage.load(name, DOMAIN)
+    assert found.dropped == {replay.DIFFERENT: 3, replay.NO_SEED: 1}
+    assert [d.seed for d in found.demonstrations] == [1000]
+    with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
+        file["episode_0/observations/image"][0] = 0
+    with pytest.raises(UserError, match="can be used, only 4 that go otherwise"):
+        storage.load(name, DOMAIN)
+
+
+def test_the_level_follows_from_the_data_and_must_be_theirs():
+    name = recorded(NAMES["partial"], episodes=1)
+    (chosen,) = config.parse("babyai", ["--demonstrations", name])
+    assert chosen.level == LEVEL and chosen.demonstrations == name
+    with pytest.raises(
+        UserError, match=f"is of {LEVEL}, not of GoToLocalS7N5: use --level {LEVEL}"
+    ):
+        config.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
+    assert storage.level_of("no/such/set-v0") is None
+
+
+def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = recorded(NAMES["partial"], spoil=DONE)
+    assert babyai.main([*TOY, "--demonstrations", name]) == 2
+    assert f"4 episodes that can be used (1 {replay.DONE}), fewer than --demos 6" in (
+        " ".join(capsys.readouterr().err.split())
+    )
+    few = ["--demos", "4", "--steps", "0", "--method", "random"]
+    assert babyai.main([*"--episodes 2 --no-pictures".split(), *few, "--demonstrations", name]) == 0
+    assert f"dropped: 1 {replay.DONE}" in " ".join(capsys.readouterr().out.split())
+
+
+@only_long
+def test_many_levels_replay():
+    for level in ("BabyAI-GoToSeqS5R2-v0", "BabyAI-PickupLoc-v0", "BabyAI-UnlockLocal-v0"):
+        name = recorded(f"minigrid/{level}/optimal-v0", episodes=20, level=level)
+        assert len(storage.load(name, BABYAI.make(level, Settings())).demonstrations) == 20
