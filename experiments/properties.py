@@ -5,6 +5,8 @@ know a part of the task; and, beyond the paper, several constraints at once.
 """
 
 import dataclasses
+import functools
+import math
 import sys
 from collections.abc import Callable, Sequence
 
@@ -34,7 +36,7 @@ Penalty = Callable[[Context, jax.Array], jax.Array]
 WEIGHT = 20.0  # of a violation, in nats: more than any detour costs
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
-FALSE_STARTS = {"leap": {"false_starts": 0.3}}
+FALSE_STARTS = {"leap": {"false_starts": 0.6, "steps": 3000}}
 # Demonstrations of empty rooms never go around things. (IQL learns from transitions, which these
 # augmentations leave as they are.)
 _DETOURS = {"detours": 0.5, "lookalikes": True, "steps": 2000}
@@ -65,23 +67,18 @@ class WatchedTurns(Watched):
         return super().step(action)
 
 
-def unseen(*penalties: Penalty) -> Callable[[Sequence[Energy]], Energy]:
+def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[Energy]], Energy]:
     """The energy of a model that sees no lava, and penalties that do."""
 
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return WEIGHT * sum((each(context, actions) for each in penalties), jnp.zeros(()))
-
-    return lambda energies: constrain(view(energies[0], without_lava), penalty, partial=True)
-
-
-def masked(*penalties: Penalty) -> Callable[[Sequence[Energy]], Energy]:
-    """The same of a method of single actions: those that violate anything at once are removed."""
-
-    def penalty(context: Context, actions: jax.Array) -> jax.Array:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
-        return jnp.where(count > 0, jnp.inf, 0.0)
+        return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
 
     return lambda energies: constrain(view(energies[0], without_lava), penalty, partial=True)
+
+
+# Of methods of single actions: those that violate anything at once are removed.
+masked = functools.partial(unseen, weight=math.inf)
 
 
 def left_to_right(trained: GibbsConfig) -> GibbsConfig:

@@ -42,7 +42,8 @@ class Window(NamedTuple):
     """One training example: what was done from one step of a demonstration on."""
 
     context: Context
-    actions: Array  # [T] int32: what to predict
+    actions: Array  # [T] int32: what was done
+    imitated: Array  # [T] bool: which of them to learn; the others are only shown
     return_to_go: Array  # [] float32: the demonstration's rewards from this step on
     extras: PyTree  # what the domain's augmentation must know of this step; no model sees it
 

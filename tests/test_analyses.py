@@ -101,7 +101,7 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
         config = analysis.training_config(properties.ANALYSIS, model, method, 0, options)
         return config.domain_settings.detours, config.domain_settings.false_starts
 
-    assert settings("leap") == (0.5, 0.3)
+    assert settings("leap") == (0.5, 0.6)
     assert settings("dt") == (0.5, 0.0)
     assert settings("iql") == settings("leap", "paper") == (0.0, 0.0)
 

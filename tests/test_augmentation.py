@@ -290,13 +290,13 @@ def test_a_false_start_leads_to_where_the_window_began():
     for before, after in changed_by(change, plain_windows()):
         state = after.context.observation
         began = before.context.observation.grid
-        moves = next(
-            n for n in range(4) if np.array_equal(after.actions[n:], before.actions[: 10 - n])
-            and np.array_equal(walked(state, after.actions[:n]).grid, began)
-        )  # fmt: skip
+        moves = int(after.imitated.argmax())
+        assert after.imitated[moves:].all() and not after.imitated[:moves].any()
+        np.testing.assert_array_equal(after.actions[moves:], before.actions[: 10 - moves])
+        np.testing.assert_array_equal(walked(state, after.actions[:moves]).grid, began)
         lengths[moves] += 1
         assert after.extras[tuple(state.pose[:2])]
-    assert set(lengths) == {1, 2, 3}
+    assert set(lengths) == set(range(1, 7))
 
 
 def walked(state, actions):
@@ -309,6 +309,7 @@ def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
     change = jax.jit(lambda key, window: augmentation.detour(key, window, 1.0, GRID_WORDS))
     longer = things = 0
     for before, after in changed_by(change, plain_windows(horizon=24)):
+        assert after.imitated.all()
         state = after.context.observation
         goal = tuple(map(int, state.goal))
         end = walked(state, after.actions[after.actions != END])
@@ -317,6 +318,7 @@ def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
         grid, _ = Grid.decode(np.asarray(state.grid))
         start = tuple(map(int, state.pose[:2]))
         moves = int((after.actions == 2).sum())
+        assert moves + 1 == after.extras.sum()  # no cell twice, and not the goal
         assert slow_path_lengths(grid, start, through_objects=False)[goal] == moves + 1
         straight = abs(start[0] - goal[0]) + abs(start[1] - goal[1])
         longer += moves + 1 > straight

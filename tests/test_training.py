@@ -185,6 +185,8 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
     ended = 0
     for row in range(3):
         one = jax.tree.map(lambda leaf, r=row: leaf[r : r + 1], batch)
+        imitated = np.arange(horizon) >= row  # what comes before is shown, and not learned
+        one = one._replace(imitated=jnp.asarray(imitated)[None])
         _, metrics = update(state, one, jax.random.key(row))
         jax.effects_barrier()
         (drawn,) = masks[-1:]
@@ -194,10 +196,11 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
         context = jax.tree.map(lambda leaf: leaf[0], one.context)
         total = 0.0
         for masked in drawn.reshape(-1, horizon):
+            masked = masked & imitated
             each = negative_log_likelihoods(context, tokens, masked)
             total += float(jnp.where(masked & ~beyond, each, 0).sum())
         assert float(metrics["loss"]) == pytest.approx(total / drawn.sum(), rel=1e-4)
-        if (masking, end) == ("each", True):  # the energy of a plan, over T
+        if (masking, end, row) == ("each", True, 0):  # the energy of a plan, over T
             memory = energy.encode(state.params, context)
             whole = float(energy.total(state.params, memory, one.actions[0]))
             assert whole == pytest.approx(total, rel=1e-4)

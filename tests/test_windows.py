@@ -72,6 +72,7 @@ def slow_window(demonstration: Demonstration, start: int, context: int, horizon:
             np.float32(sum(demonstration.rewards[:start].tolist())),
         ),
         np.array(planned, np.int32),
+        np.ones(horizon, bool),
         np.float32(sum(demonstration.rewards[start:].tolist())),
         slow_way(demonstration, start),
     )

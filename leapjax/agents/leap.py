@@ -90,6 +90,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             single = masking in schedules.SINGLE
             positions = jnp.argmax(masked)[None] if single else jnp.arange(sizes.horizon)
             beyond = (window.actions == last) & (not setup.settings.end)
+            masked &= window.imitated  # what is not learned is always shown
             tokens = jnp.where(masked, mask, jnp.where(beyond, pad, window.actions))
             logits = module.apply(
                 params, memory, tokens, positions, deterministic=False, method="logits",

@@ -19,7 +19,7 @@ from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.domain import Augmentation
 from leapjax.types import Array, Demonstration, Window
 
-FALSE_MOVES, DETOUR_MOVES = 3, 8  # at most, at the beginning of a window
+FALSE_MOVES, DETOUR_MOVES = 6, 8  # at most, at the beginning of a window
 TRIES = 8  # to find a detour
 WALL, GREY = 2, 5  # MiniGrid's indices
 
@@ -161,11 +161,12 @@ def _in_full(instruction: jax.Array, target: jax.Array, words: GridWords) -> jax
 
 
 def false_start(key: jax.Array, window: Window, share: float) -> Window:
-    """A window that begins with up to three random moves, and then does what it did.
+    """A window that begins with one to six random moves, and then does what it did.
 
     The moves lead from another pose, which is found backwards, to the one that the window
     began in. So it shows where a plan has got to that did not begin well, which plans under a
-    constraint must know, and demonstrations, being optimal, never show.
+    constraint must know, and demonstrations, being optimal, never show. What follows the moves
+    is imitated, they themselves are not: no plan shall begin so of its own.
 
     Windows stay as they are where the moves are not possible, and where there are past states.
 
@@ -178,18 +179,23 @@ def false_start(key: jax.Array, window: Window, share: float) -> Window:
         return window
     take_key, start_key = jax.random.split(key)
     most = min(FALSE_MOVES, window.actions.shape[0] - 1)
-    later, _, possible = begin_earlier(start_key, window, most, 1 / 3)
-    possible &= jax.random.bernoulli(take_key, share)
-    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), later, window)
+    if most == 0:
+        return window
+    count_key, moves_key = jax.random.split(start_key)
+    count = jax.random.randint(count_key, (), 1, most + 1)
+    later, _, possible = begin_earlier(moves_key, window, count, most, 1 / 2)
+    later = later._replace(imitated=jnp.arange(window.actions.shape[0]) >= count)
+    taken = possible & jax.random.bernoulli(take_key, share)
+    return jax.tree.map(lambda a, b: jnp.where(taken, a, b), later, window)
 
 
 def detour(key: jax.Array, window: Window, share: float, words: GridWords) -> Window:
     """A window that takes a longer way, in a world where it is the shortest.
 
-    It begins with up to eight random moves, as `false_start` has them; objects and walls are put
-    beside the way, many or few; and it is taken where no shorter way is left. So it shows that
-    ways lead around things, even where demonstrations are of empty rooms. Of some tries the one
-    is taken whose way is longer than it would be without the things, if there is one.
+    It begins with up to eight random moves; objects and walls are put beside the way, many or
+    few; and it is taken where no shorter way is left. So it shows that ways lead around things,
+    even where demonstrations are of empty rooms. Of some tries the one is taken whose way is
+    longer than it would be without the things, if there is one.
 
     Windows stay as they are where that does not work out, and where there are past states.
 
@@ -213,8 +219,11 @@ def _try_detour(
     key: jax.Array, window: Window, words: GridWords
 ) -> tuple[Window, jax.Array, jax.Array]:
     """A window on a way, whether it is the shortest, and whether things make it longer."""
-    start_key, share_key, where_key, kind_key, colour_key, wall_key = jax.random.split(key, 6)
-    earlier, whole, possible = begin_earlier(start_key, window, DETOUR_MOVES, 2 / 3)
+    count_key, start_key, share_key, where_key, kind_key, colour_key, wall_key = jax.random.split(
+        key, 7
+    )
+    count = jax.random.randint(count_key, (), 0, DETOUR_MOVES + 1)
+    earlier, whole, possible = begin_earlier(start_key, window, count, DETOUR_MOVES, 2 / 3)
     observation, way = earlier.context.observation, earlier.extras
     grid, goal = observation.grid, observation.goal
     cells = grid.shape[:2]
@@ -236,6 +245,8 @@ def _try_detour(
 
     # A way without a cell twice has as many cells, but for the goal, as moves lead to the goal.
     length = way.sum()
+    first = (whole == FORWARD) & (jnp.arange(len(whole)) < count)
+    possible &= length == window.extras.sum() + first.sum()
     possible &= (moves(filled_grid) == length) & (goal[0] >= 0) & ~_wasteful(whole)
     context = earlier.context._replace(observation=observation._replace(grid=filled_grid))
     return earlier._replace(context=context), possible, moves(grid) < length
@@ -263,7 +274,7 @@ def _wasteful(actions: jax.Array) -> jax.Array:
 
 
 def begin_earlier(
-    key: jax.Array, window: Window, most: int, forward: float
+    key: jax.Array, window: Window, count: jax.Array, most: int, forward: float
 ) -> tuple[Window, jax.Array, jax.Array]:
     """A window with random moves before its own, all of its moves, and whether they are possible.
 
@@ -273,13 +284,13 @@ def begin_earlier(
     Args:
         key: chooses the moves.
         window: one training example, without past states.
-        most: so many moves.
+        count: `[]` how many.
+        most: so many at most, and at least one.
         forward: how likely a move is one, and not a turn.
     """
     context, horizon = window.context, window.actions.shape[0]
-    count_key, turn_key, forward_key = jax.random.split(key, 3)
-    count = jax.random.randint(count_key, (), 0, most + 1)
-    shape = (max(most, 1),)
+    turn_key, forward_key = jax.random.split(key)
+    shape = (most,)
     turns = jnp.where(jax.random.bernoulli(turn_key, shape=shape), LEFT, RIGHT)
     moves = jnp.where(jax.random.bernoulli(forward_key, forward, shape), FORWARD, turns)
     observation = context.observation
@@ -312,7 +323,7 @@ def begin_earlier(
     moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
     place = jnp.arange(most + horizon)
     after = window.actions[jnp.clip(place - count, 0, horizon - 1)]
-    whole = jnp.where(place < count, moves[jnp.minimum(place, len(moves) - 1)], after)
+    whole = jnp.where(place < count, moves[jnp.minimum(place, most - 1)], after)
     way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
     began = observation._replace(grid=moved, pose=start)
     longer = window._replace(

@@ -119,6 +119,7 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
     return Window(
         _context(steps, index, context, end),
         jnp.where(ahead < rest, actions, end),
+        jnp.ones(horizon, bool),
         steps.return_so_far[final] + steps.rewards[final] - steps.return_so_far[index],
         _at(steps.extras, index),
     )
