@@ -15,15 +15,15 @@ from typing import Annotated
 
 import tyro
 from minigrid.envs.babyai.core.verifier import Instr, SeqInstr
-from PIL import Image
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from experiments import babyai_animation
+from experiments.babyai_drawing import picture
 from experiments.common import program, runtime
 from experiments.common.config import check_executed
-from leapjax import files, pretrained, rollouts
+from experiments.common.pictures import save_sheet
+from leapjax import pretrained, rollouts
 from leapjax.babyai import levels, observations
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.levels import Level
@@ -231,18 +231,9 @@ def draw(failed: Sequence[Recorder], path: Path) -> None:
         UserError: the picture cannot be written.
     """
     pictures = [
-        babyai_animation.picture(
-            r, r.env.mission, f"{len(r.cells) - 1} steps: {cause(r).value}", r.cells
-        )
-        for r in failed
+        picture(r, f"{len(r.cells) - 1} steps: {cause(r).value}", [r.cells]) for r in failed
     ]
-    width, height = pictures[0].size
-    columns = min(COLUMNS, len(pictures))
-    sheet = Image.new("RGB", (width * columns, height * -(-len(pictures) // columns)), "white")
-    for index, picture in enumerate(pictures):
-        sheet.paste(picture, (width * (index % columns), height * (index // columns)))
-    with files.whole(path) as scratch:
-        sheet.save(scratch)
+    save_sheet(pictures, COLUMNS, path)
 
 
 if __name__ == "__main__":

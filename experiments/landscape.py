@@ -21,11 +21,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from experiments import accuracy
 from experiments.common import config as configs
 from experiments.common import experiment, plots, program, results, run, runtime
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
-from experiments.common.interruption import Interruption, interruptible
+from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files
 from leapjax.batching import compile_planner
@@ -65,13 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Trains with each preset and says what was found; the exit code."""
     given = program.arguments_of(arguments)
     options = tyro.cli(Options, args=given)
-    module = "experiments.landscape"
-
-    def work() -> None:
-        with interruptible(lambda stopped: program.stop(module, given, stopped)) as interruption:
-            report(options, interruption)
-
-    return program.guarded(module, given, work)
+    return program.stoppable(
+        "experiments.landscape", given, lambda interruption: report(options, interruption)
+    )
 
 
 def report(options: Options, interruption: Interruption) -> None:
@@ -89,10 +86,7 @@ def report(options: Options, interruption: Interruption) -> None:
     runtime.start()
     found = []
     for config in wanted:
-        domain = configs.make_domain(config)
-        folder = experiment.run_folder(EXPERIMENT, config, options.seed)
-        specification = configs.specify(config, options.seed, domain)
-        this = Run(config, domain, specification, folder, console, interruption)
+        this = experiment.make_run(EXPERIMENT, config, options.seed, console, interruption)
         found.append(landscape(this, options.trajectories))
     console.print(table(found))
     folder = Path("results") if options.record else options.runs
@@ -103,7 +97,7 @@ def report(options: Options, interruption: Interruption) -> None:
 
 def landscape(this: Run, count: int) -> dict[str, Any]:
     """One training, watched; and plans of what was learned."""
-    measure = energies_of(this.domain, this.specification.planner.horizon, count)
+    measure = energies_of(this, count)
     with contextlib.ExitStack() as stack:
         played = seeds.validation_seeds(0, count)
         planner, metrics = experiment.train(this, played, stack, measure)
@@ -121,17 +115,16 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
     }
 
 
-def energies_of(
-    domain: Domain, horizon: int, count: int
-) -> Callable[[Energy, Params], dict[str, float]]:
+def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, float]]:
     """A function that takes the mean energy of demonstrations, corrupted more and more.
 
-    They are of a training seed that nothing else uses, each from its beginning.
+    They are of another training seed, each from its beginning.
     """
-    data = domain.collect(count, seeds.MAX_TRAINING_SEED - 1, lambda done: None).demonstrations
+    domain, specification = this.domain, this.specification
+    data = accuracy.others(domain, specification.origin, count)
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
     begins = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
-    end = domain.num_actions - 1
+    end, horizon = domain.num_actions - 1, specification.planner.horizon
 
     def corrupted(key: jax.Array, actions: jax.Array, share: float) -> jax.Array:
         where_key, action_key = jax.random.split(key)
@@ -142,7 +135,7 @@ def energies_of(
     @functools.partial(jax.jit, static_argnums=0)
     def mean(energy: Energy, params: Params, share: float) -> jax.Array:
         def one(place: jax.Array, begin: jax.Array) -> jax.Array:
-            window = windows.window(steps, begin, 0, horizon, end)
+            window = windows.window(steps, begin, specification.context, horizon, end)
             actions = corrupted(jax.random.key(place), window.actions, share)
             return energy.total(params, energy.encode(params, window.context), actions)
 
@@ -160,9 +153,8 @@ def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, 
     assert isinstance(trained, GibbsConfig)  # as of every energy over plans of several actions
     config = dataclasses.replace(trained, iterations=max(10, trained.iterations), score_trace=True)
     plan = compile_planner(planner.energy, config, run.CHUNK_SIZES)
-    plans = plan(
-        planner.params, jax.random.split(jax.random.key(0), len(played)), firsts(domain, played)
-    )
+    contexts = firsts(domain, played, planner.specification.context)
+    plans = plan(planner.params, jax.random.split(jax.random.key(0), len(played)), contexts)
     energies = np.asarray(plans.trace_energies)  # [B, N]
     return {
         "mean": energies.mean(axis=0).tolist(),
@@ -170,10 +162,10 @@ def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, 
     }
 
 
-def firsts(domain: Domain, played: range) -> Context:
-    """The contexts that episodes begin with."""
+def firsts(domain: Domain, played: range, length: int) -> Context:
+    """The contexts, of K = `length`, that episodes begin with."""
     adapter = domain.make_adapter()
-    histories = [History(adapter.reset(seed), 0, domain.num_actions) for seed in played]
+    histories = [History(adapter.reset(seed), length, domain.num_actions) for seed in played]
     return stack_contexts(histories)
 
 

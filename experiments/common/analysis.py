@@ -20,14 +20,12 @@ from experiments.common import config as configs
 from experiments.common import experiment, program, results, run, runtime
 from experiments.common.config import AnyConfig, check_counts, configuration_hash, with_options
 from experiments.common.experiment import Experiment
-from experiments.common.interruption import Interruption, interruptible
+from experiments.common.interruption import Interruption
 from experiments.common.results import Row
-from experiments.common.run import Run
 from leapjax import pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
-from leapjax.energy import compose
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
 from leapjax.planners import GibbsConfig, PlannerConfig
@@ -113,13 +111,11 @@ def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
     given = program.arguments_of(arguments)
     options = tyro.cli(Options, args=given, description=f"The cases: {_names(analysis.cases)}.")
-    module = f"experiments.{analysis.name}"
-
-    def work() -> None:
-        with interruptible(lambda stopped: program.stop(module, given, stopped)) as interruption:
-            run_all(analysis, options, interruption)
-
-    return program.guarded(module, given, work)
+    return program.stoppable(
+        f"experiments.{analysis.name}",
+        given,
+        lambda interruption: run_all(analysis, options, interruption),
+    )
 
 
 class Work(NamedTuple):
@@ -214,7 +210,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     found = {row["hash"]: row for row in results.read(work.rows)}
     rows = found if options.record and not options.force else {}
     missing = [name for name in ways if name not in rows]
-    models = [trained(work, each, seed) for each in settings] if missing else []
+    models = models_of(work, case, method, seed) if missing else []
     for name in missing:
         row = {
             "experiment": analysis.name,
@@ -251,6 +247,14 @@ def row_name(
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
 
 
+def models_of(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
+    """The models of a case, of one method, trained where they are not there yet."""
+    configurations = [
+        training_config(work.analysis, model, method, seed, work.options) for model in case.models
+    ]
+    return [trained(work, config, seed) for config in configurations]
+
+
 def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
     training = Experiment(config.domain, config.domain)  # whose runs are used, or made
@@ -259,11 +263,17 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     if steps and steps[-1] >= config.training.steps:
         return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
     work.console.print(f"training {folder}", highlight=False, markup=False)
-    domain = configs.make_domain(config)
-    specification = configs.specify(config, seed, domain)
-    this = Run(config, domain, specification, folder, work.console, work.interruption)
+    this = experiment.make_run(training, config, seed, work.console, work.interruption)
     with contextlib.ExitStack() as stack:
         return experiment.train(this, work.options.played, stack)[0]
+
+
+def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
+    """The models of a case as one planner, which minimises what a way says."""
+    energy = way.minimise([model.energy for model in models])
+    params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
+    plan = compile_planner(energy, search, run.CHUNK_SIZES)
+    return Pretrained(models[0].specification, energy, params, plan)
 
 
 def play(
@@ -275,8 +285,6 @@ def play(
     interruption: Interruption,
 ) -> Row:
     """What one way of asking gives."""
-    energy = way.minimise([model.energy for model in models])
-    params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     specification = models[0].specification
     search = way.search(specification.planner)
     kind = configs.find_domain(specification.domain)
@@ -288,12 +296,13 @@ def play(
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> rollouts.Episodes:
-        plan = compile_planner(energy, config, run.CHUNK_SIZES)
-        run.warm_up(Pretrained(specification, energy, params, plan), domain, options.episodes)
+        planner = asked(way, models, config)
+        run.warm_up(planner, domain, options.episodes)
         adapters.clear()
         return rollouts.evaluate(
-            make_adapter, options.played, plan, params, context=specification.context, seed=seed,
-            executed=way.executed, progress=lambda over, good: interruption.check(),
+            make_adapter, options.played, planner.plan, planner.params,
+            context=specification.context, seed=seed, executed=way.executed,
+            progress=lambda over, good: interruption.check(),
         )  # fmt: skip
 
     first_pass = None
@@ -366,8 +375,3 @@ def table(rows: Sequence[Row]) -> Table:
             "-" if paper is None else f"{paper:.1f}%",
         )
     return shown
-
-
-def summed(weights: Sequence[float] | None = None) -> Callable[[Sequence[Energy]], Energy]:
-    """Every model's energy, added up."""
-    return lambda energies: compose(energies, weights)

@@ -20,7 +20,7 @@ from experiments.common.config import (
     specify,
     with_options,
 )
-from experiments.common.interruption import Interrupted, Interruption, interruptible
+from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files, processes
 from leapjax.data import seeds
@@ -43,18 +43,11 @@ class Experiment(NamedTuple):
 def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
     arguments = program.arguments_of(arguments)
-
-    module = f"experiments.{experiment.name}"
-
-    def give_up(stopped: Interrupted) -> None:
-        if not jax.distributed.is_initialized():  # the others would wait for this one
-            program.stop(module, arguments, stopped)
-
-    def work() -> None:
-        with interruptible(give_up) as interruption:
-            run_all(experiment, arguments, interruption)
-
-    return program.guarded(module, arguments, work)
+    return program.stoppable(
+        f"experiments.{experiment.name}",
+        arguments,
+        lambda interruption: run_all(experiment, arguments, interruption),
+    )
 
 
 def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
@@ -91,6 +84,18 @@ def run_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:
     return config.runs / ("evaluations" if config.checkpoint else "") / label
 
 
+def make_run(
+    experiment: Experiment,
+    config: AnyConfig,
+    seed: int,
+    console: Console,
+    interruption: Interruption,
+) -> Run:
+    """What every step of one level and one seed needs."""
+    domain, folder = make_domain(config), run_folder(experiment, config, seed)
+    return Run(config, domain, specify(config, seed, domain), folder, console, interruption)
+
+
 def run_one(
     experiment: Experiment,
     config: AnyConfig,
@@ -109,9 +114,8 @@ def run_one(
         console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
         return known
     played = episode_seeds(config)
-    folder = run_folder(experiment, config, seed)
-    domain = make_domain(config)
-    this = Run(config, domain, specify(config, seed, domain), folder, console, interruption)
+    this = make_run(experiment, config, seed, console, interruption)
+    folder = this.folder
     console.print(
         f"{config.level}, {config.method}, preset {config.preset}, seed {seed}: "
         f"{config.checkpoint or folder}", markup=False,

@@ -1,4 +1,4 @@
-"""Animations."""
+"""Pictures: animations, and sheets of several."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,3 +18,14 @@ def save_animation(frames: Sequence[Frame], path: Path) -> None:
             scratch, save_all=True, append_images=others, loop=0, optimize=True,
             duration=[milliseconds for _, milliseconds in frames],
         )  # fmt: skip
+
+
+def save_sheet(pictures: Sequence[Image.Image], columns: int, path: Path) -> None:
+    """Writes pictures of one size side by side, at most `columns` in a row, atomically."""
+    width, height = pictures[0].size
+    columns = min(columns, len(pictures))
+    sheet = Image.new("RGB", (width * columns, height * -(-len(pictures) // columns)), "white")
+    for index, picture in enumerate(pictures):
+        sheet.paste(picture, (width * (index % columns), height * (index // columns)))
+    with files.whole(path) as scratch:
+        sheet.save(scratch)

@@ -8,7 +8,7 @@ from typing import NoReturn
 import jax
 
 from experiments.common import runtime
-from experiments.common.interruption import Interrupted
+from experiments.common.interruption import Interrupted, Interruption, interruptible
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
 from leapjax.training import NonFiniteLoss
@@ -49,6 +49,20 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
             1,
         )
     return 0
+
+
+def stoppable(module: str, arguments: Sequence[str], work: Callable[[Interruption], object]) -> int:
+    """The same for long work, which SIGINT and SIGTERM stop where nothing is lost."""
+
+    def give_up(stopped: Interrupted) -> None:
+        if not jax.distributed.is_initialized():  # the others would wait for this one
+            stop(module, arguments, stopped)
+
+    def interrupted_or_done() -> None:
+        with interruptible(give_up) as interruption:
+            work(interruption)
+
+    return guarded(module, arguments, interrupted_or_done)
 
 
 def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoReturn:

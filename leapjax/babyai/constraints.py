@@ -15,7 +15,7 @@ from leapjax.babyai.dynamics import DOOR, LAVA, OPEN, roll
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
-from leapjax.types import Context
+from leapjax.types import Array, Context
 
 
 def lava(context: Context, actions: jax.Array) -> jax.Array:
@@ -54,15 +54,16 @@ def without_open_doors(context: Context) -> Context:
 
 def half_of_obstacles(context: Context, part: int) -> Context:
     """A context in which every second object that is not the goal is seen: part 0 or 1."""
+    return _hiding(context, lambda grid, goal: in_half(grid, goal, 1 - part))
 
-    def hidden(grid: jax.Array, goal: jax.Array) -> jax.Array:
-        kinds = grid[..., 0]
-        objects = (kinds >= INTERCHANGEABLE[0]) & (kinds <= INTERCHANGEABLE[-1])
-        obstacles = objects & (one_cell(goal, grid.shape[0]) == 0)
-        count = jnp.cumsum(obstacles.reshape(-1)).reshape(obstacles.shape)
-        return obstacles & (count % 2 != part)
 
-    return _hiding(context, hidden)
+def in_half(grid: Array, goal: Array, part: int) -> jax.Array:
+    """Where in a grid `[S, S, 3]` the obstacles of part 0 or 1 are: `[S, S]` bool."""
+    kinds = jnp.asarray(grid)[..., 0]
+    objects = (kinds >= INTERCHANGEABLE[0]) & (kinds <= INTERCHANGEABLE[-1])
+    obstacles = objects & (one_cell(jnp.asarray(goal), kinds.shape[0]) == 0)
+    count = jnp.cumsum(obstacles.reshape(-1)).reshape(obstacles.shape)
+    return obstacles & (count % 2 == part)
 
 
 def _hiding(context: Context, which: Callable[[jax.Array, jax.Array], jax.Array]) -> Context:

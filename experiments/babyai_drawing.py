@@ -1,0 +1,73 @@
+"""Levels of BabyAI as MiniGrid renders them, with the ways of plans drawn in."""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from leapjax.babyai.adapter import END, BabyAIAdapter
+from leapjax.babyai.observations import Cell, agent_cell
+
+SIDE = 336  # pixels of a level, about
+CAPTION = 34  # pixels of text below the level
+WHITE = (255, 255, 255)
+# Of one way after another: blue, orange, green, pink, yellow.
+COLOURS = ((80, 160, 255), (255, 150, 50), (90, 220, 120), (255, 110, 200), (240, 230, 80))
+GLYPHS = ("L", "R", "F", "pick", "drop", "open", "end", "?")  # of actions, and of MASK
+Colour = tuple[int, int, int]
+
+
+def picture(
+    adapter: BabyAIAdapter,
+    text: str,
+    ways: Sequence[Sequence[Cell]] = (),
+    marked: Sequence[tuple[Sequence[Cell], Colour]] = (),
+) -> Image.Image:
+    """A level as it is now, with its goal in a white frame, its mission and a caption.
+
+    Args:
+        adapter: of the level.
+        text: the caption.
+        ways: through cells, each drawn in another colour.
+        marked: cells in frames, and their colours.
+    """
+    env, tile = adapter.env, SIDE // adapter.side
+    level = Image.fromarray(env.grid.render(tile, tuple(env.agent_pos), env.agent_dir))
+    image = Image.new("RGB", (SIDE, SIDE + CAPTION), "white")
+    image.paste(level, (0, 0))
+    pen = ImageDraw.Draw(image)
+    goal = [(int(adapter.goal[0]), int(adapter.goal[1]))] if adapter.goal[0] >= 0 else []
+    for cells, colour in ((goal, WHITE), *marked):
+        for x, y in cells:
+            box = [x * tile, y * tile, (x + 1) * tile - 1, (y + 1) * tile - 1]
+            pen.rectangle(box, outline=colour, width=2)
+    for index, way in enumerate(ways):
+        colour = COLOURS[index % len(COLOURS)]
+        points = [((x + 0.5) * tile, (y + 0.5) * tile) for x, y in way]
+        if len(points) > 1:
+            pen.line(points, fill=colour, width=4, joint="curve")
+        last_x, last_y = points[-1]
+        pen.ellipse([last_x - 5, last_y - 5, last_x + 5, last_y + 5], fill=colour)
+    pen.text((4, SIDE + 2), env.mission[:60], fill="black")
+    pen.text((4, SIDE + 18), text, fill="black")
+    return image
+
+
+def spelled(actions: np.ndarray) -> str:
+    """A plan `[T]` in short."""
+    return " ".join(GLYPHS[int(action)] for action in actions)
+
+
+def way_of(adapter: BabyAIAdapter, actions: np.ndarray) -> list[Cell]:
+    """The cells that a plan leads through, found by playing it on a copy of the level."""
+    copied = copy.deepcopy(adapter.env)
+    cells = [agent_cell(copied)]
+    for action in actions:
+        if action >= END:  # or MASK, of a plan that is not complete yet
+            break
+        _, _, terminated, truncated, _ = copied.step(int(action))
+        cells.append(agent_cell(copied))
+        if terminated or truncated:
+            break
+    return cells

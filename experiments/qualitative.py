@@ -1,0 +1,215 @@
+"""Drawings of plans: `python -m experiments.qualitative --help`.
+
+The paper's two figures 'Qualitative Visualization'.
+
+Plans after N = 1, 5 and 10 iterations and what they lead to, of published planners; and what
+models of `experiments.properties` do in worlds that they were not trained in.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from PIL import Image
+from rich.console import Console
+
+from experiments import properties
+from experiments.babyai_drawing import Colour, picture, spelled, way_of
+from experiments.common import analysis, program, results, runtime
+from experiments.common.analysis import Way, Work
+from experiments.common.episodes import watched
+from experiments.common.interruption import Interruption
+from experiments.common.pictures import save_sheet
+from leapjax import pretrained
+from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.babyai.constraints import in_half
+from leapjax.babyai.levels import find_level
+from leapjax.babyai.observations import Cell, agent_cell
+from leapjax.data import seeds
+from leapjax.errors import UserError
+from leapjax.planners import GibbsConfig
+from leapjax.pretrained import Pretrained
+from leapjax.types import Plan
+
+FIGURES = ("plans", "properties")
+ITERATIONS = (1, 5, 10)
+STEPS = 10  # of an episode that is drawn, at least
+HALVES = ((255, 80, 80), (80, 255, 255))  # frames of obstacles that one model sees: red, cyan
+MOST_LEVELS, MOST_PLANS = 200, 30  # to look at, for one; and to draw
+# Tasks of the first figure: planning a trajectory, and completing an instruction.
+PLANNED = ("GoToObjMazeS4", "GoToSeqS5R2")
+# Cases of the second one, and which of their ways.
+ASKED = (
+    ("adaptation-medium", "whole plan"),
+    ("generalization-hard", "leap, open doors seen as empty"),
+    ("composition-easy", "sum"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Draw plans, and what comes of them."""
+
+    seed: int = 0
+    """Training seed, of what must be trained."""
+    test_seed: int = seeds.UNSEEN
+    """Level seed to look from for episodes to draw: the first that are long enough are taken."""
+    record: bool = False
+    """Write the figures of docs/, which are committed."""
+    runs: Path = Path("runs")
+    """Where what is trained, and figures that are not recorded, go."""
+
+
+class Drawn(NamedTuple):
+    """An episode: how its first plan came about, and where all of them led."""
+
+    level_seed: int
+    trace: np.ndarray  # [N, T] of the first plan
+    ways: Sequence[Sequence[Cell]]  # through the level, one of each plan
+    steps: int
+    outcome: str
+    adapter: BabyAIAdapter  # as it was left
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draws both figures; the exit code."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.stoppable(
+        "experiments.qualitative", given, lambda interruption: draw(options, interruption)
+    )
+
+
+def draw(options: Options, interruption: Interruption) -> None:
+    """Both figures."""
+    runtime.start()
+    work = Work(
+        properties.ANALYSIS,
+        analysis.Options(runs=options.runs),
+        results.versions(),
+        Console(),
+        interruption,
+    )
+    folder = Path("docs") if options.record else options.runs
+    refined = [each for level in PLANNED for each in refinement(level, options.test_seed)]
+    asked = [unlearned(work, *names, options) for names in ASKED]
+    sheets = (refined, 1 + len(ITERATIONS)), (asked, len(asked))
+    for name, (pictures, columns) in zip(FIGURES, sheets, strict=True):
+        path = folder / f"{name}.png"
+        save_sheet(pictures, columns, path)
+        work.console.print(f"wrote {path}", highlight=False)
+
+
+def refinement(level: str, first: int) -> list[Image.Image]:
+    """A plan of a published planner after some iterations of algorithm 1, and what came of it."""
+    planner = pretrained.load(level)
+    trained = planner.specification.planner
+    assert isinstance(trained, GibbsConfig)  # as all that are published
+    search = dataclasses.replace(trained, iterations=max(ITERATIONS), fill="together", resampled=1)
+
+    def make() -> BabyAIAdapter:
+        return BabyAIAdapter(find_level(level))
+
+    def plans_of(found: Drawn) -> tuple[BabyAIAdapter, list[list[Cell]]]:
+        """The level as it was at first, and where plans lead after more and more iterations."""
+        start = make()
+        start.reset(found.level_seed)
+        return start, [way_of(start, found.trace[n - 1]) for n in ITERATIONS]
+
+    def refined(found: Drawn) -> bool:
+        return all(before != after for before, after in pairwise(plans_of(found)[1]))
+
+    found = episode(make, analysis.asked(Way("refined"), [planner], search), None, first, refined)
+    start, ways = plans_of(found)
+    plans = [
+        picture(start, f"N = {n}: {spelled(found.trace[n - 1])}", [way])
+        for n, way in zip(ITERATIONS, ways, strict=True)
+    ]
+    return [*plans, executed(found)]
+
+
+def unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Image.Image:
+    """What models do in a world that they were not trained in."""
+    (case,) = (case for case in properties.CASES if case.name == case_name)
+    (way,) = (way for way in case.ways if way.name == way_name)
+    models = analysis.models_of(work, case, way.method, options.seed)
+    search = way.search(models[0].specification.planner)
+
+    def make() -> BabyAIAdapter:
+        return BabyAIAdapter(find_level(case.level))
+
+    planner = analysis.asked(way, models, search)
+    found = episode(make, planner, way.executed, options.test_seed)
+    halves: list[tuple[list[Cell], Colour]] = []
+    if case_name.startswith("composition"):  # who sees which obstacles
+        state = found.adapter.observe()
+        halves = [
+            ([(x, y) for x, y in np.argwhere(in_half(state.grid, state.goal, part))], colour)
+            for part, colour in enumerate(HALVES)
+        ]
+    return executed(found, case_name, halves)
+
+
+def executed(
+    found: Drawn, name: str = "", marked: Sequence[tuple[Sequence[Cell], Colour]] = ()
+) -> Image.Image:
+    """What came of an episode's plans, each in a colour of its own."""
+    plans = f"{len(found.ways)} plan{'s' * (len(found.ways) > 1)}"
+    text = f"{name}{': ' * bool(name)}{plans}, {found.steps} steps, {found.outcome}"
+    return picture(found.adapter, text, found.ways, marked)
+
+
+def episode(
+    make: Callable[[], BabyAIAdapter],
+    planner: Pretrained,
+    limit: int | None,
+    first: int,
+    wanted: Callable[[Drawn], bool] = lambda found: True,
+) -> Drawn:
+    """The first episode of some length that is wanted.
+
+    Args:
+        make: makes the level.
+        planner: for it.
+        limit: actions of each plan that are executed; None for all.
+        first: level seed to look from.
+        wanted: whether to draw it.
+
+    Raises:
+        UserError: there is none among many.
+    """
+    for level_seed in range(first, first + MOST_LEVELS):
+        found = played(make(), planner, limit, level_seed)
+        if found.steps >= STEPS and wanted(found):
+            return found
+    raise UserError(f"--test-seed {first}: none of {MOST_LEVELS} episodes is worth a drawing")
+
+
+def played(
+    adapter: BabyAIAdapter, planner: Pretrained, limit: int | None, level_seed: int
+) -> Drawn:
+    """One episode."""
+    traces: list[np.ndarray] = []
+    ways: list[list[Cell]] = []
+    steps, outcome = 0, "gave up"
+    length = planner.specification.context
+    for event in watched(adapter, planner, length, level_seed, executed=limit, most=MOST_PLANS):
+        if isinstance(event, Plan):
+            traces.append(np.asarray(event.trace[0]))
+            ways.append([agent_cell(adapter.env)])
+            continue
+        _, transition = event
+        ways[-1].append(agent_cell(adapter.env))
+        over = transition.terminated or transition.truncated
+        outcome = ("success" if transition.success else "failed") if over else "not finished"
+        steps += 1
+    return Drawn(level_seed, traces[0], ways, steps, outcome, adapter)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

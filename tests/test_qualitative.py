@@ -1,0 +1,79 @@
+"""Drawings of plans: episodes that are watched, and the program at toy size."""
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import qualitative
+from experiments.babyai_drawing import COLOURS, picture, way_of
+from experiments.common.episodes import watched
+from leapjax import pretrained, rollouts
+from leapjax.babyai.adapter import END, BabyAIAdapter
+from leapjax.babyai.levels import find_level
+from leapjax.babyai.observations import agent_cell
+from leapjax.types import Plan
+from tests.programs import untrained_run
+
+LEVEL = find_level("GoToLocalS7N5")
+FORWARD, RIGHT = 2, 1
+
+
+@pytest.fixture(scope="module")
+def planner(tmp_path_factory):
+    return pretrained.load(untrained_run(tmp_path_factory.mktemp("run")), chunk_sizes=(8,))
+
+
+@pytest.mark.parametrize("executed", [None, 2])
+def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
+    seeds = range(5)
+    played = rollouts.evaluate(
+        lambda: BabyAIAdapter(LEVEL), seeds, planner.plan, planner.params, context=0,
+        seed=3, executed=executed,
+    )  # fmt: skip
+    plans = 0
+    for row, level_seed in enumerate(seeds):
+        adapter = BabyAIAdapter(LEVEL)
+        events = list(watched(adapter, planner, 0, level_seed, seed=3, executed=executed))
+        steps = [event for event in events if not isinstance(event, Plan)]
+        plans += len(events) - len(steps)
+        assert len(steps) == played.lengths[row]
+        succeeded = bool(steps) and steps[-1][1].success
+        assert succeeded == played.successes[row]
+        several = list(watched(adapter, planner, 0, level_seed, 3, executed, most=1))
+        assert jax.tree.all(jax.tree.map(np.array_equal, several[0], events[0]))
+        assert sum(isinstance(event, Plan) for event in several) == 1
+    assert plans == played.plans
+
+
+def test_a_way_is_what_a_plan_would_do_and_is_drawn():
+    adapter = BabyAIAdapter(LEVEL)
+    adapter.reset(0)
+    turns = next(n for n in range(4) if len(set(way_of(adapter, [RIGHT] * n + [FORWARD]))) == 2)
+    plan = [RIGHT] * turns + [FORWARD, END, FORWARD]
+    before = agent_cell(adapter.env)
+    cells = way_of(adapter, plan)
+    assert agent_cell(adapter.env) == before == cells[0]  # nothing was done
+    for action in plan[: turns + 1]:
+        adapter.step(action)
+    assert agent_cell(adapter.env) == cells[-1] and len(cells) == turns + 2
+    plain = np.asarray(picture(adapter, "text"))
+    drawn = np.asarray(picture(adapter, "text", [cells]))
+    changed = drawn[(plain != drawn).any(axis=-1)]
+    assert len(changed) > 30 and (changed == COLOURS[0]).all()
+
+
+def test_both_figures_are_drawn(tmp_path, monkeypatch):
+    untrained = pretrained.load(untrained_run(tmp_path, "--level", "GoToBehindObstacles"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(qualitative, "STEPS", 0)  # any episode will do
+    monkeypatch.setattr(qualitative, "ITERATIONS", (2,))
+    monkeypatch.setattr(qualitative, "PLANNED", ("GoToLocalS7N5",))
+    monkeypatch.setattr(qualitative, "ASKED", (("composition-easy", "sum"),))
+    monkeypatch.setattr(qualitative.analysis, "models_of", lambda *_: [untrained, untrained])
+    assert qualitative.main(["--test-seed", "0"]) == 0
+    refined, asked = (Image.open(tmp_path / "runs" / f"{name}.png") for name in qualitative.FIGURES)
+    assert refined.size == (2 * 336, 370) and asked.size == (336, 370)
+    frames = np.asarray(asked).reshape(-1, 3)
+    for colour in qualitative.HALVES:  # who sees what
+        assert (frames == colour).all(axis=1).any()
