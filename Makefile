@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: babyai test test-long lint clean
+.PHONY: babyai test test-long lint package clean
 
 # The main job: train LEAP on a BabyAI level and report its success beside the paper's.
 # More options: make babyai ARGS="--level all".
@@ -26,10 +26,19 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Wheel and sdist in dist/, checked; the wheel, unpacked on its own, must do what the README says.
+package: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[release]'
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist . > /dev/null
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python -m pip install --quiet --no-deps --target dist/site dist/*.whl
+	cd dist && PYTHONPATH=site ../$(BIN)/python ../tests/wheel.py ../README.md site
+
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $(READY)
 
 clean:
-	rm -rf .venv
+	rm -rf .venv dist

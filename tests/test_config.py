@@ -2,9 +2,11 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import pytest
 
+import experiments.__main__ as programs
 from experiments.common import config
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from leapjax import checkpoints, domains, pretrained
@@ -104,3 +106,14 @@ def test_all_levels_are_those_of_the_paper():
     assert [each.level for each in found] == list(BABYAI.levels)
     assert {each.demos for each in found} == {9}
     assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
+
+
+def test_every_program_is_known_by_name(capsys):
+    assert programs.main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {name} " in shown for name in programs.PROGRAMS)
+    modules = {path.stem for path in Path(programs.__file__).parent.glob("*.py")}
+    assert set(programs.PROGRAMS) <= modules
+    assert programs.main(["babyia"]) == 2
+    assert "did you mean babyai" in capsys.readouterr().err
+    assert programs.main(["properties", "--only", "nothing"]) == 2  # what follows is handed on

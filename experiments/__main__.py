@@ -1,0 +1,34 @@
+"""All programs by name: `python -m experiments NAME`; once installed, `leapjax NAME`."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from experiments.common import program
+from leapjax.errors import did_you_mean
+
+# In the order in which someone new meets them; what they do is the first line of each.
+PROGRAMS = (
+    "babyai", "stars", "sudoku", "properties", "stochastic", "suboptimal", "ablation", "landscape",
+    "qualitative", "accuracy", "failures",
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the program that comes first with all that follows it; the exit code."""
+    name, *rest = program.arguments_of(arguments) or ["--help"]
+    if name in ("-h", "--help"):
+        print("usage: leapjax NAME [OPTIONS]; leapjax NAME --help says which\n")
+        for each in PROGRAMS:
+            said = (importlib.import_module(f"experiments.{each}").__doc__ or "").splitlines()[0]
+            print(f"  {each:12} {said.split(': `')[0]}")
+        return 0
+    if name not in PROGRAMS:
+        expected = f"expected one of {', '.join(PROGRAMS)}{did_you_mean(name, PROGRAMS)}"
+        print(f"error: unknown program {name!r}: {expected}", file=sys.stderr)
+        return 2
+    return importlib.import_module(f"experiments.{name}").main(rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

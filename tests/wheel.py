@@ -1,0 +1,20 @@
+"""What an installed wheel must do, away from its checkout; `make package` runs it."""
+
+import re
+import sys
+from pathlib import Path
+
+import experiments.__main__
+import leapjax
+
+readme, site = Path(sys.argv[1]), Path(sys.argv[2]).resolve()
+for package in (leapjax, experiments):
+    assert Path(package.__file__).is_relative_to(site), package.__file__
+assert (Path(leapjax.__file__).parent / "py.typed").exists()
+names: dict = {}
+for snippet in re.findall(r"```python\n(.*?)```", readme.read_text(), flags=re.DOTALL):
+    exec(compile(snippet, "README.md", "exec"), names)
+assert names["plans"].satisfied.all()
+assert experiments.__main__.main(["--help"]) == 0
+options = ["--level", "GoToLocalS7N5", "--pretrained", "--episodes", "5", "--no-pictures"]
+assert experiments.__main__.main(["babyai", *options]) == 0
