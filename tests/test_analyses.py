@@ -94,7 +94,7 @@ def test_rows_are_named_by_all_that_matters():
 
 
 def test_options_of_a_method_are_for_it_alone_and_for_ours():
-    model = case_of("generalization-hard").models[0]
+    model = case_of("generalization-easy").models[0]
 
     def settings(method, preset="leapjax"):
         options = Options(preset=preset)
