@@ -3,10 +3,13 @@
 from leapjax.babyai.domain import BABYAI
 from leapjax.domain import DomainType
 from leapjax.errors import UserError
+from leapjax.gymnasium.domain import GYMNASIUM
 from leapjax.stars.domain import STARS
 from leapjax.sudoku.domain import SUDOKU
 
-DOMAINS: dict[str, DomainType] = {"babyai": BABYAI, "stars": STARS, "sudoku": SUDOKU}
+DOMAINS: dict[str, DomainType] = {
+    "babyai": BABYAI, "stars": STARS, "sudoku": SUDOKU, "gymnasium": GYMNASIUM,
+}  # fmt: skip
 
 
 def find_domain(name: str) -> DomainType:

@@ -47,7 +47,7 @@ class Config(Generic[M, D, P]):
     seeds: tuple[int, ...] = (0,)
     """Training seeds; each draws its own demonstrations."""
     demos: int = 500
-    """Demonstrations to train on."""
+    """Demonstrations to train on; of a data set that is given, all that it has if it has fewer."""
     demonstrations: str | None = None
     """Id of a Minari data set to train on instead of those that the domain makes; --level follows
     from it where it says of what it is."""
@@ -146,6 +146,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
         first.add_argument(name)
+    first.add_argument("--demos")
     first.add_argument("--pretrained", action="store_true")
     chosen, _ = first.parse_known_args(list(arguments))
     folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
@@ -167,6 +168,11 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
         every = [other for other in METHODS if METHODS[other].everywhere]
         for one in every if method == "all" else [method]:
             default = preset(domain, each, one, name)
+            if chosen.demonstrations and chosen.demos is None:  # as many as there are
+                count = storage.episodes_in(chosen.demonstrations)
+                default = dataclasses.replace(
+                    default, demos=min(default.demos, count or default.demos)
+                )
             if trained and (trained.domain, trained.method) == (domain, one):
                 default = _as_trained(default, trained)
             given = _parse(arguments, default)

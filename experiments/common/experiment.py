@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -79,7 +80,8 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
 
 def run_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:
     """Where a run leaves what it makes."""
-    of = f"{config.level}-{config.method}-{config.preset}-seed{seed}"
+    level = re.sub(r"[^\w.-]", "-", config.level)  # ids of environments may have a slash
+    of = f"{level}-{config.method}-{config.preset}-seed{seed}"
     label = f"{experiment.name}-{of}-{configuration_hash(config, seed)}"
     return config.runs / ("evaluations" if config.checkpoint else "") / label
 

@@ -254,11 +254,24 @@ def _demonstration(
 def level_of(name: str) -> str | None:
     """The id of the environment that a data set was recorded in, if it says so."""
     try:
-        text = (datasets_folder() / name / "data" / "metadata.json").read_text(encoding="utf-8")
-        recorded = json.loads(json.loads(text)["env_spec"])["id"]
+        recorded = json.loads(_metadata(name)["env_spec"])["id"]
     except (OSError, ValueError, KeyError, TypeError):
         return None  # what is wrong with it is said when it is loaded
     return recorded if isinstance(recorded, str) else None
+
+
+def episodes_in(name: str) -> int | None:
+    """How many episodes a data set says that it has."""
+    try:
+        count = _metadata(name)["total_episodes"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return count if isinstance(count, int) and count > 0 else None
+
+
+def _metadata(name: str) -> Any:
+    path = datasets_folder() / name / "data" / "metadata.json"
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _inspect(folder: Path) -> None:

@@ -1,0 +1,160 @@
+"""Any Gymnasium environment with discrete actions as a `Domain`, with data from Minari."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import flax.linen as nn
+import gymnasium as gym
+import jax
+import numpy as np
+
+from leapjax.domain import Collection, Domain, DomainType
+from leapjax.environments import GymnasiumAdapter, Transition
+from leapjax.errors import UserError, check_at_least, did_you_mean, first_line
+from leapjax.gymnasium.observations import StateTokens, blank_of, parts_of
+from leapjax.models.trajectory import ModelConfig
+from leapjax.types import PyTree
+
+R = TypeVar("R")
+EXAMPLES = ("CartPole-v1",)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What an environment does not always say of itself."""
+
+    success_return: float | None = None  # of an episode that succeeds; None: what its authors
+    # say, or a positive reward at its end where they say nothing
+    max_steps: int | None = None  # of an episode; None: what its authors say
+
+    def __post_init__(self) -> None:
+        if self.max_steps is not None:
+            check_at_least(self, 1, "max_steps")
+
+
+class CheckedAdapter(GymnasiumAdapter):
+    """An environment of whom it may concern: what goes wrong in it is said in one line."""
+
+    def __init__(self, env: gym.Env, name: str, blank: PyTree, threshold: float | None) -> None:
+        super().__init__(env)
+        self._name, self._blank, self._threshold = name, blank, threshold
+        self._return = 0.0
+
+    def reset(self, seed: int) -> PyTree:
+        """Starts the episode of a seed."""
+        self._return = 0.0
+        return self._checked(
+            self._guarded("reset", lambda: super(CheckedAdapter, self).reset(seed))
+        )
+
+    def step(self, action: int) -> Transition:
+        """Takes one action."""
+        found = self._guarded("step", lambda: super(CheckedAdapter, self).step(action))
+        self._return += found.reward
+        success = found.success
+        if self._threshold is not None:
+            over = found.terminated or found.truncated
+            success = over and self._return >= self._threshold
+        return found._replace(observation=self._checked(found.observation), success=success)
+
+    def _guarded(self, what: str, work: Callable[[], R]) -> R:
+        try:
+            return work()
+        except Exception as error:  # it is anybody's code
+            raise UserError(
+                f"{what} of {self._name} raised {type(error).__name__}: {first_line(error)}"
+            ) from error
+
+    def _checked(self, observation: Any) -> PyTree:
+        expected = jax.tree.map(np.shape, self._blank)
+        if isinstance(observation, dict):
+            observation = dict(observation)
+        shapes = jax.tree.map(np.shape, observation)
+        if shapes != expected:
+            raise UserError(
+                f"{self._name} gave an observation of shape {shapes}; its observation space says "
+                f"{expected}"
+            )
+        return jax.tree.map(lambda x, like: np.asarray(x, like.dtype), observation, self._blank)
+
+
+def make_environment(name: str, options: Settings) -> gym.Env:
+    """An environment by its id, or by `module:id`, cut off after `max_steps`.
+
+    Raises:
+        UserError: it cannot be made, or an episode may never end.
+    """
+    try:
+        env = gym.make(name, max_episode_steps=options.max_steps)
+    except Exception as error:  # noqa: BLE001  (it is anybody's code)
+        hint = did_you_mean(name, gym.registry)
+        raise UserError(
+            f"the environment {name!r} cannot be made: {first_line(error)}{hint}"
+        ) from None
+    if _longest(env) is None:
+        raise UserError(
+            f"{name} has no limit of steps, so an episode may never end: give it one with "
+            "--max-steps"
+        )
+    return env
+
+
+def _longest(env: gym.Env) -> int | None:
+    return env.spec.max_episode_steps if env.spec is not None else None
+
+
+def make(name: str, options: Settings) -> Domain:
+    """An environment by its id; it is made once, to look at it.
+
+    Raises:
+        UserError: it cannot be made, or its spaces cannot be used.
+    """
+    env = make_environment(name, options)
+    actions = env.action_space
+    if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
+        raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
+    space = env.observation_space
+    blank, parts = blank_of(space, f"the observation of {name}"), parts_of(space)
+    threshold = options.success_return
+    if threshold is None and env.spec is not None:
+        threshold = env.spec.reward_threshold
+
+    def tokens(num_actions: int, model: ModelConfig, context: int) -> nn.Module:
+        del context
+        return StateTokens(parts, model.width, num_actions, model.dtype)
+
+    return Domain(
+        level=name,
+        make_adapter=lambda: CheckedAdapter(
+            make_environment(name, options), name, blank, threshold
+        ),
+        collect=functools.partial(collect, name),
+        actions=(*(str(action) for action in range(actions.n)), "end"),
+        max_steps=_longest(env) or 0,
+        blank=blank,
+        encoders={
+            "paper": functools.partial(tokens, 0),  # it embeds actions itself
+            "leapjax": functools.partial(tokens, int(actions.n) + 1),
+        },
+        signature={"parts": [list(part) for part in parts]},
+    )
+
+
+def collect(name: str, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
+    """There is no demonstrator of an environment that nobody here knows.
+
+    Raises:
+        UserError: always.
+    """
+    raise UserError(f"{name} has no demonstrator: name a Minari data set of it with --dataset")
+
+
+def preset(name: str, preset: str) -> Mapping[str, Any]:
+    """What a preset sets for an environment: act, and look again."""
+    del name, preset
+    return {"horizon": 5, "iterations": 5, "executed": 1, "steps": 2000, "episodes": 100}
+
+
+GYMNASIUM = DomainType(Settings, make, EXAMPLES, preset)

@@ -1,0 +1,189 @@
+"""Environments of one's own: what they may look like, what goes wrong, the program at toy size."""
+
+import warnings
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari import DataCollector
+
+from experiments import gymnasium as program
+from experiments.common import config, results
+from leapjax import domains
+from leapjax.domain import blank_context
+from leapjax.errors import UserError
+from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
+from leapjax.gymnasium.observations import Part, StateTokens, blank_of, parts_of
+from tests.programs import SMALL
+
+WAY = 5
+
+
+class Corridor(gym.Env):
+    """Go right until the end; what is seen is a picture, a number, and a choice."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Dict(
+        picture=spaces.Box(0, 255, (WAY, 3, 3), np.uint8),
+        here=spaces.Box(-np.inf, np.inf, (2,)),
+        lamp=spaces.Discrete(3),
+    )
+    trouble = ""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0
+        return self.seen(), {}
+
+    def seen(self):
+        picture = np.zeros((WAY, 3, 3), np.uint8)
+        picture[self.place] = 200
+        here = np.array([self.place, 0.01], np.float32)
+        return {"picture": picture, "here": here, "lamp": self.place % 3}
+
+    def step(self, action):
+        if self.trouble == "raises":
+            raise RuntimeError("the lamp\nis broken")
+        self.place = max(0, self.place + 2 * int(action) - 1)
+        seen, over = self.seen(), self.place == WAY - 1
+        if self.trouble == "grows":
+            seen["here"] = np.zeros(3, np.float32)
+        return seen, float(over), over, False, {}
+
+
+class Raises(Corridor):
+    trouble = "raises"
+
+
+class Grows(Corridor):
+    trouble = "grows"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered():
+    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows}
+    for name, kind in kinds.items():
+        gym.register(f"{name}-v0", f"tests.test_gymnasium:{kind.__name__}", max_episode_steps=12)
+    gym.register("Endless-v0", "tests.test_gymnasium:Corridor")
+    yield
+    for name in (*kinds, "Endless"):
+        del gym.registry[f"{name}-v0"]
+
+
+def recorded(name, level, policy, episodes):
+    """A data set of a policy, as Minari's collector writes it."""
+    env = DataCollector(gym.make(level, disable_env_checker=True), jpeg_encoding=False)
+    for seed in range(episodes):
+        seen, _ = env.reset(seed=seed)
+        over = False
+        while not over:
+            seen, _, terminated, truncated, _ = env.step(policy(seen))
+            over = terminated or truncated
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env.create_dataset(name)
+    env.close()
+    return name
+
+
+def test_spaces_become_blank_observations_and_parts():
+    space = Corridor.observation_space
+    blank = blank_of(space, "it")
+    assert [leaf.shape for leaf in jax.tree.leaves(blank)] == [(2,), (), (WAY, 3, 3)]
+    assert parts_of(space) == (Part("numbers"), Part("choices", 3), Part("image"))
+    several = spaces.MultiDiscrete([4, 9], start=[1, 1])
+    assert parts_of(several) == (Part("choices", 10),) and blank_of(several, "it").shape == (2,)
+    assert parts_of(spaces.MultiBinary(3)) == (Part("numbers"),)
+    with pytest.raises(UserError, match=r"it\['said'\] is a Text: expected Box"):
+        blank_of(spaces.Dict(said=spaces.Text(5)), "it")
+
+
+def test_a_state_is_a_token_and_its_parts_are_read():
+    domain = make("Corridor-v0", Settings())
+    context = jax.tree.map(jnp.asarray, blank_context(domain, 2))
+    for num_actions in (0, 3):
+        module = StateTokens(parts_of(Corridor.observation_space), 8, num_actions)
+        params = module.init(jax.random.key(0), context)
+        tokens = module.apply(params, context)
+        assert tokens.shape == (3, 8)
+        for field, value in {"here": [0.0, 0.5], "lamp": 2, "picture": 9}.items():
+            seen = {**context.observation}
+            seen[field] = jnp.full_like(seen[field], jnp.asarray(value))
+            changed = module.apply(params, context._replace(observation=seen))
+            np.testing.assert_allclose(changed[:-1], tokens[:-1], atol=1e-6)
+            assert np.abs(changed[-1] - tokens[-1]).max() > 1e-3, field
+        acted = module.apply(params, context._replace(actions=jnp.array([0, 1])))
+        assert bool(jnp.any(acted != tokens)) == bool(num_actions)
+
+
+def test_success_is_what_the_environment_says_or_the_user():
+    def play(domain, actions):
+        adapter = domain.make_adapter()
+        adapter.reset(0)
+        return [adapter.step(action).success for action in actions]
+
+    assert play(make("Corridor-v0", Settings()), [1] * 4) == [False] * 3 + [True]
+    assert play(make("Corridor-v0", Settings(success_return=2.0)), [1] * 4) == [False] * 4
+    # CartPole's authors ask for a return of 475: to fall is no success, though it is rewarded.
+    assert not any(play(make("CartPole-v1", Settings()), [0] * 11))
+    assert any(play(make("CartPole-v1", Settings(success_return=5.0)), [0] * 11))
+    short = make("Corridor-v0", Settings(max_steps=2))
+    assert short.max_steps == 2 and make("Endless-v0", Settings(max_steps=7)).max_steps == 7
+    adapter = short.make_adapter()
+    adapter.reset(0)
+    assert [adapter.step(0).truncated for _ in range(2)] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("level", "says"),
+    [
+        ("CartPol-v1", "cannot be made: .*; did you mean CartPole-v1"),
+        ("no_such_module:Own-v0", "cannot be made: .*no_such_module"),
+        ("Pendulum-v1", "has actions Box.*: expected Discrete"),
+        ("Endless-v0", "no limit of steps, so an episode may never end: .*--max-steps"),
+    ],
+)
+def test_environments_that_cannot_be_used_are_one_line(level, says, capsys):
+    with pytest.raises(UserError, match=says):
+        make(level, Settings())
+    assert program.main(["--env", level]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("level", "says"),
+    [
+        ("Raises-v0", "step of Raises-v0 raised RuntimeError: the lamp"),
+        ("Grows-v0", "gave an observation of shape .*its observation space says"),
+    ],
+)
+def test_environments_that_go_wrong_are_one_line(level, says, tmp_path, monkeypatch, capsys):
+    adapter = make(level, Settings()).make_adapter()
+    adapter.reset(0)
+    with pytest.raises(UserError, match=says):
+        adapter.step(1)
+    monkeypatch.chdir(tmp_path)
+    random = "--method random --demos 0 --episodes 2 --no-pictures".split()
+    assert program.main(["--env", level, *random]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_without_data_it_says_what_is_missing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert program.main(["--env=Corridor-v0", *SMALL, "--steps", "1"]) == 2
+    assert "Corridor-v0 has no demonstrator: name a Minari data set" in capsys.readouterr().err
+
+
+def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 4)
+    (chosen,) = config.parse("gymnasium", ["--demonstrations", name])
+    assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # as the data say
+    options = [*SMALL, "--horizon", "3", "--context", "1", "--steps", "40"]
+    assert program.main(["--dataset", name, *options]) == 0
+    (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
+    assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
+    assert domains.find_domain("gymnasium") is GYMNASIUM
