@@ -30,6 +30,7 @@ from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
 from leapjax.planners import GibbsConfig, PlannerConfig
 from leapjax.pretrained import Pretrained
+from leapjax.rollouts import Episodes
 from leapjax.types import Energy
 
 
@@ -212,19 +213,20 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     missing = [name for name in ways if name not in rows]
     models = models_of(work, case, method, seed) if missing else []
     for name in missing:
+        said, episodes = play(case, ways[name], models, seed, options, work.interruption)
         row = {
             "experiment": analysis.name,
             "hash": name,
             "trained": [configuration_hash(each, seed) for each in settings],
             "versions": work.versions,
-            **play(case, ways[name], models, seed, options, work.interruption),
+            **said,
         }
-        results.record(work.rows, row)
+        results.record(work.rows, row, episodes)
         rows[name] = row
     for name, way in ways.items():
         before = "" if name in missing else ", recorded already"
-        said = f"{case.name}, {way.name}: {results.percent(rows[name])}{before}"
-        work.console.print(said, highlight=False)
+        line = f"{case.name}, {way.name}: {results.percent(rows[name])}{before}"
+        work.console.print(line, highlight=False)
     return [rows[name] for name in ways]
 
 
@@ -283,8 +285,8 @@ def play(
     seed: int,
     options: Options,
     interruption: Interruption,
-) -> Row:
-    """What one way of asking gives."""
+) -> tuple[Row, Episodes]:
+    """What one way of asking gives, and its episodes."""
     specification = models[0].specification
     search = way.search(specification.planner)
     kind = configs.find_domain(specification.domain)
@@ -295,7 +297,7 @@ def play(
         adapters.append(case.adapter(case.level) if case.adapter else domain.make_adapter())
         return adapters[-1]
 
-    def episodes(config: PlannerConfig) -> rollouts.Episodes:
+    def episodes(config: PlannerConfig) -> Episodes:
         planner = asked(way, models, config)
         run.warm_up(planner, domain, options.episodes)
         adapters.clear()
@@ -312,7 +314,7 @@ def play(
     found = episodes(search)
     violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
     good = found.lengths[found.successes]
-    return {
+    row = {
         "domain": specification.domain,
         "level": case.level,
         "case": case.name,
@@ -339,6 +341,7 @@ def play(
         "paper_success": way.paper,
         "date": results.today(),
     }
+    return row, found
 
 
 def rows_of_way(

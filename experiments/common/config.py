@@ -12,6 +12,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import jax
 import tyro
 
+from experiments.common import loggers
 from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
@@ -77,6 +78,8 @@ class Config(Generic[M, D, P]):
     """Where checkpoints, metrics, plots and unrecorded rows go."""
     pictures: bool = True
     """Draw the plots and the animation."""
+    loggers: tuple[str, ...] = ()
+    """Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says more)."""
     checkpoint_seconds: float = 30.0
     """Save the training state this often: what a killed run can lose at most."""
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
@@ -89,7 +92,7 @@ AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
 # What a result does not depend on, or what its row holds on its own.
 _NOT_HASHED = (
     "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
-    "checkpoint_seconds", "cluster",
+    "checkpoint_seconds", "cluster", "loggers",
 )  # fmt: skip
 
 
@@ -222,6 +225,7 @@ def check(config: AnyConfig) -> None:
     episode_seeds(config)
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
+    loggers.check(config.loggers)
     if not config.checkpoint_seconds >= 0:
         raise UserError(f"--checkpoint-seconds must be at least 0, got {config.checkpoint_seconds}")
     if config.context < 0:

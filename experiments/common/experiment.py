@@ -129,6 +129,8 @@ def run_one(
         )
     metrics: run.Metrics = []
     with contextlib.ExitStack() as stack:
+        if processes.is_first():
+            this = run.with_loggers(this, name, stack)
         if config.checkpoint is not None:
             planner = run.reuse(this, config.checkpoint)
         else:
@@ -136,9 +138,13 @@ def run_one(
         planner = run.with_rules(planner, this)
         episodes = run.measure(planner, this, played)
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
+        measured = {"success": row["successes"] / row["episodes"], "return": row["mean_return"]}
+        measured["length"] = row["mean_length"]
+        of = {f"evaluation/{what}": value for what, value in measured.items()}
+        this.log(config.training.steps, of)
 
         def write() -> None:
-            results.record(rows, row)
+            results.record(rows, row, episodes)
             if config.pictures:
                 run.draw(planner, this, played, metrics)
                 if experiment.animate is not None:

@@ -20,9 +20,10 @@ import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
 
-from experiments.common import plots
-from experiments.common.config import AnyConfig
+from experiments.common import loggers, plots
+from experiments.common.config import AnyConfig, resolved
 from experiments.common.interruption import Interruption
+from experiments.common.loggers import About, Log
 from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
 from leapjax.agents import learning
@@ -56,6 +57,7 @@ class Run:
     folder: Path
     console: Console
     interruption: Interruption
+    log: Log = loggers.nowhere
     # Where the time went, filled in by each step.
     seconds: dict[str, float] = dataclasses.field(
         default_factory=lambda: {"demos": 0.0, "compile": 0.0, "train": 0.0, "eval": 0.0}
@@ -65,6 +67,19 @@ class Run:
     def seed(self) -> int:
         """The training seed."""
         return self.specification.origin.seed
+
+
+def with_loggers(run: Run, name: str, stack: contextlib.ExitStack) -> Run:
+    """A run whose measurements go to the loggers that are asked for, until a stack is closed."""
+
+    def about() -> About:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        before = read_metrics(run.folder)
+        done = int(before[-1]["step"]) if before else 0
+        return About(run.folder, name, resolved(run.config, run.seed), done)
+
+    log = stack.enter_context(loggers.opened(run.config.loggers, about))
+    return dataclasses.replace(run, log=log)
 
 
 class Programs(NamedTuple):
@@ -219,6 +234,7 @@ def fit(
             elapsed = time.perf_counter() - begun
             seen = watch(agent.energy, now.params) if watch else {}
             metrics.append({"step": done, "seconds": before + elapsed, **means, **seen})
+            run.log(done, {f"training/{name}": value for name, value in (means | seen).items()})
             meter.update(done, " ".join(f"{name} {mean:.3g}" for name, mean in means.items()))
             due = time.perf_counter() - last_saved > config.checkpoint_seconds
             # Processes have their own clocks and signals, and must agree on what to do.

@@ -1,0 +1,41 @@
+"""A planner that comes with the library is forbidden to turn left: nothing is trained."""
+
+import sys
+
+import jax.numpy as jnp
+
+import leapjax as leap
+from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.babyai.levels import find_level
+
+LEVEL, EPISODES = "GoToLocalS7N5", int(sys.argv[1]) if len(sys.argv) > 1 else 100
+LEFT = ACTIONS.index("left")
+
+
+def left_turns(context, actions):  # a penalty: 0 where a plan is allowed
+    return 20.0 * jnp.sum(actions == LEFT)
+
+
+class Counting(BabyAIAdapter):
+    """Counts what the planner was asked not to do."""
+
+    lefts = 0
+
+    def step(self, action):
+        """Takes one action."""
+        Counting.lefts += action == LEFT
+        return super().step(action)
+
+
+planner = leap.load(LEVEL)
+energies = {
+    "as it is": planner.energy,
+    "without left turns": leap.constrain(planner.energy, left_turns, partial=True),
+}
+for name, energy in energies.items():
+    Counting.lefts = 0
+    plan = leap.compile_planner(energy, planner.specification.planner)
+    played = leap.evaluate(
+        lambda: Counting(find_level(LEVEL)), range(EPISODES), plan, planner.params, context=0
+    )
+    print(f"{name}: success {played.successes.mean():.0%}, {Counting.lefts} left turns")

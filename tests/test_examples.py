@@ -1,0 +1,28 @@
+"""The examples do what they say."""
+
+import re
+import runpy
+import sys
+
+import pytest
+
+from tests.programs import ROOT
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "says"),
+    [
+        ("plan_with_my_energy", [], r"(9\d|100)% of 256 plans keep to the constraint"),
+        ("train_on_my_data", ["2", "1"], r"mean return \d+, success \d+%"),
+        ("add_a_constraint", ["4"], r"without left turns: success \d+%, 0 left turns"),
+    ],
+)
+def test_an_example_runs(name, arguments, says, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+    assert re.search(says, capsys.readouterr().out)
+
+
+def test_every_example_is_tried():
+    marks = test_an_example_runs.pytestmark[0].args[1]
+    assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {mark[0] for mark in marks}

@@ -1,0 +1,110 @@
+"""Where measurements go, and what is kept of every episode."""
+
+import csv
+import struct
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.common import config, experiment, loggers, results
+from leapjax import domains, scores
+from leapjax.errors import UserError
+from tests.frozen_lake import FROZEN_LAKE
+from tests.programs import LAKE, SMALL
+
+TRAINED = [*SMALL, "--demos", "3", "--steps", "4"]
+
+
+def events(folder):
+    """All that TensorBoard's files hold: (name, step, value)."""
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
+    found = []
+    for path in sorted(folder.iterdir()):
+        data, place = path.read_bytes(), 0
+        while place < len(data):  # length, its checksum, record, its checksum
+            (length,) = struct.unpack("<Q", data[place : place + 8])
+            event = event_pb2.Event.FromString(data[place + 12 : place + 12 + length])
+            found += [(v.tag, event.step, v.simple_value) for v in event.summary.value]
+            place += length + 16
+    return found
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(domains.DOMAINS, LAKE.domain, FROZEN_LAKE)
+    return tmp_path
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """What Weights & Biases was given, in its place."""
+    heard = SimpleNamespace(begun=[], logged=[], finished=0)
+
+    def init(**options):
+        heard.begun.append(options)
+        return SimpleNamespace(
+            log=lambda values, step: heard.logged.append((step, values)), finish=finish
+        )
+
+    def finish():
+        heard.finished += 1
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    return heard
+
+
+def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch):
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    arguments = [*TRAINED, "--loggers", "tensorboard", "wandb", "--record"]
+    assert experiment.main(LAKE, arguments) == 0
+    (row,) = results.read(workplace / "results" / "lake.jsonl")
+    (folder,) = (path for path in (workplace / "runs").iterdir() if path.is_dir())
+    ((_, values), (last, measured)) = sent.logged
+    assert last == 4 and measured["evaluation/success"] == row["successes"] / row["episodes"]
+    (metrics,) = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
+    assert values["training/loss"] == pytest.approx(float(metrics["loss"]))
+    (begun,) = sent.begun
+    assert begun["mode"] == "offline" and begun["id"] == row["hash"] and sent.finished == 1
+    assert begun["config"]["training"]["steps"] == 4
+    everything = {**values, **measured}
+    assert {name: value for name, step, value in events(folder / "tensorboard") if step == 4} == (
+        pytest.approx(everything)
+    )
+    # The logger is no part of a result's name.
+    plain, logged = (config.parse("frozen_lake", more) for more in (TRAINED, arguments[:-1]))
+    assert config.configuration_hash(plain[0], 0) == config.configuration_hash(logged[0], 0)
+
+    played = list(
+        csv.DictReader(
+            (results.episodes_path(workplace / "results" / "lake.jsonl", row["hash"]))
+            .read_text()
+            .splitlines()
+        )
+    )
+    assert [int(one["seed"]) for one in played] == [10_000_000 + i for i in range(3)]
+    good = sum(int(one["success"]) for one in played)
+    assert scores.wilson_interval(good, len(played)) == (
+        scores.wilson_interval(row["successes"], row["episodes"])
+    )
+    assert sum(float(one["return"]) for one in played) / 3 == pytest.approx(row["mean_return"])
+    assert sum(int(one["length"]) for one in played) / 3 == pytest.approx(row["mean_length"])
+
+
+def test_a_run_that_goes_on_says_where_it_began(tmp_path, sent, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "online")  # asked for
+    about = loggers.About(tmp_path, "abc", {}, 40)
+    with loggers.opened(["wandb", "tensorboard"], lambda: about) as log:
+        assert not sent.begun  # with the first value, and not before
+        log(60, {"training/loss": 0.5})
+    assert sent.begun[0]["mode"] == "online" and sent.begun[0]["resume"] == "allow"
+    assert events(tmp_path / "tensorboard") == [("training/loss", 60, 0.5)]
+
+
+def test_loggers_that_there_are_not_are_one_line(monkeypatch):
+    with pytest.raises(UserError, match="unknown logger 'csv': expected some of tensorboard"):
+        config.parse("babyai", ["--loggers", "csv"])
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(UserError, match=r"pip install 'leapjax\[tensorboard\]'"):
+        config.parse("babyai", ["--loggers", "tensorboard"])
