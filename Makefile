@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: babyai test test-long lint package clean
+.PHONY: babyai test test-long lint package docs clean
 
 # The main job: train LEAP on a BabyAI level and report its success beside the paper's.
 # More options: make babyai ARGS="--level all".
@@ -35,10 +35,15 @@ package: $(READY)
 	$(BIN)/python -m pip install --quiet --no-deps --target dist/site dist/*.whl
 	cd dist && PYTHONPATH=site ../$(BIN)/python ../tests/wheel.py ../README.md site
 
+# The site, in site/; a broken link, or a public name without documentation, fails.
+docs: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $(READY)
 
 clean:
-	rm -rf .venv dist
+	rm -rf .venv dist site

@@ -1,6 +1,7 @@
 """Imports point one way, and the README says what is true."""
 
 import ast
+import inspect
 import os
 import re
 import subprocess
@@ -110,6 +111,14 @@ def test_there_is_no_cycle_of_imports():
 def test_the_public_names_are_sorted_and_exist():
     assert leapjax.__all__ == sorted(leapjax.__all__)
     assert all(hasattr(leapjax, name) for name in leapjax.__all__)
+
+
+def test_the_public_names_are_documented():
+    listed = re.findall(r"^::: leapjax\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    assert sorted(listed) == leapjax.__all__
+    for name in leapjax.__all__:
+        said = inspect.getdoc(getattr(leapjax, name)) or ""
+        assert len(said) > 20 and not said.startswith(f"{name}("), name
 
 
 def test_the_readme_snippets_run():
