@@ -29,6 +29,7 @@ from leapjax.planners import (
     random_shooting,
 )
 from leapjax.pretrained import Pretrained, load
+from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
 from leapjax.scores import interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
@@ -46,6 +47,7 @@ __all__ = [
     "GibbsConfig",
     "Plan",
     "Pretrained",
+    "PureEnvironment",
     "ShootingConfig",
     "TrainState",
     "UserError",
@@ -53,6 +55,7 @@ __all__ = [
     "beam_search",
     "classifier",
     "compile_planner",
+    "compile_rollout",
     "compose",
     "constrain",
     "cross_entropy_method",
