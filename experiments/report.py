@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments import ablation, properties, stochastic, suboptimal
 from experiments.common import analysis, plots, program, results
 from experiments.common.analysis import Analysis
@@ -158,14 +160,21 @@ def replace_section(text: str, name: str, section: str) -> str:
 
 
 def success(rows: Sequence[Row]) -> str:
-    """Success rates per level: the paper's, and those of every setting.
+    """Success rates per level: the paper's, and those of every setting; their middle.
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
     """
+    papers = [paper_success(level)["leap"] for level in LEVELS]
     lines = [
-        [level, f"{paper_success(level)['leap']:.1f}%", *cells]
-        for level, cells in zip(LEVELS, _by_setting(rows, _rate), strict=True)
+        [level, f"{paper:.1f}%", *cells]
+        for level, paper, cells in zip(LEVELS, papers, _by_setting(rows, _rate), strict=True)
     ]
+    of_settings = [
+        [_of_setting([row for row in rows if row["level"] == level], setting) for level in LEVELS]
+        for setting in SETTINGS
+    ]
+    paper = scores.interquartile_mean(np.array(papers))
+    lines.append(["interquartile mean", f"{paper:.1f}%", *map(_middle, of_settings)])
     return _table(f"level | paper | {TITLES}", lines)
 
 
@@ -539,6 +548,15 @@ def _rate(rows: Sequence[Row]) -> str:
     if rows[0]["method"] == "rules":  # nothing was trained
         return rate
     return f"{rate}, {len(rows)} seed{'s' if len(rows) > 1 else ''}{earlier}"
+
+
+def _middle(levels: Sequence[Sequence[Row]]) -> str:
+    """The interquartile mean over levels, of rows of each, where none is without."""
+    if not all(levels):
+        return "-"
+    counts = [([r["successes"] for r in of], [r["episodes"] for r in of]) for of in levels]
+    middle, (low, high) = scores.aggregate(counts)
+    return f"{100 * middle:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _mean_rate(rows: Sequence[Row]) -> float:

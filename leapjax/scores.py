@@ -44,13 +44,58 @@ def interval_over_seeds(
     Raises:
         ValueError: no seeds, no episodes, or more successes than episodes.
     """
+    means = _drawn_means(successes, episodes, np.random.default_rng(0))
+    rate = float((np.asarray(successes) / np.asarray(episodes)).mean())
+    return _bounds(means, rate, level)
+
+
+def interquartile_mean(values: np.ndarray) -> np.ndarray:
+    """The mean of the middle half of values `[..., L]` (Agarwal et al., 2021): `[...]`.
+
+    As scipy's `trim_mean` and rliable have it: a quarter of the values, rounded down, is left out
+    at each end.
+    """
+    cut = values.shape[-1] // 4
+    return np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1)
+
+
+def aggregate(
+    levels: Sequence[tuple[Sequence[int], Sequence[int]]], level: float = 0.95
+) -> tuple[float, tuple[float, float]]:
+    """The interquartile mean of success over levels, and its confidence interval, as fractions.
+
+    A bootstrap stratified by level (Agarwal et al., 2021): within each, seeds are drawn, then
+    episodes, as `interval_over_seeds` does. A level counts by the mean of its seeds, of which some
+    levels have more than others.
+
+    Args:
+        levels: of each, successes `[S]` and episodes `[S]` of its training seeds.
+        level: of confidence.
+
+    Raises:
+        ValueError: no levels, no seeds, no episodes, or more successes than episodes.
+    """
+    if not levels:
+        raise ValueError("no levels to aggregate over")
+    rng = np.random.default_rng(0)
+    drawn = np.stack([_drawn_means(good, count, rng) for good, count in levels], axis=-1)
+    rates = np.array([(np.asarray(g) / np.asarray(c)).mean() for g, c in levels])
+    middle = float(interquartile_mean(rates))
+    return middle, _bounds(interquartile_mean(drawn), middle, level)
+
+
+def _drawn_means(
+    successes: Sequence[int], episodes: Sequence[int], rng: np.random.Generator
+) -> np.ndarray:
+    """Mean success rates `[BOOTSTRAPS]` of seeds, and episodes, that could as well have been."""
     good, count = np.asarray(successes), np.asarray(episodes)
     if not len(good) or (count < 1).any() or (good < 0).any() or (good > count).any():
         raise ValueError(f"{list(successes)} successes of {list(episodes)} episodes")
-    rng = np.random.default_rng(0)
     chosen = rng.integers(0, len(good), (BOOTSTRAPS, len(good)))
-    rates = rng.beta(good[chosen] + 0.5, (count - good)[chosen] + 0.5)
-    means = rates.mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    rate = float((good / count).mean())
-    return min(rate, float(low)), max(rate, float(high))
+    return rng.beta(good[chosen] + 0.5, (count - good)[chosen] + 0.5).mean(axis=1)
+
+
+def _bounds(drawn: np.ndarray, found: float, level: float) -> tuple[float, float]:
+    """The interval of a bootstrap, which holds what was found."""
+    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2])
+    return min(found, float(low)), max(found, float(high))

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
-from leapjax.scores import interval_over_seeds, wilson_interval
+from leapjax.scores import (
+    aggregate,
+    interquartile_mean,
+    interval_over_seeds,
+    wilson_interval,
+)
 
 counts = st.integers(1, 100_000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -106,3 +112,27 @@ def test_the_interval_over_seeds_holds_the_truth_as_often_as_it_says():
 def test_impossible_seeds_are_refused(successes, episodes):
     with pytest.raises(ValueError, match="successes of"):
         interval_over_seeds(successes, episodes)
+
+
+def test_the_interquartile_mean_is_scipys_and_rliables():
+    rng = np.random.default_rng(0)
+    for count in (1, 3, 4, 7, 20):
+        values = rng.normal(size=(5, count))
+        expected = stats.trim_mean(values, 0.25, axis=1)
+        np.testing.assert_allclose(interquartile_mean(values), expected)
+
+
+def test_an_aggregate_is_stratified_by_level():
+    levels = [([50, 60], [100, 100]), ([90], [100]), ([0], [100]), ([80], [100])]
+    middle, (low, high) = aggregate(levels)
+    assert middle == pytest.approx((0.55 + 0.8) / 2)  # the best and the worst do not count
+    assert low < middle < high
+    # Of many episodes only the seeds of the first level are left to differ.
+    certain = [([g * 10**7 for g in good], [c * 10**7 for c in of]) for good, of in levels]
+    assert aggregate(certain)[1] == pytest.approx(((0.5 + 0.8) / 2, (0.6 + 0.8) / 2), abs=1e-3)
+    one = aggregate([([190], [200])])
+    assert one == (0.95, interval_over_seeds([190], [200]))
+    with pytest.raises(ValueError, match="no levels"):
+        aggregate([])
+    with pytest.raises(ValueError, match="successes of"):
+        aggregate([([1], [1]), ([2], [1])])
