@@ -80,14 +80,17 @@ def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(spoil, reas
 
 
 def test_episodes_that_go_otherwise_are_dropped_and_counted():
-    name = recorded(NAMES["partial"])
+    name = recorded(NAMES["partial"], episodes=6)
     with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
         file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never was
         file["episode_2"].attrs["seed"] = 5  # of another level
         file["episode_3/rewards"][-1] = 0.123
         del file["episode_4"].attrs["seed"]
+        shorter = file["episode_5/observations/image"][:-1]
+        del file["episode_5/observations/image"]
+        file["episode_5/observations/image"] = shorter
     found = storage.load(name, DOMAIN)
-    assert found.dropped == {replay.DIFFERENT: 3, replay.NO_SEED: 1}
+    assert found.dropped == {replay.DIFFERENT: 3, replay.NO_SEED: 1, replay.INCOMPLETE: 1}
     assert [d.seed for d in found.demonstrations] == [1000]
     with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
         file["episode_0/observations/image"][0] = 0

@@ -92,7 +92,7 @@ def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
             **{name: "x" if kind is str else 1 for name, kind in results.FIELDS.items()},
             "hash": str(cycle % 7), "successes": int(episodes.successes.sum()), "episodes": 3,
         }  # fmt: skip
-        results.record(tmp_path / "rows.jsonl", row, episodes)
+        results.record(tmp_path / "rows.jsonl", row)
         watch.look()
     with capsys.disabled():
         print("\nsoak, library:", watch.report())

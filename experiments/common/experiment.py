@@ -144,7 +144,9 @@ def run_one(
         this.log(config.training.steps, of)
 
         def write() -> None:
-            results.record(rows, row, episodes)
+            beside = results.episodes_path(rows, name) if config.record else folder / "episodes.csv"
+            results.write_episodes(beside, episodes)
+            results.record(rows, row)
             if config.pictures:
                 run.draw(planner, this, played, metrics)
                 if experiment.animate is not None:

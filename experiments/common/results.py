@@ -72,25 +72,25 @@ def _what_is_wrong(row: Any) -> str | None:
     return None
 
 
-def record(path: Path, row: Row, episodes: Episodes) -> None:
-    """Adds a row, in the place of one of the same configuration, atomically.
-
-    What became of each episode goes beside it (`episodes_path`), for whoever wants to compute
-    with more than a mean.
-    """
-    columns = episodes.seeds, episodes.successes, episodes.returns, episodes.lengths
-    table = ["seed,success,return,length"]
-    for seed, success, total, length in zip(*columns, strict=True):
-        table.append(f"{seed},{int(success)},{total:.6g},{length}")
-    write_text(episodes_path(path, row["hash"]), "\n".join(table) + "\n")
+def record(path: Path, row: Row) -> None:
+    """Adds a row, in the place of one of the same configuration, atomically."""
     with only_process_in(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
         write_text(path, "".join(f"{line}\n" for line in lines))
 
 
+def write_episodes(path: Path, episodes: Episodes) -> None:
+    """What became of each episode, for whoever wants to compute with more than a mean."""
+    columns = episodes.seeds, episodes.successes, episodes.returns, episodes.lengths
+    table = ["seed,success,return,length"]
+    for seed, success, total, length in zip(*columns, strict=True):
+        table.append(f"{seed},{int(success)},{total:.6g},{length}")
+    write_text(path, "\n".join(table) + "\n")
+
+
 def episodes_path(path: Path, name: str) -> Path:
-    """The file of the episodes of a row, by the file of rows and the row's hash."""
+    """Where the episodes of a recorded row are, by the file of rows and the row's hash."""
     return path.parent / "episodes" / f"{path.stem}-{name}.csv"
 
 

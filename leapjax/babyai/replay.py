@@ -17,6 +17,7 @@ NO_SEED = "without the seed of their reset"
 DONE = "with the action `done`"
 DIFFERENT = "that go otherwise when they are played again"
 FAILED = "that failed"
+INCOMPLETE = "without an observation for every step"
 
 
 def replay(recording: Recording, level: Level) -> Demonstration | str | None:
@@ -26,6 +27,8 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
         return None
     if recording.seed < 0:
         return NO_SEED
+    if any(len(stored[name]) != len(recording.actions) + 1 for name in ("image", "mission")):
+        return INCOMPLETE
     if (recording.actions >= END).any():
         return DONE
     if not (recording.rewards > 0).any():
