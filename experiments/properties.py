@@ -181,7 +181,7 @@ CASES = (
         _without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
-        "composition-easy", [Model(OBSTACLES, more={"leap": DETOURS["leap"]})] * 2, OBSTACLES,
+        "composition-easy", [Model(OBSTACLES, more={"leap": BOTH["leap"]})] * 2, OBSTACLES,
         _composed(halves, (83.5, 58.0, 42.5)),
     ),
     Case(
