@@ -94,7 +94,7 @@ ANALYSES = {
 }
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
 SEARCHES_FIGURE = Path("docs/searches.png")
-LANDSCAPE_FIGURE = Path("docs/landscape.png")
+LANDSCAPE_FIGURE, AGGREGATE_FIGURE = Path("docs/landscape.png"), Path("docs/aggregate.png")
 
 
 def main() -> int:
@@ -110,6 +110,7 @@ def rewrite() -> None:
     plots.iterations_by_level(success_by_iterations(rows), ITERATIONS_FIGURE)
     plots.methods_by_level(success_by_method(rows), METHODS_FIGURE)
     plots.iterations_by_level(success_by_passes(rows_of(Path(), *PUZZLES)), SEARCHES_FIGURE)
+    plots.intervals(aggregates(rows), AGGREGATE_FIGURE)
     plots.landscape(read_json(Path("results/landscape.json")), LANDSCAPE_FIGURE)
 
 
@@ -169,13 +170,29 @@ def success(rows: Sequence[Row]) -> str:
         [level, f"{paper:.1f}%", *cells]
         for level, paper, cells in zip(LEVELS, papers, _by_setting(rows, _rate), strict=True)
     ]
-    of_settings = [
-        [_of_setting([row for row in rows if row["level"] == level], setting) for level in LEVELS]
-        for setting in SETTINGS
-    ]
     paper = scores.interquartile_mean(np.array(papers))
-    lines.append(["interquartile mean", f"{paper:.1f}%", *map(_middle, of_settings)])
+    found = [_middle(rows, setting) for setting in SETTINGS]
+    cells = [
+        "-" if each is None else f"{each[0]:.1f}% [{each[1]:.1f}, {each[2]:.1f}]" for each in found
+    ]
+    lines.append(["interquartile mean", f"{paper:.1f}%", *cells])
     return _table(f"level | paper | {TITLES}", lines)
+
+
+def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+    """The interquartile means of the paper's LEAP, and of what has rows on every level."""
+    paper = float(
+        scores.interquartile_mean(np.array([paper_success(level)["leap"] for level in LEVELS]))
+    )
+    methods = [
+        dataclasses.replace(setting, title=f"{method}, {preset}")
+        for preset, by_method in BY_METHOD.items()
+        for method, setting in by_method.items()
+        if method not in ("random", "leap")
+    ]
+    found = {setting.title: _middle(rows, setting) for setting in (*SETTINGS, *methods)}
+    known = {title: each for title, each in found.items() if each is not None}
+    return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
 
 
 def steps(rows: Sequence[Row]) -> str:
@@ -550,13 +567,16 @@ def _rate(rows: Sequence[Row]) -> str:
     return f"{rate}, {len(rows)} seed{'s' if len(rows) > 1 else ''}{earlier}"
 
 
-def _middle(levels: Sequence[Sequence[Row]]) -> str:
-    """The interquartile mean over levels, of rows of each, where none is without."""
+def _middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
+    """The interquartile mean of a setting over all levels, and its interval, in percent."""
+    levels = [
+        _of_setting([row for row in rows if row["level"] == level], setting) for level in LEVELS
+    ]
     if not all(levels):
-        return "-"
+        return None
     counts = [([r["successes"] for r in of], [r["episodes"] for r in of]) for of in levels]
     middle, (low, high) = scores.aggregate(counts)
-    return f"{100 * middle:.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+    return 100 * middle, 100 * low, 100 * high
 
 
 def _mean_rate(rows: Sequence[Row]) -> float:

@@ -75,6 +75,19 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
 
 
+def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
+    everywhere = [row(level, method="bc", rate=0.5) for level in report.LEVELS]
+    found = report.aggregates([*everywhere, row("PickUpLoc")])
+    assert list(found) == ["LEAP, the paper's numbers", "bc, leapjax"]
+    middle, low, high = found["bc, leapjax"]
+    assert middle == 50.0 and 40 < low < 50 < high < 60
+    ours = [row(level, rate=0.9) for level in report.LEVELS]
+    (line,) = (x for x in report.success(ours).splitlines() if "interquartile" in x)
+    assert "| 63.6% | - | - | 90.0% [" in line
+    plots.intervals(found, tmp_path / "aggregate.png")
+    assert (tmp_path / "aggregate.png").stat().st_size > 5_000
+
+
 def test_what_acting_costs():
     # 500 episodes of 6 steps, a plan for each, 100 plans per second.
     rows = [row(method="bc", rate=1.0) | {"plans": 3000, "plans_per_second": 100}]

@@ -110,6 +110,23 @@ def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], pat
     _save(figure, path)
 
 
+def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
+    """Aggregate scores with their intervals, one below the other (Agarwal et al., 2021).
+
+    Args:
+        found: by label: in percent the score, and the bounds of its interval.
+        path: to write.
+    """
+    figure, axis = plt.subplots(figsize=(6, 0.8 + 0.35 * len(found)), layout="constrained")
+    for place, (score, low, high) in enumerate(reversed(found.values())):
+        axis.barh(place, high - low, left=low, height=0.5, color=f"C{place}", alpha=0.6)
+        axis.plot([score, score], [place - 0.3, place + 0.3], color="black")
+    axis.set_yticks(range(len(found)), [label.replace("`", "") for label in reversed(found)])
+    axis.set(xlim=(0, 102), xlabel="interquartile mean of success over levels (%), 95% interval")
+    axis.grid(axis="x", alpha=0.3)
+    _save(figure, path)
+
+
 def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Energies of good and bad plans over training, and of plans over iterations.
 

@@ -35,7 +35,7 @@ class Settings:
 
 
 class CheckedAdapter(GymnasiumAdapter):
-    """An environment of whom it may concern: what goes wrong in it is said in one line."""
+    """Anybody's environment: what goes wrong in it is said in one line."""
 
     def __init__(self, env: gym.Env, name: str, blank: PyTree, threshold: float | None) -> None:
         super().__init__(env)
