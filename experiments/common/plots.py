@@ -122,7 +122,8 @@ def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
         axis.barh(place, high - low, left=low, height=0.5, color=f"C{place}", alpha=0.6)
         axis.plot([score, score], [place - 0.3, place + 0.3], color="black")
     axis.set_yticks(range(len(found)), [label.replace("`", "") for label in reversed(found)])
-    axis.set(xlim=(0, 102), xlabel="interquartile mean of success over levels (%), 95% interval")
+    axis.set(xlim=(0, 102))
+    axis.set_xlabel("interquartile mean of success (%), and its 95% interval", fontsize=9)
     axis.grid(axis="x", alpha=0.3)
     _save(figure, path)
 
