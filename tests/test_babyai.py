@@ -105,17 +105,19 @@ def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
         assert after[name] == before[name], name
     assert after["hash"] != before["hash"]  # to train and to play are two rows
     assert parse("babyai", [*TOY_RUN, *arguments]) == parse("babyai", arguments)
-    assert [path.name for path in (workplace / "again").iterdir() if path.is_dir()] == []
+    left = only_folder(workplace / "again" / "evaluations")
+    assert [path.name for path in left.iterdir()] == ["episodes.csv"]  # nothing was trained
 
 
-def test_a_checkpoint_brings_its_seed_and_leaves_only_pictures(workplace, tmp_path, capsys):
+def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
     folder = untrained_run(tmp_path / "random", "--method", "random", "--seeds", "2")
     arguments = ["--checkpoint", str(folder), "--episodes", "1", "--runs", str(tmp_path / "again")]
     assert babyai.main(arguments) == 0
     (row,) = results.read(tmp_path / "again" / "babyai.jsonl")
     assert row["seed"] == row["configuration"]["seed"] == 2 and row["method"] == "random"
     pictures = only_folder(tmp_path / "again" / "evaluations")
-    assert {path.name for path in pictures.iterdir()} == {"iterations.png", "plan.gif"}
+    names = {path.name for path in pictures.iterdir()}
+    assert names == {"iterations.png", "plan.gif", "episodes.csv"}
     capsys.readouterr()
     assert babyai.main([*arguments, "--seeds", "0"]) == 2
     assert "does not fit: seed is 2, not 0" in capsys.readouterr().err
