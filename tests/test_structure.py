@@ -8,8 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 import leapjax
 from experiments import report
+from experiments.common import results
 
 ROOT = Path(__file__).parent.parent
 LIBRARY = sorted((ROOT / "leapjax").rglob("*.py"))
@@ -177,3 +181,16 @@ def test_neither_imports_nor_a_command_line_start_a_backend():
     environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
     environment["LEAPJAX_COMPILATION_CACHE"] = "off"
     subprocess.run([sys.executable, "-c", program], check=True, env=environment, cwd=ROOT)
+
+
+def test_the_episodes_that_are_kept_are_those_of_the_rows():
+    rows = {
+        results.episodes_path(ROOT / "results" / f"{row['experiment']}.jsonl", row["hash"]): row
+        for row in report.rows_of(ROOT, "babyai", *report.PUZZLES, *report.ANALYSES)
+    }
+    for path in (ROOT / "results" / "episodes").iterdir():
+        played = np.loadtxt(path, delimiter=",", skiprows=1)
+        assert (
+            len(played) == rows[path]["episodes"] and played[:, 1].sum() == rows[path]["successes"]
+        )
+        assert played[:, 3].mean() == pytest.approx(rows[path]["mean_length"])
