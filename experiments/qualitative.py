@@ -112,19 +112,16 @@ def refinement(level: str, first: int) -> list[Image.Image]:
     assert isinstance(trained, GibbsConfig)  # as all that are published
     search = dataclasses.replace(trained, iterations=max(ITERATIONS), fill="together", resampled=1)
 
-    def make() -> BabyAIAdapter:
-        return BabyAIAdapter(find_level(level))
-
     def plans_of(found: Drawn) -> tuple[BabyAIAdapter, list[list[Cell]]]:
         """The level as it was at first, and where plans lead after more and more iterations."""
-        start = make()
+        start = BabyAIAdapter(find_level(level))
         start.reset(found.level_seed)
         return start, [way_of(start, found.trace[n - 1]) for n in ITERATIONS]
 
     def refined(found: Drawn) -> bool:
         return all(before != after for before, after in pairwise(plans_of(found)[1]))
 
-    found = episode(make, analysis.asked(Way("refined"), [planner], search), None, first, refined)
+    found = episode(level, analysis.asked(Way("refined"), [planner], search), None, first, refined)
     start, ways = plans_of(found)
     plans = [
         picture(start, f"N = {n}: {spelled(found.trace[n - 1])}", [way])
@@ -139,12 +136,8 @@ def unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Im
     (way,) = (way for way in case.ways if way.name == way_name)
     models = analysis.models_of(work, case, way.method, options.seed)
     search = way.search(models[0].specification.planner)
-
-    def make() -> BabyAIAdapter:
-        return BabyAIAdapter(find_level(case.level))
-
     planner = analysis.asked(way, models, search)
-    found = episode(make, planner, way.executed, options.test_seed)
+    found = episode(case.level, planner, way.executed, options.test_seed)
     halves: list[tuple[list[Cell], Colour]] = []
     if case_name.startswith("composition"):  # who sees which obstacles
         state = found.adapter.observe()
@@ -165,7 +158,7 @@ def executed(
 
 
 def episode(
-    make: Callable[[], BabyAIAdapter],
+    level: str,
     planner: Pretrained,
     limit: int | None,
     first: int,
@@ -174,7 +167,7 @@ def episode(
     """The first episode of some length that is wanted.
 
     Args:
-        make: makes the level.
+        level: its name.
         planner: for it.
         limit: actions of each plan that are executed; None for all.
         first: level seed to look from.
@@ -184,7 +177,7 @@ def episode(
         UserError: there is none among many.
     """
     for level_seed in range(first, first + MOST_LEVELS):
-        found = played(make(), planner, limit, level_seed)
+        found = played(BabyAIAdapter(find_level(level)), planner, limit, level_seed)
         if found.steps >= STEPS and wanted(found):
             return found
     raise UserError(f"--test-seed {first}: none of {MOST_LEVELS} episodes is worth a drawing")

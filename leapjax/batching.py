@@ -206,11 +206,16 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
     return np.asarray(_fold_in(jax.random.key(seed), folded))[:batch]
 
 
+def plan_key(key: jax.Array, episode: jax.Array, replan: jax.Array) -> jax.Array:
+    """The key of one plan, inside a program: see `plan_keys`."""
+    return jax.random.fold_in(jax.random.fold_in(key, episode), replan)
+
+
 @jax.jit
 def _fold_in(key: jax.Array, indices: jax.Array) -> jax.Array:
     """Key data `[B, 2]` of one key and indices `[2, B]`."""
 
     def fold(episode: jax.Array, replan: jax.Array) -> jax.Array:
-        return jax.random.key_data(jax.random.fold_in(jax.random.fold_in(key, episode), replan))
+        return jax.random.key_data(plan_key(key, episode, replan))
 
     return jax.vmap(fold)(*indices)

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.batching import plan_key
 from leapjax.environments import Transition
 from leapjax.planners import PlannerConfig, bind
-from leapjax.rollouts import Episodes
+from leapjax.rollouts import Episodes, check_actions, check_limits
 from leapjax.types import Array, Context, Energy, Params, PyTree, pad_token
 
 
@@ -66,14 +67,8 @@ def compile_rollout(
         ValueError: nothing to execute, other actions than the energy's, or, of the function
             returned, an energy that was NaN.
     """
-    for name, value in {"executed": executed, "max_steps": max_steps}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    if environment.num_actions != energy.num_actions:
-        raise ValueError(
-            f"the energy has {energy.num_actions} actions and the environment "
-            f"{environment.num_actions}, the end action included in both"
-        )
+    check_limits(executed, max_steps)
+    check_actions("energy", energy.num_actions, environment.num_actions)
     plan = bind(energy, config)
     end = energy.num_actions - 1
 
@@ -100,10 +95,8 @@ def compile_rollout(
         return (kept, ended), None
 
     def play(params: Params, level_seed: jax.Array, key: jax.Array) -> _Episode:
-        mine = jax.random.fold_in(key, level_seed)
-
         def replanned(episode: _Episode) -> _Episode:
-            found = plan(params, jax.random.fold_in(mine, episode.plans), episode.context)
+            found = plan(params, plan_key(key, level_seed, episode.plans), episode.context)
             actions = found.actions[:executed]
             episode = episode._replace(plans=episode.plans + 1, valid=episode.valid & found.valid)
             (acted, _), _ = jax.lax.scan(act, (episode, jnp.bool_(False)), actions)

@@ -91,11 +91,31 @@ def _check_adapters(adapters: Sequence[Adapter], plan: CompiledPlanner) -> None:
     if len({id(adapter) for adapter in adapters}) < len(adapters):
         raise ValueError("make_adapter returned the same environment twice: make a new one")
     for adapter in adapters:
-        if adapter.num_actions != plan.num_actions:
-            raise ValueError(
-                f"the planner has {plan.num_actions} actions and the environment "
-                f"{adapter.num_actions}, the end action included in both"
-            )
+        check_actions("planner", plan.num_actions, adapter.num_actions)
+
+
+def check_limits(executed: int | None, max_steps: int | None) -> None:
+    """Refuses to execute nothing of a plan, or of an episode.
+
+    Raises:
+        ValueError: says which.
+    """
+    for name, value in {"executed": executed, "max_steps": max_steps}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def check_actions(of: str, planned: int, possible: int) -> None:
+    """Refuses what plans with other actions than its environment has.
+
+    Raises:
+        ValueError: says how many there are.
+    """
+    if possible != planned:
+        raise ValueError(
+            f"the {of} has {planned} actions and the environment {possible}, the end action "
+            "included in both"
+        )
 
 
 def _copy(observation: PyTree) -> PyTree:
@@ -145,9 +165,7 @@ def evaluate(
             that are one and the same, or that have other actions than the planner, or
             observations that are not all of one shape.
     """
-    for name, value in {"executed": executed, "max_steps": max_steps}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    check_limits(executed, max_steps)
     begun = time.perf_counter()
     adapters = [make_adapter() for _ in seeds]
     _check_adapters(adapters, plan)

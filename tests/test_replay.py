@@ -106,7 +106,7 @@ def test_the_level_follows_from_the_data_and_must_be_theirs():
         UserError, match=f"is of {LEVEL}, not of GoToLocalS7N5: use --level {LEVEL}"
     ):
         config.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
-    assert storage.level_of("no/such/set-v0") is None
+    assert storage.described("no/such/set-v0").level is None
 
 
 def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):

@@ -171,8 +171,8 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
     for case in wanted:
         for method in methods_of(case, options.methods):
             for seed in options.seeds:
-                for model in case.models:
-                    configs.check(training_config(analysis, model, method, seed, options))
+                for config in configurations(analysis, case, method, seed, options):
+                    configs.check(config)
     return wanted
 
 
@@ -198,10 +198,17 @@ def training_config(
     return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
 
 
+def configurations(
+    analysis: Analysis, case: Case, method: str, seed: int, options: Options
+) -> list[AnyConfig]:
+    """What each of a case's models is trained with, of one method."""
+    return [training_config(analysis, model, method, seed, options) for model in case.models]
+
+
 def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     """The rows of one case, method and training seed."""
     analysis, options = work.analysis, work.options
-    settings = [training_config(analysis, m, method, seed, options) for m in case.models]
+    settings = configurations(analysis, case, method, seed, options)
     ways = {
         row_name(analysis, case, way, settings, seed, options): way
         for way in case.ways
@@ -252,10 +259,8 @@ def row_name(
 
 def models_of(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
     """The models of a case, of one method, trained where they are not there yet."""
-    configurations = [
-        training_config(work.analysis, model, method, seed, work.options) for model in case.models
-    ]
-    return [trained(work, config, seed) for config in configurations]
+    wanted = configurations(work.analysis, case, method, seed, work.options)
+    return [trained(work, config, seed) for config in wanted]
 
 
 def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
@@ -354,10 +359,7 @@ def rows_of_way(
         if (row["case"], row["way"], row["preset"]) != (case.name, way.name, preset):
             continue
         options = Options(preset=preset)
-        settings = [
-            training_config(analysis, model, way.method, row["seed"], options)
-            for model in case.models
-        ]
+        settings = configurations(analysis, case, way.method, row["seed"], options)
         if row["hash"] == row_name(analysis, case, way, settings, row["seed"], options):
             found.append(row)
     return found

@@ -18,6 +18,7 @@ from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.data import seeds, storage
 from leapjax.data.seeds import UNSEEN
+from leapjax.data.storage import Described
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
@@ -157,8 +158,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
         raise UserError("--checkpoint and --pretrained: give one of them")
     trained = None if folder is None else pretrained.read_specification(folder)
     levels = find_domain(domain).levels
-    recorded = storage.level_of(chosen.demonstrations) if chosen.demonstrations else None
-    level = chosen.level or (trained.level if trained else recorded or levels[0])
+    data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
+    level = chosen.level or (trained.level if trained else data.level or levels[0])
     if chosen.method == "all" and (folder is not None or chosen.pretrained):
         raise UserError("--method all: a planner that is trained already is of one method")
     configs = []
@@ -171,11 +172,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
         every = [other for other in METHODS if METHODS[other].everywhere]
         for one in every if method == "all" else [method]:
             default = preset(domain, each, one, name)
-            if chosen.demonstrations and chosen.demos is None:  # as many as there are
-                count = storage.episodes_in(chosen.demonstrations)
-                default = dataclasses.replace(
-                    default, demos=min(default.demos, count or default.demos)
-                )
+            if data.episodes is not None and chosen.demos is None:  # as many as there are
+                default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
             if trained and (trained.domain, trained.method) == (domain, one):
                 default = _as_trained(default, trained)
             given = _parse(arguments, default)
@@ -234,7 +232,7 @@ def check(config: AnyConfig) -> None:
     checkpoints.check_path(config.runs)
     if config.play is not None and config.checkpoint is None:
         raise UserError("--play: another level is played with a --checkpoint, and there is none")
-    recorded = storage.level_of(config.demonstrations) if config.demonstrations else None
+    recorded = storage.described(config.demonstrations).level if config.demonstrations else None
     if recorded is not None and recorded != config.level:
         raise UserError(
             f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "

@@ -138,10 +138,14 @@ def run_one(
         planner = run.with_rules(planner, this)
         episodes = run.measure(planner, this, played)
         row = make_row(experiment, this, name, planner, episodes) | {"versions": versions}
-        measured = {"success": row["successes"] / row["episodes"], "return": row["mean_return"]}
-        measured["length"] = row["mean_length"]
-        of = {f"evaluation/{what}": value for what, value in measured.items()}
-        this.log(config.training.steps, of)
+        this.log(
+            config.training.steps,
+            {
+                "evaluation/success": row["successes"] / row["episodes"],
+                "evaluation/return": row["mean_return"],
+                "evaluation/length": row["mean_length"],
+            },
+        )
 
         def write() -> None:
             beside = results.episodes_path(rows, name) if config.record else folder / "episodes.csv"

@@ -38,7 +38,7 @@ def nowhere(step: int, values: Mapping[str, float]) -> None:
 
 def tensorboard(about: About) -> Logger:
     """Event files in the run's folder."""
-    writer = _installed("tensorboardX", "tensorboard").SummaryWriter(
+    writer = _installed("tensorboard").SummaryWriter(
         str(about.folder / "tensorboard"), purge_step=about.begin or None
     )
 
@@ -51,7 +51,7 @@ def tensorboard(about: About) -> Logger:
 
 def wandb(about: About) -> Logger:
     """A run of Weights & Biases, in the run's folder."""
-    run = _installed("wandb", "wandb").init(
+    run = _installed("wandb").init(
         project="leapjax", name=about.folder.name, id=about.name, resume="allow",
         dir=str(about.folder), config=dict(about.configuration),
         mode=os.environ.get("WANDB_MODE", "offline"),
@@ -76,15 +76,16 @@ def check(names: Sequence[str]) -> None:
     for name in names:
         if name not in LOGGERS:
             raise UserError(f"unknown logger {name!r}: expected some of {', '.join(LOGGERS)}")
-        _installed(_MODULES[name], name)
+        _installed(name)
 
 
-def _installed(module: str, extra: str) -> ModuleType:
+def _installed(name: str) -> ModuleType:
+    """The module that a logger needs; the extra that brings it has the logger's name."""
     try:
-        return importlib.import_module(module)
+        return importlib.import_module(_MODULES[name])
     except ImportError:
         raise UserError(
-            f"--loggers {extra} needs {module}: pip install 'leapjax[{extra}]'"
+            f"--loggers {name} needs {_MODULES[name]}: pip install 'leapjax[{name}]'"
         ) from None
 
 

@@ -27,7 +27,8 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
         return None
     if recording.seed < 0:
         return NO_SEED
-    if any(len(stored[name]) != len(recording.actions) + 1 for name in ("image", "mission")):
+    images, missions = np.asarray(stored["image"]), np.asarray(stored["mission"])
+    if {len(images), len(missions)} != {len(recording.actions) + 1}:
         return INCOMPLETE
     if (recording.actions >= END).any():
         return DONE
@@ -35,15 +36,16 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
         return FAILED
     adapter = BabyAIAdapter(level)
     states = [adapter.reset(recording.seed)]
-    same = [_is(adapter, stored, 0)]
+    same = _is(adapter, images[0], missions[0])
     success = terminated = truncated = False
     for step, action in enumerate(recording.actions, start=1):
-        if terminated or truncated or not same[-1]:
+        if terminated or truncated or not same:
             return DIFFERENT
         state, reward, terminated, truncated, success = adapter.step(int(action))
         states.append(state)
-        same.append(_is(adapter, stored, step) and np.isclose(reward, recording.rewards[step - 1]))
-    if not same[-1] or not success:
+        same = _is(adapter, images[step], missions[step])
+        same = same and bool(np.isclose(reward, recording.rewards[step - 1]))
+    if not same or not success:
         return DIFFERENT
     return Demonstration(
         Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
@@ -55,10 +57,10 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
     )
 
 
-def _is(adapter: BabyAIAdapter, stored: dict, step: int) -> bool:
-    """Whether a level is now as it was recorded after so many steps."""
-    env, image = adapter.env, np.asarray(stored["image"])[step]
-    if str(np.asarray(stored["mission"])[step]) != env.mission:
+def _is(adapter: BabyAIAdapter, image: np.ndarray, mission: np.ndarray) -> bool:
+    """Whether a level is now as it was recorded."""
+    env = adapter.env
+    if str(mission) != env.mission:
         return False
     whole = image.shape == (env.width, env.height, 3)
     if not whole:  # the adapter has no use for the agent's view, so it has taken it away

@@ -14,7 +14,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import h5py
@@ -255,27 +255,27 @@ def _demonstration(
     )
 
 
-def level_of(name: str) -> str | None:
-    """The id of the environment that a data set was recorded in, if it says so."""
-    try:
-        recorded = json.loads(_metadata(name)["env_spec"])["id"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None  # what is wrong with it is said when it is loaded
-    return recorded if isinstance(recorded, str) else None
+class Described(NamedTuple):
+    """What a data set says of itself; what is wrong with that is said when it is loaded."""
+
+    level: str | None = None  # the id of the environment that it was recorded in
+    episodes: int | None = None
 
 
-def episodes_in(name: str) -> int | None:
-    """How many episodes a data set says that it has."""
-    try:
-        count = _metadata(name)["total_episodes"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return count if isinstance(count, int) and count > 0 else None
-
-
-def _metadata(name: str) -> Any:
+def described(name: str) -> Described:
+    """What a data set says of itself, as far as it does."""
     path = datasets_folder() / name / "data" / "metadata.json"
-    return json.loads(path.read_text(encoding="utf-8"))
+    try:
+        metadata = json.loads(path.read_text(encoding="utf-8"))
+        count = metadata.get("total_episodes")
+    except (OSError, ValueError, AttributeError):
+        return Described()
+    count = count if isinstance(count, int) and count > 0 else None
+    try:
+        level = json.loads(metadata["env_spec"])["id"]
+    except (ValueError, KeyError, TypeError):
+        level = None
+    return Described(level if isinstance(level, str) else None, count)
 
 
 def _inspect(folder: Path) -> None:

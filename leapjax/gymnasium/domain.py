@@ -40,6 +40,7 @@ class CheckedAdapter(GymnasiumAdapter):
     def __init__(self, env: gym.Env, name: str, blank: PyTree, threshold: float | None) -> None:
         super().__init__(env)
         self._name, self._blank, self._threshold = name, blank, threshold
+        self._shapes = jax.tree.map(np.shape, blank)
         self._return = 0.0
 
     def reset(self, seed: int) -> PyTree:
@@ -68,14 +69,13 @@ class CheckedAdapter(GymnasiumAdapter):
             ) from error
 
     def _checked(self, observation: Any) -> PyTree:
-        expected = jax.tree.map(np.shape, self._blank)
         if isinstance(observation, dict):
             observation = dict(observation)
         shapes = jax.tree.map(np.shape, observation)
-        if shapes != expected:
+        if shapes != self._shapes:
             raise UserError(
                 f"{self._name} gave an observation of shape {shapes}; its observation space says "
-                f"{expected}"
+                f"{self._shapes}"
             )
         return jax.tree.map(lambda x, like: np.asarray(x, like.dtype), observation, self._blank)
 

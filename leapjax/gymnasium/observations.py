@@ -15,7 +15,7 @@ from leapjax.types import Context, PyTree
 
 SCALES = (0.01, 0.1, 1.0, 10.0)  # that numbers are looked at in: nobody says how large they are
 SMALL = 12  # pixels: an image is halved until no side is longer
-FEATURES = 32  # of an image's first layer; each of the next has twice as many, up to twice
+FEATURES = 32  # of an image's first layer; the others have twice as many
 
 
 class Part(NamedTuple):
