@@ -9,8 +9,8 @@ from leapjax.errors import did_you_mean
 
 # In the order in which someone new meets them; what they do is the first line of each.
 PROGRAMS = (
-    "babyai", "gymnasium", "stars", "sudoku", "properties", "stochastic", "suboptimal", "ablation",
-    "landscape", "qualitative", "accuracy", "failures",
+    "babyai", "atari", "gymnasium", "stars", "sudoku", "properties", "stochastic", "suboptimal",
+    "ablation", "atari_energy", "landscape", "qualitative", "accuracy", "failures",
 )  # fmt: skip
 
 

@@ -16,10 +16,7 @@ NAMES = {"--env": "--level", "--dataset": "--demonstrations"}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every environment and seed asked for; the exit code."""
-    given = []
-    for argument in program.arguments_of(arguments):
-        name, equals, value = argument.partition("=")
-        given.append(f"{NAMES.get(name, name)}{equals}{value}")
+    given = program.renamed(program.arguments_of(arguments), NAMES)
     return experiment.main(EXPERIMENT, given)
 
 

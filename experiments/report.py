@@ -17,6 +17,7 @@ from experiments.common.config import preset as config_of_preset
 from experiments.common.results import Row
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from leapjax import scores
+from leapjax.atari.games import GAMES
 from leapjax.babyai.levels import LEVELS, paper_success
 from leapjax.checkpoints import read_json
 from leapjax.files import read_text, write_text
@@ -75,6 +76,16 @@ BY_METHOD = {
     preset: {method: Setting(method, preset, method) for method in COMPARED}
     for preset in ("paper", "leapjax")
 }
+ATARI = {
+    "LEAP": Setting("LEAP", "leapjax"),
+    "LEAP without return": Setting("LEAP", "leapjax", options={"returns": False}),
+    "BC": Setting("BC", "leapjax", "bc"),
+    "DT": Setting("DT", "leapjax", "dt"),
+    "CQL": Setting("CQL", "leapjax", "cql"),
+    "QR-DQN": Setting("QR-DQN", "leapjax", "qr_dqn"),
+    "REM": Setting("REM", "leapjax", "rem"),
+    "random": Setting("random", "leapjax", "random"),
+}
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
@@ -124,9 +135,10 @@ def documents(root: Path) -> dict[Path, str]:
     rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
     for name in ANALYSES:
         rows[name] = rows_of(root, name)
-    for name in ("planning", "training", "quality", "landscape"):
+    rows["atari"] = rows_of(root, "atari")
+    for name in ("planning", "training", "quality", "landscape", "atari-data"):
         rows[name] = read_json(root / "results" / f"{name}.json")
-    sections: dict[str, tuple[Callable[[Sequence[Row]], str], str]] = {
+    sections: dict[str, tuple[Callable[[Any], str], str]] = {
         "results": (success, "babyai"),
         "speed": (speed, "planning"),
         "planning": (planning, "planning"),
@@ -138,6 +150,8 @@ def documents(root: Path) -> dict[Path, str]:
         "acting": (acting, "babyai"),
         "searches": (searches, "puzzles"),
         "arms": (arms, "puzzles"),
+        "atari": (atari, "atari"),
+        "atari-data": (atari_data, "atari-data"),
         "quality": (quality, "quality"),
         "landscape": (landscape, "landscape"),
         **{name: (functools.partial(analysed, each), name) for name, each in ANALYSES.items()},
@@ -232,6 +246,8 @@ def is_used(row: Row) -> bool:
             for case in of.cases
             for way in case.ways
         )
+    if row["domain"] == "atari":
+        return any(setting.has(row) for setting in ATARI.values())
     if row["domain"] not in PUZZLES and row["level"] not in LEVELS:
         return False
     if row["domain"] in PUZZLES:
@@ -394,6 +410,67 @@ def arms(rows: Sequence[Row]) -> str:
         if sum(map(bool, each)) > 1
     ]
     return _table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
+
+
+def atari(rows: Sequence[Row]) -> str:
+    """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
+
+    With the standard error, over seeds where there are several and over games where there is one.
+    """
+    lines = []
+    for name, game in GAMES.items():
+        of = {
+            title: [row for row in rows if row["level"] == name and setting.has(row)]
+            for title, setting in ATARI.items()
+        }
+        theirs = {"LEAP without return": game.paper_without_return} | {
+            title: game.paper[setting.method]
+            for title, setting in ATARI.items()
+            if setting.method in game.paper and not setting.options
+        }
+        scale = game.human - game.random
+        cells = {title: _mean_score(found) for title, found in of.items() if found}
+        normal = {
+            title: f"{game.normalised(mean):.1f} ± {100 * error / scale:.1f}"
+            for title, (mean, error) in cells.items()
+        }
+        raw = {title: f"{mean:.1f} ± {error:.1f}" for title, (mean, error) in cells.items()}
+        papers = {title: f"{score:.1f}" for title, score in theirs.items()}
+        for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
+            lines.append([name, what, *(by_title.get(title, "-") for title in ATARI)])
+    return _table("game | | " + " | ".join(ATARI), lines)
+
+
+def _mean_score(rows: Sequence[Row]) -> tuple[float, float]:
+    """The mean score of rows, one for each seed, and its standard error."""
+    means = np.array([row["mean_return"] for row in rows])
+    error = scores.standard_error(means) if len(rows) > 1 else rows[0]["return_error"]
+    return float(means.mean()), error or 0.0
+
+
+def atari_data(found: Mapping[str, Any]) -> str:
+    """What the demonstrators reached, whose games are learned from."""
+    lines = []
+    for name in GAMES:
+        games = found.get(name, [])
+        if not games:
+            continue
+        reached = np.array([game["score"] for game in games])
+        by_noise = {
+            noise: np.mean([game["score"] for game in games if game["noise"] == noise])
+            for noise in sorted({game["noise"] for game in games})
+        }
+        lines.append(
+            [
+                name,
+                str(len(games)),
+                str(sum(game["transitions"] for game in games)),
+                f"{reached.mean():.1f}",
+                f"{reached.min():g} .. {reached.max():g}",
+                ", ".join(f"{mean:.1f} ({noise:.0%})" for noise, mean in by_noise.items()),
+            ]
+        )
+    return _table("game | games | transitions | mean score | range | by random actions", lines)
 
 
 def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:

@@ -38,6 +38,18 @@ class Recording(NamedTuple):
     seed: int  # with which the environment was reset; negative where nobody knows
 
 
+class Source(NamedTuple):
+    """Demonstrations that are kept in a format of their own, not as Minari data sets."""
+
+    default: str  # where they are, if nobody says
+    exists: Callable[[str], bool]
+    make: Callable[[str, Callable[[int], None]], None]
+    # (where, progress) -> writes them, continuing where it was stopped
+    load: Callable[[str, int], Collection]
+    # (where, training seed) -> as many as the domain's settings say
+    transitions: int  # that `make` makes, and tells the progress of
+
+
 def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
     """The two numbers of a level's name, such as 3 and 5 of Star3x5.
 
@@ -88,9 +100,11 @@ class Domain(NamedTuple):
     replay: Callable[[Recording], Demonstration | str | None] | None = None
     # what an episode of other observations is as a demonstration; or why it is none; or None,
     # where nothing is known of such observations
+    source: Source | None = None  # of demonstrations, in the place of Minari and `collect`
     rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
+    return_scale: float = 1.0  # what returns are divided by before a network sees them
     paper_success: Mapping[str, float] = {}  # the paper's results by method, in percent
 
     @property

@@ -1,5 +1,6 @@
 """The table of domains: what `leapjax.load` and the experiments find by name."""
 
+from leapjax.atari.domain import ATARI
 from leapjax.babyai.domain import BABYAI
 from leapjax.domain import DomainType
 from leapjax.errors import UserError
@@ -9,6 +10,7 @@ from leapjax.sudoku.domain import SUDOKU
 
 DOMAINS: dict[str, DomainType] = {
     "babyai": BABYAI, "stars": STARS, "sudoku": SUDOKU, "gymnasium": GYMNASIUM,
+    "atari": ATARI,
 }  # fmt: skip
 
 

@@ -3,13 +3,16 @@
 from leapjax.agents.bc import BC
 from leapjax.agents.bcq import BCQ
 from leapjax.agents.classifier import CLASSIFIER
+from leapjax.agents.cql import CQL
 from leapjax.agents.dt import DT
 from leapjax.agents.iql import IQL
 from leapjax.agents.leap import LEAP
 from leapjax.agents.learning import Method
 from leapjax.agents.mopo import MOPO
 from leapjax.agents.plate import PLATE
+from leapjax.agents.qr_dqn import QR_DQN
 from leapjax.agents.random import RANDOM
+from leapjax.agents.rem import REM
 from leapjax.agents.rules import RULES
 from leapjax.errors import UserError
 
@@ -22,6 +25,9 @@ METHODS: dict[str, Method] = {
     "iql": IQL,
     "mopo": MOPO,
     "plate": PLATE,
+    "cql": CQL,
+    "qr_dqn": QR_DQN,
+    "rem": REM,
     "rules": RULES,
     "random": RANDOM,
 }

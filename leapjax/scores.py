@@ -49,6 +49,13 @@ def interval_over_seeds(
     return _bounds(means, rate, level)
 
 
+def standard_error(values: np.ndarray) -> float | None:
+    """Of the mean of values `[n]`; None for fewer than two, which say nothing of it."""
+    if len(values) < 2:
+        return None
+    return float(np.std(values, ddof=1) / math.sqrt(len(values)))
+
+
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
     """The mean of the middle half of values `[..., L]` (Agarwal et al., 2021): `[...]`.
 

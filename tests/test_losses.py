@@ -46,6 +46,51 @@ def test_bellman_targets(terminated):
     np.testing.assert_array_equal(gradient, [0, 0])
 
 
+def test_bellman_targets_of_several_values():
+    transition = TransitionWindow(context([0, 1, 2], [5.0, 1.0, 2.0]), jnp.array(True))
+    values = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
+    found = losses.bellman(transition, values, 0.5)
+    np.testing.assert_allclose(found, [[6, 11, 16], [2, 2, 2]])
+
+
+def test_the_values_of_actions():
+    values = np.random.default_rng(0).normal(size=(2, CHOICES, 4))
+    actions = jnp.array([2, 0])
+    np.testing.assert_allclose(losses.of_action(values, actions), [values[0, 2], values[1, 0]])
+    single = losses.of_action(values[..., 3], actions)
+    np.testing.assert_allclose(single, [values[0, 2, 3], values[1, 0, 3]])
+
+
+@pytest.mark.parametrize("kappa", [0.3, 1.0])
+def test_the_quantile_huber_loss_is_what_loops_say(kappa):
+    rng = np.random.default_rng(0)
+    estimates, targets = rng.normal(size=(2, 4)), 2 * rng.normal(size=(2, 3))
+    expected = np.zeros(2)
+    for p in range(2):
+        for i, share in enumerate([1 / 8, 3 / 8, 5 / 8, 7 / 8]):
+            for target in targets[p]:
+                error = target - estimates[p, i]
+                small = abs(error) <= kappa
+                huber = error**2 / 2 if small else kappa * (abs(error) - kappa / 2)
+                expected[p] += (1 - share if error < 0 else share) * huber / 3
+    found = losses.quantile_huber(jnp.array(estimates), jnp.array(targets), kappa)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_the_least_quantile_huber_loss_is_at_the_quantiles():
+    sample = np.random.default_rng(0).gamma(2.0, size=2000)
+    expected = stats.gamma(2.0).ppf([1 / 8, 3 / 8, 5 / 8, 7 / 8])
+    targets = jnp.array(sample)[None]
+    loss = jax.jit(lambda estimates: losses.quantile_huber(estimates, targets, 1e-3)[0])
+    for place, quantile in enumerate(expected):  # each has a least of its own
+        others = jnp.array(expected)[None]
+        found = optimize.minimize_scalar(
+            lambda x, others=others, place=place: float(loss(others.at[0, place].set(x)) * 1e3),
+            bounds=(0, 10), method="bounded",
+        )  # fmt: skip
+        assert found.x == pytest.approx(quantile, abs=0.1)
+
+
 def test_imitation_counts_what_is_known_alone():
     likelihoods = jnp.array([[0.2, 0.3, 0.5], [0.5, 0.25, 0.25], [0.1, 0.8, 0.1]])
     loss, accuracy = losses.imitation(

@@ -19,6 +19,7 @@ from leapjax.models.trajectory import (
     build,
 )
 from leapjax.types import Context, mask_token, pad_token
+from tests import mixed
 from tests.enumerable import all_plans, quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
@@ -407,6 +408,30 @@ def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
     high = run(architecture, 2, context, actions)["logits"][:, :-1]  # the end may be -inf
     assert low.dtype == np.float32
     assert 0 < np.abs(low - high).max() < 0.05 * np.abs(high).max()
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_with_causal_attention_no_action_sees_a_later_one(architecture):
+    """And with full attention every action sees every other."""
+
+    def scores(attention, actions):
+        config = ModelConfig(architecture, 2, 2, 16, attention=attention)
+        encoder = mixed.DOMAIN.encoders[architecture](config, 1)
+        module = build(config, Sizes(4, 1, HORIZON, 9), encoder)
+        context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(1))
+        params = module.init(jax.random.key(0), context, actions, method=everything)
+        return module.apply(params, context, actions, method=everything)
+
+    everywhere = np.ones((HORIZON, HORIZON), bool)
+    for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
+        before = scores(attention, jnp.zeros(HORIZON, jnp.int32))
+        for changed in range(HORIZON):
+            after = scores(attention, jnp.zeros(HORIZON, jnp.int32).at[changed].set(1))
+            seen = sees[:, changed].copy()
+            # Ours is read where the action is (it is masked there), the paper's before it.
+            seen[changed] &= architecture == "leapjax" or attention == "full"
+            differs = np.abs(after - before)[:, :3].max(axis=1) > 1e-7
+            np.testing.assert_array_equal(differs, seen)
 
 
 def test_unknown_precision_is_refused():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from leapjax import batching
-from leapjax.agents import bc, bcq, dt, iql, mopo
+from leapjax.agents import bc, bcq, dt, iql, leap, mopo, returns
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
@@ -159,7 +159,12 @@ def test_the_target_network_follows_slowly():
     jax.tree.map(np.testing.assert_array_equal, fresh.extra, begun)
 
 
-def test_decision_transformer_does_what_leads_to_the_return_that_is_asked_for():
+@pytest.mark.parametrize(
+    ("module", "settings"),
+    [(dt, dt.Settings), (leap, functools.partial(leap.Settings, "random", False, True))],
+    ids=["dt", "leap"],
+)
+def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings):
     """Of walks that end well and walks that never do, it follows those that gave as much."""
     model = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
     learn = TrainingConfig(
@@ -169,7 +174,9 @@ def test_decision_transformer_does_what_leads_to_the_return_that_is_asked_for():
     walks = [mixed.walk(rng, int(x), share, 6) for x in mixed.PLACES for share in (0.0, 1.0)]
     data = mixed.windows.concatenate(walks)
     agents = {
-        target: dt.make_agent(Setup(mixed.DOMAIN, 2, 1, model, learn, dt.Settings(target)))
+        target: module.make_agent(
+            Setup(mixed.DOMAIN, 2, 1, model, learn, settings(target_return=target))
+        )
         for target in (1.0, 0.0)
     }
     state, _ = toy.learn(agents[1.0], data, learn.steps)
@@ -180,7 +187,7 @@ def test_decision_transformer_does_what_leads_to_the_return_that_is_asked_for():
 
 def test_returns_to_go_are_sums_of_what_is_to_come():
     context = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
-    np.testing.assert_array_equal(dt.returns_to_go(context, jnp.float32(10)), [17, 16, 14, 10])
+    np.testing.assert_array_equal(returns.returns_to_go(context, jnp.float32(10)), [17, 16, 14, 10])
 
 
 @pytest.mark.parametrize("name", list(MODULES))

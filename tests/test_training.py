@@ -322,10 +322,12 @@ def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
             found.add(context.module.path)
         return call(*args, **kwargs)
 
+    def touch(module, context):
+        return module.logits(module.encode(context), jnp.zeros(3, jnp.int32), jnp.arange(3))
+
     def init(key, context):
         with nn.intercept_methods(note):
-            actions = jnp.zeros(3, jnp.int32)
-            return module.init(key, context, actions, method=leap._encode_and_score)
+            return module.init(key, context, method=touch)
 
     return jax.eval_shape(init, jax.random.key(0), blank_context(LEVEL, 2)), found
 

@@ -23,7 +23,7 @@ from experiments.common.config import (
 )
 from experiments.common.interruption import Interruption
 from experiments.common.run import Run
-from leapjax import files, processes
+from leapjax import files, processes, scores
 from leapjax.data import seeds
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
@@ -39,6 +39,7 @@ class Experiment(NamedTuple):
     # how else to plan with what was trained: options of the planner, a row for each
     animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
     # (planner, run, level seeds, path): draws plans being refined and executed
+    iterations: bool = True  # draw success against the number of iterations
 
 
 def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
@@ -152,7 +153,7 @@ def run_one(
             results.write_episodes(beside, episodes)
             results.record(rows, row)
             if config.pictures:
-                run.draw(planner, this, played, metrics)
+                run.draw(planner, this, played if experiment.iterations else None, metrics)
                 if experiment.animate is not None:
                     experiment.animate(planner, this, played[:3], folder / "plan.gif")
                 console.print(f"pictures: {folder}", highlight=False, markup=False)
@@ -203,6 +204,7 @@ def make_row(
         "validation": config.validation,
         "successes": int(episodes.successes.sum()),
         "mean_return": float(episodes.returns.mean()),
+        "return_error": scores.standard_error(episodes.returns),
         "mean_length": float(lengths.mean()),
         "mean_success_length": float(lengths[episodes.successes].mean())
         if episodes.successes.any()

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -157,6 +158,29 @@ def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
         right.set(xlabel="passes N", ylabel="energy", yscale="log")
         right.set_title("of plans being refined", fontsize=9)
         right.legend(fontsize=7)
+    _save(figure, path)
+
+
+def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """The mean energy of each trajectory against its return, both from 0 to 1.
+
+    Args:
+        found: by game, as `experiments.atari_energy` has it.
+        path: to write.
+    """
+    figure, axes = plt.subplots(
+        1, len(found), figsize=(3 * len(found), 2.8), layout="constrained", squeeze=False
+    )
+
+    def scaled(values: Sequence[float]) -> np.ndarray:
+        least, most = min(values), max(values)
+        return (np.array(values) - least) / max(most - least, 1e-9)
+
+    for axis, (name, each) in zip(axes[0], found.items(), strict=True):
+        axis.scatter(scaled(each["returns"]), scaled(each["energies"]), s=14, alpha=0.7)
+        axis.set(xlabel="reward", xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
+        axis.set_title(f"{name}: rank correlation {each['correlation']:.2f}", fontsize=9)
+    axes[0][0].set_ylabel("energy")
     _save(figure, path)
 
 

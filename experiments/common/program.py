@@ -2,7 +2,7 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 import jax
@@ -19,6 +19,12 @@ FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can b
 def arguments_of(arguments: Sequence[str] | None) -> list[str]:
     """The command line of a program: what was given, or the real one."""
     return list(sys.argv[1:] if arguments is None else arguments)
+
+
+def renamed(arguments: Sequence[str], names: Mapping[str, str]) -> list[str]:
+    """A command line whose options have other names, by those that they have."""
+    parts = [argument.partition("=") for argument in arguments]
+    return [f"{names.get(name, name)}{equals}{value}" for name, equals, value in parts]
 
 
 def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:

@@ -155,7 +155,8 @@ def planner_name(row: Row) -> str:
 
 def success_table(rows: Sequence[Row]) -> Table:
     """Success rates beside the paper's."""
-    result = Table("level", "method", "planner", "seed", "success [95%]", "length", "paper")
+    columns = ("level", "method", "planner", "seed", "success [95%]", "return", "length", "paper")
+    result = Table(*columns)
     for row in rows:
         paper = row.get("paper_success")
         result.add_row(
@@ -164,6 +165,7 @@ def success_table(rows: Sequence[Row]) -> Table:
             planner_name(row),
             str(row["seed"]),
             percent(row),
+            f"{row['mean_return']:.2f}" if "mean_return" in row else "-",
             f"{row['mean_length']:.1f}",
             "-" if paper is None else f"{paper:.1f}%",
         )

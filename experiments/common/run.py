@@ -8,6 +8,7 @@ import concurrent.futures
 import contextlib
 import csv
 import dataclasses
+import functools
 import json
 import sys
 import time
@@ -31,7 +32,7 @@ from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
-from leapjax.domain import Domain, blank_context
+from leapjax.domain import Domain, Source, blank_context
 from leapjax.energy import compose
 from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
@@ -45,6 +46,11 @@ Watch = Callable[[Energy, Params], dict[str, float]]
 # One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
 # evaluation would rather have smaller ones.
 CHUNK_SIZES = (32,)
+
+
+def chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
+    """Of planning: as large as there are episodes, up to the usual."""
+    return tuple(min(size, 1 << (config.episodes - 1).bit_length()) for size in CHUNK_SIZES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +101,7 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
     """Begins to compile, in the background; what is returned waits for the end of it."""
     config, domain = run.config, run.domain
     agent = pretrained.make_agent(run.specification, domain, mesh)
-    plan = compile_planner(agent.energy, config.planner, CHUNK_SIZES)
+    plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
     like = learning.blank_steps(domain) if config.demos else ()
 
     def training_programs() -> tuple[Any, TrainStep]:
@@ -124,15 +130,18 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
 
 
 def dataset(run: Run) -> str:
-    """The id of the demonstrations to train on."""
-    config = run.config
+    """The id of the demonstrations to train on, or where they are."""
+    config, source = run.config, run.domain.source
+    if source is not None:
+        return config.demonstrations or source.default
     return config.demonstrations or storage.dataset_id(run.domain, config.demos, run.seed)
 
 
 def must_collect(run: Run) -> bool:
     """Whether the demonstrations to train on do not exist yet."""
     wanted = run.config.demos and run.config.demonstrations is None
-    return bool(wanted) and processes.first_does(lambda: not storage.exists(dataset(run)))
+    exists = storage.exists if run.domain.source is None else run.domain.source.exists
+    return bool(wanted) and processes.first_does(lambda: not exists(dataset(run)))
 
 
 def collect(run: Run) -> None:
@@ -149,8 +158,12 @@ def collect(run: Run) -> None:
         run.console.print(summary)
         storage.save(dataset(run), collection, run.domain, summary)
 
-    begun = time.perf_counter()
-    processes.first_does(save)
+    def make(source: Source) -> None:
+        with Meter(run.console, "transitions", source.transitions) as meter:
+            source.make(dataset(run), meter.update)
+
+    begun, source = time.perf_counter(), run.domain.source
+    processes.first_does(save if source is None else functools.partial(make, source))
     run.seconds["demos"] += time.perf_counter() - begun
 
 
@@ -161,20 +174,24 @@ def load(run: Run) -> list[Demonstration]:
         UserError: they cannot be read, are fewer than asked for, or hold no rewards where the
             method learns from them.
     """
-    config, name = run.config, dataset(run)
+    config, name, source = run.config, dataset(run), run.domain.source
     if not config.demos:
         return []
     begun = time.perf_counter()
     # Each process reads for itself: the data need not be on one shared disk.
-    loaded = processes.together(lambda: storage.load(name, run.domain, config.demos))
-    data, dropped = loaded.demonstrations, reasons(loaded)
-    if len(data) < config.demos:
+    if source is None:
+        loaded = processes.together(lambda: storage.load(name, run.domain, config.demos))
+    else:
+        loaded = processes.together(lambda: source.load(name, run.seed))
+    data, dropped = loaded.demonstrations[: config.demos], reasons(loaded)
+    if len(data) < config.demos and source is None:
         also = f" that can be used ({dropped})" if dropped else ""
         raise UserError(f"{name} has {len(data)} episodes{also}, fewer than --demos {config.demos}")
     run.seconds["demos"] += time.perf_counter() - begun
     if dropped:
         run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)
-    if find_method(config.method).rewards and not any(d.rewards.any() for d in data):
+    asked = find_method(config.method).rewards or getattr(config.method_settings, "returns", False)
+    if asked and not any(d.rewards.any() for d in data):
         raise UserError(
             f"{name} holds no rewards, from which --method {config.method} learns: give it data "
             "with rewards, or another method"
@@ -309,7 +326,7 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
                 f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
                 f"not {wanted[name]}"
             )
-    return pretrained.load(checkpoint, run.config.planner, CHUNK_SIZES, run.config.play)
+    return pretrained.load(checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play)
 
 
 def _training_settings(specification: Specification) -> dict[str, Any]:
@@ -336,7 +353,7 @@ def with_rules(planner: Pretrained, run: Run) -> Pretrained:
     if not weight or rules is None:
         return planner
     energy = compose([planner.energy, rules], [1.0, weight])
-    plan = compile_planner(energy, run.config.planner, CHUNK_SIZES)
+    plan = compile_planner(energy, run.config.planner, chunk_sizes(run.config))
     return Pretrained(planner.specification, energy, (planner.params, ()), plan)
 
 
@@ -387,12 +404,14 @@ def warm_up(planner: Pretrained, domain: Domain, batch: int) -> None:
         jax.block_until_ready(planner(jax.random.split(jax.random.key(0), size), contexts))
 
 
-def draw(planner: Pretrained, run: Run, episode_seeds: range, metrics: Metrics) -> None:
-    """The training curve, and success against iterations."""
+def draw(planner: Pretrained, run: Run, episode_seeds: range | None, metrics: Metrics) -> None:
+    """The training curve; and success against iterations, where there are episodes to play."""
     config, folder = run.config, run.folder
     folder.mkdir(parents=True, exist_ok=True)
     if metrics:
         plots.training_curve(metrics, folder / "loss.png")
+    if episode_seeds is None:
+        return
     play = player(planner, run)
     some = episode_seeds[:100]
     iterations = sorted({1, 2, 3, 5, *np.linspace(1, config.planner.iterations, 5).astype(int)})

@@ -1,6 +1,5 @@
 """What BC and DT share: an agent that learns which action was taken, of every state."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +8,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup
+from leapjax.agents.returns import Returns, nothing_wanted
 from leapjax.models.policy import PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -16,22 +16,19 @@ from leapjax.types import Agent, Context, Params, PyTree, Window
 def make_imitator(
     setup: Setup,
     mesh: Mesh | None,
-    returns: Callable[[Context, jax.Array | None], jax.Array] | None = None,
+    wanted: Returns | None = None,
 ) -> Agent:
     """An agent whose energy is minus the logits of the next action.
 
     Args:
         setup: what it is made from.
         mesh: of devices to train on; None for one device.
-        returns: (context, return to go of a demonstration, or None while acting) -> `[K + 1]`
-            the returns to go that the action is conditioned on; None: on nothing else.
+        wanted: the returns that the action is conditioned on; None: on nothing else.
     """
     choices = setup.domain.num_actions - 1  # the end action is not chosen
-    module = setup.policy(("logits", choices), conditioned=returns is not None)
+    module = setup.policy(("logits", choices), conditioned=wanted is not None)
+    wanted = wanted or nothing_wanted
     optimizer = learning.make_optimizer(setup.training)
-
-    def wanted(context: Context, return_to_go: jax.Array | None = None) -> jax.Array | None:
-        return None if returns is None else returns(context, return_to_go)
 
     def say(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, returns=wanted(context))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax import schedules
-from leapjax.agents import learning
+from leapjax.agents import learning, returns
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.energy import pseudo_likelihood
@@ -37,12 +37,15 @@ class Settings:
 
     masking: str = "one"  # "one", "each" or "random": see leapjax.schedules
     end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
+    returns: bool = False  # condition plans on the return to go, as Decision Transformer does
+    target_return: float = 1.0  # of an episode, asked for while acting
 
     def __post_init__(self) -> None:
         if self.masking not in schedules.MASKINGS:
             raise ValueError(
                 f"unknown masking {self.masking!r}: expected one of {', '.join(schedules.MASKINGS)}"
             )
+        returns.check_target(self.target_return)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
@@ -53,7 +56,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         mesh: of devices to train on (see `leapjax.sharding`); None for one device.
     """
     sizes, masking = setup.sizes, setup.settings.masking
-    module = trajectory.build(setup.model, sizes, setup.encoder())
+    conditioned = setup.settings.returns
+    module = trajectory.build(setup.model, sizes, setup.encoder(), conditioned)
+    to_go = returns.wanted(setup) if conditioned else returns.nothing_wanted
     optimizer = learning.make_optimizer(setup.training)
     mask, pad = mask_token(sizes.num_actions), pad_token(sizes.num_actions)
     last = sizes.num_actions - 1  # the end action
@@ -62,7 +67,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return logits if setup.settings.end else logits.at[:, last].set(-jnp.inf)
 
     def encode(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, method="encode")
+        return module.apply(params, context, returns=to_go(context), method="encode")
 
     def logits(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
@@ -82,7 +87,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         masks = schedules.sample_masks(mask_key, sizes.horizon, masking)  # [C, T]
         memory = module.apply(
             params, window.context, deterministic=False, method="encode",
-            rngs={"dropout": encode_key},
+            rngs={"dropout": encode_key}, returns=to_go(window.context, window.return_to_go),
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
@@ -111,13 +116,13 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     update = learning.make_update(
         window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
-    init = learning.make_init(setup, module, _encode_and_score, optimizer)
+
+    def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
+        memory = module.encode(context, returns=to_go(context))
+        return module.logits(memory, actions, jnp.arange(actions.shape[0]))
+
+    init = learning.make_init(setup, module, touch, optimizer)
     return Agent(init, window_batches(setup), update, energy)
-
-
-def _encode_and_score(module: Model, context: Context, actions: jax.Array) -> jax.Array:
-    """Touches every parameter of a model, to initialise them."""
-    return module.logits(module.encode(context), actions, jnp.arange(actions.shape[0]))
 
 
 LEAP = Method(Settings, make_agent, PRESETS)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from leapjax.models.policy import past_and_present
 from leapjax.types import Context, TransitionWindow
@@ -31,13 +32,14 @@ def last_actions(context: Context, count: int, choices: int) -> tuple[jax.Array,
 
 
 def bellman(transition: TransitionWindow, values: jax.Array, discount: float) -> jax.Array:
-    """`[P]`: each reward, and the discounted value `[P]` of the state that it led to.
+    """Each reward, and the discounted value of the state that it led to.
 
-    No gradient flows through it. Only a transition's last step can have come to an end.
+    Values are `[P]`, or `[P, N]` where there are several of each state; so are the results. No
+    gradient flows through them. Only a transition's last step can have come to an end.
     """
     rewards = transition.context.rewards[-values.shape[0] :]
     goes_on = jnp.ones(values.shape[0]).at[-1].set(1.0 - transition.terminated)
-    return jax.lax.stop_gradient(rewards + discount * goes_on * values)
+    return jax.lax.stop_gradient((rewards + discount * goes_on * values.T).T)
 
 
 def mean_where(values: jax.Array, known: jax.Array) -> jax.Array:
@@ -46,8 +48,9 @@ def mean_where(values: jax.Array, known: jax.Array) -> jax.Array:
 
 
 def of_action(values: jax.Array, actions: jax.Array) -> jax.Array:
-    """Which of values `[P, choices]` belongs to actions `[P]`: `[P]`."""
-    return jnp.take_along_axis(values, actions[:, None], axis=1)[:, 0]
+    """Which of values `[P, choices, ...]` belong to actions `[P]`: `[P, ...]`."""
+    chosen = jnp.expand_dims(actions, range(1, values.ndim))
+    return jnp.take_along_axis(values, chosen, axis=1)[:, 0]
 
 
 def imitation(
@@ -66,3 +69,17 @@ def expectile(differences: jax.Array, share: float) -> jax.Array:
     below (Kostrikov et al., Implicit Q-Learning, equation 5).
     """
     return jnp.where(differences > 0, share, 1 - share) * differences**2
+
+
+def quantile_huber(estimates: jax.Array, targets: jax.Array, kappa: float = 1.0) -> jax.Array:
+    """The loss `[P]` that is least where estimates `[P, N]` are quantiles of targets `[P, M]`.
+
+    Smooth where they differ by less than kappa; the sum over estimates, the mean over targets
+    (Dabney et al., Distributional Reinforcement Learning with Quantile Regression, equation 10
+    and algorithm 1).
+    """
+    count = estimates.shape[1]
+    shares = (jnp.arange(count) + 0.5) / count  # lemma 2
+    errors = targets[:, None, :] - estimates[:, :, None]  # [P, N, M]
+    weights = jnp.abs(shares[:, None] - (errors < 0))
+    return (weights * optax.losses.huber_loss(errors, delta=kappa)).mean(axis=2).sum(axis=1)

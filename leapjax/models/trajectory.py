@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.errors import check_at_least
-from leapjax.models.transformer import Transformer, dense, embed
+from leapjax.models.transformer import Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
 
 ARCHITECTURES = ("paper", "leapjax")
+ATTENTIONS = ("full", "causal")
 DTYPES = ("float32", "bfloat16")
 
 
@@ -30,12 +31,17 @@ class ModelConfig:
     width: int = 128  # D, embedding dimension
     dropout: float = 0.1  # of embeddings, attention and residuals
     dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
+    attention: str = "full"  # of a plan's actions; "causal": no action sees a later one
 
     def __post_init__(self) -> None:
         if self.architecture not in ARCHITECTURES:
             raise ValueError(
                 f"unknown architecture {self.architecture!r}: "
                 f"expected one of {', '.join(ARCHITECTURES)}"
+            )
+        if self.attention not in ATTENTIONS:
+            raise ValueError(
+                f"unknown attention {self.attention!r}: expected one of {', '.join(ATTENTIONS)}"
             )
         check_at_least(self, 1, "layers", "heads", "width")
         if not 0 <= self.dropout < 1:
@@ -65,36 +71,54 @@ def forbid_early_end(logits: jax.Array, positions: jax.Array) -> jax.Array:
 class PaperModel(nn.Module):
     """The network of the paper's appendix: state and action tokens, interleaved.
 
-    Tokens s_1 a_1 ... s_n a_n s_n a_n+1 ... with fully bidirectional attention; an action
-    is read off its state token and all tokens share one embedding of the time at the end
-    of the plan, as in the authors' code.
+    Tokens s_1 a_1 ... s_n a_n s_n a_n+1 ... with fully bidirectional attention (or causal
+    attention, as the paper has it in Atari); an action is read off its state token and all
+    tokens share one embedding of the time at the end of the plan, as in the authors' code.
+    Where it is conditioned on returns to go, the token of one precedes each state's.
     """
 
     config: ModelConfig
     sizes: Sizes
     states: nn.Module  # the domain's: context -> [K + 1, D], a token for each of its states
+    conditioned: bool = False  # on returns to go
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
         nn.share_scope(self, self.states)  # its parameters lie beside the others
         self.action = embed(sizes.num_actions + 2, c.width)
-        tokens = 2 * (sizes.context + sizes.horizon)
+        self.each = 3 if self.conditioned else 2  # tokens of a step
+        tokens = self.each * (sizes.context + sizes.horizon)
         self.position = nn.Embed(tokens, c.width, embedding_init=nn.initializers.zeros)
         steps = sizes.max_steps + sizes.horizon + 1
         self.time = nn.Embed(steps, c.width, embedding_init=nn.initializers.zeros)
+        if self.conditioned:
+            self.goal = dense(c.width, scale=1.0)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
-    def encode(self, context: Context, deterministic: bool = True) -> PyTree:
-        """The embeddings that every pass shares: `[2 (K + T), D]`."""
+    def encode(
+        self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
+    ) -> PyTree:
+        """The embeddings that every pass shares: `[2 (K + T), D]`, or `3 (K + T)` of them.
+
+        Args:
+            context: what is known.
+            deterministic: without dropout.
+            returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
+        """
         del deterministic
-        horizon, past = self.sizes.horizon, self.sizes.context
-        states = self.states(context)  # [K + 1, D]
-        states = jnp.concatenate([states, jnp.repeat(states[-1:], horizon - 1, axis=0)])
+        horizon = self.sizes.horizon
+
+        def with_plan(known: jax.Array) -> jax.Array:  # every position has the current one
+            return jnp.concatenate([known, jnp.repeat(known[-1:], horizon - 1, axis=0)])
+
         actions = jnp.tanh(self.action(context.actions))
         actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
-        tokens = jnp.stack([states, actions], axis=1).reshape(2 * (past + horizon), -1)
+        steps = [with_plan(self.states(context)), actions]  # of [K + T, D]
+        if returns is not None:
+            steps.insert(0, with_plan(jnp.tanh(self.goal(returns[:, None]))))
+        tokens = jnp.stack(steps, axis=1).reshape(-1, self.config.width)
         time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
         return tokens + self.position(jnp.arange(tokens.shape[0])) + time
 
@@ -107,11 +131,11 @@ class PaperModel(nn.Module):
     ) -> jax.Array:
         """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
         check_plan(actions, self.sizes.horizon)
-        first = 2 * self.sizes.context
-        embedded = jnp.tanh(self.action(actions))
-        x = memory.at[first + 1 + 2 * jnp.arange(self.sizes.horizon)].add(embedded)
+        asked = self.each * (self.sizes.context + jnp.arange(self.sizes.horizon)) + self.each - 2
+        x = memory.at[asked + 1].add(jnp.tanh(self.action(actions)))
         x = self.drop(x, deterministic=deterministic)
-        h = self.transformer(x, first + 2 * positions, deterministic=deterministic)
+        mask = causal_mask(x.shape[0]) if self.config.attention == "causal" else None
+        h = self.transformer(x, asked[positions], mask=mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
 
 
@@ -119,24 +143,39 @@ class LeapModel(nn.Module):
     """Ours: the state once, and a cached context.
 
     The tokens of the context are a prefix that never attends to the plan, so its keys and
-    values are computed once per plan, and a pass runs over T action tokens only.
+    values are computed once per plan, and a pass runs over T action tokens only. Where it is
+    conditioned on the return to go, that is one more token of the context.
     """
 
     config: ModelConfig
     sizes: Sizes
     context: nn.Module  # the domain's: context -> [C, D], a few tokens
+    conditioned: bool = False  # on the return to go
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
         self.action = embed(sizes.num_actions + 2, c.width)
+        if self.conditioned:
+            self.goal = dense(c.width, scale=1.0)
         self.position = embed(sizes.horizon, c.width)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
-    def encode(self, context: Context, deterministic: bool = True) -> PyTree:
-        """Keys and values of the prefix tokens, per layer."""
-        tokens = self.drop(self.context(context), deterministic=deterministic)
+    def encode(
+        self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
+    ) -> PyTree:
+        """Keys and values of the prefix tokens, per layer.
+
+        Args:
+            context: what is known.
+            deterministic: without dropout.
+            returns: `[K + 1]` the return to go at each state, where it is conditioned on it.
+        """
+        tokens = self.context(context)
+        if returns is not None:
+            tokens = jnp.concatenate([tokens, jnp.tanh(self.goal(returns[-1:, None]))])
+        tokens = self.drop(tokens, deterministic=deterministic)
         return self.transformer.prefix(tokens, deterministic=deterministic)
 
     def logits(
@@ -150,7 +189,9 @@ class LeapModel(nn.Module):
         check_plan(actions, self.sizes.horizon)
         x = self.action(actions) + self.position(jnp.arange(self.sizes.horizon))
         x = self.drop(x, deterministic=deterministic)
-        h = self.transformer(x, positions, memory, deterministic=deterministic)
+        horizon, prefix = self.sizes.horizon, memory[0].keys.shape[0]
+        mask = causal_mask(horizon, prefix) if self.config.attention == "causal" else None
+        h = self.transformer(x, positions, memory, mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
 
 
@@ -185,11 +226,15 @@ class SequenceClassifier(nn.Module):
 Model = PaperModel | LeapModel
 
 
-def build(config: ModelConfig, sizes: Sizes, encoder: nn.Module) -> Model:
-    """The masked language model that a configuration describes, around a domain's encoder."""
-    if config.architecture == "paper":
-        return PaperModel(config, sizes, encoder)
-    return LeapModel(config, sizes, encoder)
+def build(
+    config: ModelConfig, sizes: Sizes, encoder: nn.Module, conditioned: bool = False
+) -> Model:
+    """The masked language model that a configuration describes, around a domain's encoder.
+
+    `conditioned` says whether it is, on returns to go.
+    """
+    kind = PaperModel if config.architecture == "paper" else LeapModel
+    return kind(config, sizes, encoder, conditioned)
 
 
 def check_plan(actions: jax.Array, horizon: int) -> None:

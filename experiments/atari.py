@@ -1,0 +1,108 @@
+"""Atari (paper, table 2): `python -m experiments.atari --game Breakout --help`.
+
+Plays games with built-in demonstrators where there are no data yet, trains a method on them, and
+reports its score beside the paper's. `python -m experiments.atari collect --help` makes data
+alone.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.atari_animation import animate
+from experiments.common import experiment, program
+from experiments.common.config import check_counts
+from experiments.common.experiment import Experiment
+from experiments.common.progress import Meter
+from leapjax import files
+from leapjax.atari.domain import FOLDER, Settings, make
+from leapjax.atari.games import find_game
+from leapjax.checkpoints import read_json
+
+RECORDED = Path("results/atari-data.json")
+EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
+NAMES = {"--game": "--level"}  # what its users call the options of every experiment
+
+
+@dataclasses.dataclass(frozen=True)
+class Collect:
+    """Play games with built-in demonstrators; writes what DQN-Replay's files hold."""
+
+    game: str
+    """Breakout, Qbert, Pong or Seaquest."""
+    transitions: int = Settings.transitions
+    """At least so many, in whole games."""
+    folder: Path = Path(FOLDER)
+    """Where to; a game that was begun there goes on."""
+    run: int = 1
+    """Number of the run: each has games of its own."""
+    longest: int = 5_000
+    """Decisions of a game, which is cut off then."""
+    workers: int | None = None
+    """Processes; None: one on each core."""
+    record: bool = False
+    """Write what demonstrators have reached to results/, which is committed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs every game and seed asked for, or collects data; the exit code."""
+    given = program.arguments_of(arguments)
+    if given[:1] == ["collect"]:
+        options = tyro.cli(Collect, prog="experiments.atari collect", args=given[1:])
+        return program.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+    return experiment.main(EXPERIMENT, program.renamed(given, NAMES))
+
+
+def run(options: Collect) -> None:
+    """Makes data.
+
+    Raises:
+        UserError: an unknown game, or numbers that cannot be.
+    """
+    for name in ("transitions", "run", "longest", "workers"):
+        if getattr(options, name) is not None:
+            check_counts(options, name)
+    settings = Settings(transitions=options.transitions, replay_run=options.run)
+    source = make(options.game, settings).source
+    assert source is not None
+    from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
+
+    console = Console()
+    with Meter(console, "transitions", options.transitions) as meter:
+        made = collect(
+            options.folder, find_game(options.game), options.transitions, options.run,
+            options.longest, options.workers, meter.update,
+        )  # fmt: skip
+    games = [game for manifest in made for game in manifest["games"]]
+    console.print(scores_table(games))
+    if options.record:
+        known = read_json(RECORDED) if RECORDED.exists() else {}
+        files.write_text(RECORDED, json.dumps({**known, options.game: games}, indent=1) + "\n")
+
+
+def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
+    """What demonstrators have reached, by how often they act at random."""
+    table = Table("random actions", "games", "transitions", "mean score", "least", "most")
+    for noise in sorted({game["noise"] for game in games}):
+        some = [game for game in games if game["noise"] == noise]
+        scores = [game["score"] for game in some]
+        table.add_row(
+            f"{noise:.0%}",
+            str(len(some)),
+            str(sum(game["transitions"] for game in some)),
+            f"{sum(scores) / len(scores):.1f}",
+            f"{min(scores):g}",
+            f"{max(scores):g}",
+        )
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""A game played by a planner, its planned actions beside it, as an animated GIF."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from experiments.common.episodes import watched
+from experiments.common.pictures import Frame, save_animation
+from experiments.common.run import Run
+from leapjax.atari.adapter import AtariAdapter
+from leapjax.pretrained import Pretrained
+from leapjax.types import Plan
+
+SIDE, MARGIN, LINE = 252, 150, 18  # pixels: of the game, of the plan beside it, of one action
+MOST_DECISIONS = 300  # of one game
+SHOWN, STEP_MS = 2, 60  # every second of them, for so many milliseconds
+WHITE, BLACK, GREY, BLUE = (255, 255, 255), (0, 0, 0), (150, 150, 150), (40, 110, 220)
+
+
+def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
+    """Draws the beginning of one game, every second decision of it."""
+    adapter = run.domain.make_adapter()
+    assert isinstance(adapter, AtariAdapter)
+    actions, seed = run.domain.actions, seeds[0]
+    frames: list[Frame] = []
+    frame, score, step = adapter.reset(seed), 0.0, 0
+    for event in watched(
+        adapter, planner, planner.specification.context, seed, run.seed, run.config.executed,
+        MOST_DECISIONS,
+    ):  # fmt: skip
+        if isinstance(event, Plan):
+            plan = np.asarray(event.actions[0])
+            if step % SHOWN == 0:
+                frames.append((picture(frame, plan, actions, score, run.domain.level), STEP_MS))
+            continue
+        _, transition = event
+        frame, score, step = transition.observation, score + transition.reward, step + 1
+    save_animation(frames, path)
+
+
+def picture(
+    frame: np.ndarray, plan: np.ndarray, actions: Sequence[str], score: float, title: str
+) -> Image.Image:
+    """A frame `[84, 84]`, and the plan `[T]` beside it: the first of its actions is executed."""
+    image = Image.new("RGB", (SIDE + MARGIN, SIDE), WHITE)
+    image.paste(Image.fromarray(frame).resize((SIDE, SIDE), Image.Resampling.NEAREST))
+    pen = ImageDraw.Draw(image)
+    left = SIDE + 10
+    pen.text((left, 8), f"{title}: {score:g}", fill=BLACK)
+    pen.text((left, 8 + 2 * LINE), "plan", fill=GREY)
+    for place, action in enumerate(plan.tolist()):
+        said = f"{place + 1}. {actions[action]}"
+        pen.text((left, 8 + (3 + place) * LINE), said, fill=BLUE if place == 0 else GREY)
+    return image

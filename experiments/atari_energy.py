@@ -1,0 +1,128 @@
+"""Energies of good and bad games (paper, figure 'Energy vs. Reward on Atari').
+
+`python -m experiments.atari_energy --checkpoint runs/NAME`: the energy that a trained LEAP gives to
+what was done in the trajectories that it learned from, beside what each of them was rewarded with.
+"""
+
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from scipy import stats
+
+from experiments.common import plots, program, results, runtime
+from experiments.common.config import check_counts
+from leapjax import files, pretrained
+from leapjax.checkpoints import read_json
+from leapjax.data import windows
+from leapjax.errors import UserError
+from leapjax.pretrained import Pretrained
+from leapjax.types import Demonstration
+
+RESULTS = Path("atari-energy.json")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Compare the energies of trajectories with their rewards."""
+
+    checkpoint: tuple[Path, ...]
+    """Folders of runs of LEAP on Atari, one for each game."""
+    windows: int = 64
+    """Random windows of each trajectory to take the energy of."""
+    record: bool = False
+    """Write what was found to results/, which is committed."""
+    runs: Path = Path("runs")
+    """Where what is not recorded goes."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Says how energy and reward are correlated; the exit code."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("experiments.atari_energy", given, lambda: report(options))
+
+
+def report(options: Options) -> None:
+    """The correlation of each game, the file and the figure."""
+    check_counts(options, "windows")
+    specifications = [pretrained.read_specification(path) for path in options.checkpoint]
+    for path, specification in zip(options.checkpoint, specifications, strict=True):
+        if (specification.domain, specification.method) != ("atari", "leap"):
+            raise UserError(
+                f"{path} is {specification.method} on {specification.level}, not LEAP on Atari"
+            )
+    runtime.start()
+    path = (Path("results") if options.record else options.runs) / RESULTS
+    found = read_json(path) if path.exists() else {}
+    console = Console()
+    for checkpoint in options.checkpoint:
+        planner = pretrained.load(checkpoint)
+        each = correlate(planner, trajectories(planner), options.windows)
+        found[planner.specification.level] = each
+        console.print(
+            f"{planner.specification.level}: rank correlation {each['correlation']:.2f} of energy "
+            f"and reward (p = {each['p_value']:.2g}, {len(each['energies'])} trajectories)"
+        )
+    files.write_text(path, json.dumps(found, indent=1) + "\n")
+    picture = options.runs / "atari-energy.png"
+    plots.energy_against_reward(found, picture)
+    console.print(f"picture: {picture}", highlight=False, markup=False)
+
+
+def trajectories(planner: Pretrained) -> list[Demonstration]:
+    """What a planner learned from."""
+    specification = planner.specification
+    source = pretrained.make_domain(specification).source
+    assert source is not None  # as all games have
+    where = specification.origin.demonstrations or source.default
+    return source.load(where, specification.origin.seed).demonstrations
+
+
+def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -> dict[str, Any]:
+    """The mean energy per action of each trajectory, its return, and their rank correlation."""
+    specification = planner.specification
+    horizon, end = specification.planner.horizon, planner.energy.num_actions - 1
+    random = np.random.default_rng(specification.origin.seed)
+    # Windows lie within their trajectory: the end action is no action of a game.
+    games = [game for game in games if len(game.actions) >= horizon]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def energies(energy: Any, params: Any, steps: windows.Steps, places: jax.Array) -> jax.Array:
+        def one(place: jax.Array) -> jax.Array:
+            window = windows.window(steps, place, specification.context, horizon, end)
+            memory = energy.encode(params, window.context)
+            return energy.total(params, memory, window.actions) / horizon
+
+        return jax.vmap(one)(places).mean()
+
+    means, returns = [], []
+    for game in games:
+        places = random.integers(len(game.actions) - horizon + 1, size=count)
+        steps = jax.tree.map(jnp.asarray, windows.padded(windows.concatenate([game])))
+        means.append(float(energies(planner.energy, planner.params, steps, jnp.asarray(places))))
+        returns.append(float(game.rewards.sum()))
+    found = stats.spearmanr(means, returns)
+    return {
+        "energies": means,
+        "returns": returns,
+        "correlation": float(found.statistic),
+        "p_value": float(found.pvalue),
+        "horizon": horizon,
+        "windows": count,
+        "versions": results.versions(),
+        "date": results.today(),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

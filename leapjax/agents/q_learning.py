@@ -1,0 +1,103 @@
+"""What methods share that learn Q-values from transitions alone, and act by the highest."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from leapjax.agents import learning, losses
+from leapjax.agents.batches import transition_batches
+from leapjax.agents.learning import Setup
+from leapjax.data import windows
+from leapjax.models.policy import PolicyModel, Said
+from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The options of each of them."""
+
+    discount: float = 0.99
+    # The originals copy it every few thousand steps: 8,000 (Agarwal et al.), 2,000 (d3rlpy).
+    target_rate: float = 0.005  # how far the target network follows at each step
+
+    def __post_init__(self) -> None:
+        learning.check_shares(self, "discount", "target_rate")
+
+
+class Judged(NamedTuple):
+    """A step that was taken, and the W numbers that networks say of the states around it."""
+
+    now: jax.Array  # [P, W] before the step
+    later: jax.Array  # [P, W] after it
+    held: jax.Array  # [P, W] after it, by the target network
+    taken: jax.Array  # [P] int32: the action
+
+
+Returns = Callable[[jax.Array], jax.Array]
+# values of the states after a step, [P] or [P, N] -> targets of the same shape: `losses.bellman`
+Loss = Callable[[Judged, Returns, jax.Array], jax.Array]  # (judged, returns, key) -> [P]
+
+
+def make_agent(
+    setup: Setup,
+    mesh: Mesh | None,
+    width: int,
+    loss: Loss,
+    values: Callable[[jax.Array], jax.Array],
+) -> Agent:
+    """An `Agent` whose energy is minus its Q-values.
+
+    Args:
+        setup: what it is made from.
+        mesh: of devices to train on; None for one.
+        width: W, how many numbers its network says of a state.
+        loss: of each step.
+        values: of what is said, `[P, W]`: the Q-values, `[P, A - 1]`.
+    """
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    module = setup.policy(("q", width))
+    optimizer = learning.make_optimizer(setup.training)
+
+    def say(params: Params, context: Context) -> PyTree:
+        return module.apply(params, context)
+
+    def transition_loss(
+        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        context = transition.context
+        dropout_key, loss_key = jax.random.split(key)
+        said: Any = module.apply(
+            params, context, deterministic=False, rngs={"dropout": dropout_key},
+            method="transition",
+        )  # fmt: skip
+        now, later = (each["q"] for each in said)
+        held: Any = module.apply(target, windows.after(context))
+        taken, known = losses.last_actions(context, len(now), choices)
+
+        def returns(values: jax.Array) -> jax.Array:
+            return losses.bellman(transition, values, settings.discount)
+
+        each = loss(Judged(now, later, held["q"], taken), returns, loss_key)
+        q = values(now)
+        return losses.mean_where(each, known), {
+            "accuracy": losses.mean_where(jnp.argmax(q, axis=1) == taken, known),
+            "value": losses.mean_where(losses.of_action(q, taken), known),
+        }
+
+    init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
+    update = learning.make_update(
+        transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
+        setup.training.microbatch,
+    )  # fmt: skip
+    energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
+    return Agent(init, transition_batches(setup), update, energy)
+
+
+def _say(module: PolicyModel, context: Context, actions: jax.Array) -> Said:
+    """Touches every parameter, to initialise them."""
+    del actions
+    return module(context)

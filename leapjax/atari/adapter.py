@@ -1,0 +1,44 @@
+"""A game as the rollout sees it: ale-py's native environment, one frame a step."""
+
+import numpy as np
+from ale_py.vector_env import AtariVectorEnv
+
+from leapjax.atari.games import FRAME_SKIP, HEIGHT, WIDTH, Game
+from leapjax.environments import Transition
+
+
+class AtariAdapter:
+    """One game: unclipped rewards, up to 30 no-ops at the start, over when the game is.
+
+    It succeeds with as high a score as a gamer's.
+    """
+
+    def __init__(self, game: Game, sticky: float, max_steps: int) -> None:
+        self.num_actions = len(game.actions) + 1
+        self._game = game
+        self._env = AtariVectorEnv(
+            game.rom, num_envs=1, num_threads=1, stack_num=1, frameskip=FRAME_SKIP,
+            img_height=HEIGHT, img_width=WIDTH, repeat_action_probability=sticky,
+            max_num_frames_per_episode=max_steps * FRAME_SKIP, reward_clipping=False,
+            use_fire_reset=False,
+        )  # fmt: skip
+        self._score = 0.0
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Starts the game of a seed: the frame `[84, 84]` uint8."""
+        self._score = 0.0
+        observations, _ = self._env.reset(seed=seed)
+        return np.array(observations[0, -1])
+
+    def step(self, action: int) -> Transition:
+        """Takes one action, for four frames of the game."""
+        observations, rewards, terminated, truncated, _ = self._env.step(np.array([action]))
+        self._score += float(rewards[0])
+        over = bool(terminated[0] or truncated[0])
+        return Transition(
+            np.array(observations[0, -1]),
+            float(rewards[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            over and self._score >= self._game.human,
+        )

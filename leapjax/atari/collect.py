@@ -1,0 +1,167 @@
+"""Data in the format of DQN-Replay for whoever cannot download it: real games, played here.
+
+A file holds a game or more. It depends on its number alone, so that data do not depend on how
+many processes made them, nor on how often they were stopped.
+"""
+
+import itertools
+import json
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from multiprocessing.pool import AsyncResult
+from pathlib import Path
+from typing import Any
+
+from leapjax import files
+from leapjax.atari import demonstrators, replay
+from leapjax.atari.games import Game, find_game
+from leapjax.data.seeds import TRAINING_START, TRAINING_STRIDE
+from leapjax.errors import UserError
+
+SHARD = 1_000  # transitions of a file, at least: what a killed program loses at most of each core
+GAMES = 1_000  # of a file, at most
+BYTES = 200  # of a transition on the disk, more or less
+LONGEST = 5_000  # decisions of a game: a ball can fly on for ever
+POLL = 0.2  # seconds
+
+Manifest = dict[str, Any]
+
+
+def collect(
+    folder: Path,
+    game: Game,
+    transitions: int,
+    run: int = 1,
+    longest: int = LONGEST,
+    workers: int | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> list[Manifest]:
+    """Plays until there are so many transitions; goes on where it was stopped.
+
+    Args:
+        folder: of all games.
+        game: to play.
+        transitions: at least so many, in whole games.
+        run: number of the run, from 1; others have other games.
+        longest: decisions of a game, which then counts as over.
+        workers: processes; None for one on each core.
+        progress: called with the number of transitions so far.
+
+    Returns:
+        What is in each file: its games, with their scores.
+    """
+    logs = replay.replay_logs(folder, game, run)
+    workers = workers or len(os.sched_getaffinity(0))
+    with files.only_process_in(logs):
+        files.check_room(logs, transitions * BYTES)
+        found: dict[int, Manifest] = {}
+        done = 0
+        # Not forked: this process may run threads.
+        context = multiprocessing.get_context("spawn")
+        waiting = (number for number in itertools.count() if _known(logs, number) is None)
+        with context.Pool(workers, _ignore_interrupts) as pool:
+
+            def submit() -> AsyncResult[Manifest]:
+                shard = folder, game.name, run, next(waiting), longest
+                return pool.apply_async(make_shard, shard)
+
+            running: list[AsyncResult[Manifest]] = []
+            for number in itertools.count():
+                if done >= transitions:
+                    break
+                while _known(logs, number) is None:
+                    running = [each for each in running if not _finished(each)]
+                    running += [submit() for _ in range(workers - len(running))]
+                    time.sleep(POLL)
+                found[number] = _known(logs, number) or {}
+                done += _transitions(found[number])
+                progress(min(done, transitions))
+    manifests = list(found.values())
+    files.write_text(logs.parent / "manifest.json", json.dumps(manifests, indent=1) + "\n")
+    return manifests
+
+
+def is_whole(folder: Path, game: Game, transitions: int, run: int = 1) -> bool:
+    """Whether `collect` has nothing left to do."""
+    logs, done = replay.replay_logs(folder, game, run), 0
+    for manifest in _known_shards(logs):
+        done += _transitions(manifest)
+        if done >= transitions:
+            return True
+    return False
+
+
+def make_shard(folder: Path, name: str, run: int, number: int, longest: int = LONGEST) -> Manifest:
+    """Plays and writes one file; what is in it."""
+    game = find_game(name)
+    logs = replay.replay_logs(folder, game, run)
+    noises = demonstrators.NOISES[name]
+    first = TRAINING_START + run * TRAINING_STRIDE + number * GAMES
+    played: list[replay.Episode] = []
+    games: list[dict[str, Any]] = []
+    while sum(len(episode.actions) for episode in played) < SHARD:
+        index = len(played)
+        seed, noise = first + index, noises[(number + index) % len(noises)]
+        each = demonstrators.play(game, seed, noise, longest)
+        played.append(replay.Episode(each.frames, each.actions, each.rewards))
+        games.append(
+            {
+                "seed": seed, "noise": noise, "score": each.score,
+                "transitions": len(each.actions),
+            }
+        )  # fmt: skip
+    replay.write_shard(logs, number, played)
+    manifest = {
+        "game": name, "run": run, "shard": number, "games": games,
+        "versions": {each: metadata.version(each) for each in ("leapjax", "ale-py", "numpy")},
+    }  # fmt: skip
+    # Last: a file without its manifest is made again.
+    files.write_text(_manifest(logs, number), json.dumps(manifest) + "\n")
+    return manifest
+
+
+def _manifest(logs: Path, number: int) -> Path:
+    return logs / f"manifest.{number}.json"
+
+
+def _known(logs: Path, number: int) -> Manifest | None:
+    """What is in a file that was made here; None if it was not."""
+    path = _manifest(logs, number)
+    if not path.exists() or not replay.has_shard(logs, number):
+        return None
+    try:
+        manifest = json.loads(files.read_text(path))
+        _transitions(manifest)
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
+    return manifest
+
+
+def _known_shards(logs: Path) -> Iterator[Manifest]:
+    """What is in the files that were made here, up to the first that was not."""
+    for number in itertools.count():
+        manifest = _known(logs, number)
+        if manifest is None:
+            return
+        yield manifest
+
+
+def _transitions(manifest: Manifest) -> int:
+    return sum(int(game["transitions"]) for game in manifest["games"])
+
+
+def _finished(result: AsyncResult[Manifest]) -> bool:
+    """Whether a process is done with its file; what went wrong there is raised here."""
+    if not result.ready():
+        return False
+    result.get()
+    return True
+
+
+def _ignore_interrupts() -> None:
+    """Ctrl-C reaches all processes: the first one ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,338 @@
+"""Players that are built in, so that data can be made without a download.
+
+They know what the emulator's memory means, and try in the emulator what would happen: a paddle
+follows a rule that is tried with several aims, Qbert searches a tree of hops, and Seaquest takes
+the best of random plans.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from leapjax.atari.emulator import MOST_NOOPS, Emulator
+from leapjax.atari.games import FRAME_SKIP, MAX_FRAMES, Game
+
+Demonstrator = Callable[[Emulator, np.random.Generator], int]
+# what to do now; leaves the emulator as it found it. One plays one game, from its start on.
+
+MOST_STEPS = MAX_FRAMES // FRAME_SKIP
+NOISES: dict[str, tuple[float, ...]] = {
+    "Breakout": (0.0, 0.1, 0.3),
+    "Qbert": (0.0, 0.1, 0.3),
+    "Pong": (0.0, 0.1, 0.3),
+    "Seaquest": (0.0, 0.1, 0.3),
+}  # probabilities of a random action with which returns vary
+
+_NOOP = 0  # in every game
+
+
+class PlayedGame(NamedTuple):
+    """What was seen, done and won in a game of `n` decisions."""
+
+    frames: np.ndarray  # [n, 84, 84] uint8: before each action
+    actions: np.ndarray  # [n] int32: as executed
+    rewards: np.ndarray  # [n] float32, not clipped
+    over: bool  # it came to an end of its own
+
+    @property
+    def score(self) -> float:
+        """The sum of all rewards."""
+        return float(self.rewards.sum())
+
+
+def play(game: Game, seed: int, noise: float, most_steps: int = MOST_STEPS) -> PlayedGame:
+    """Plays a game; the same one for the same arguments.
+
+    Args:
+        game: which.
+        seed: of the no-ops that it starts with, up to 30, and of all that is random.
+        noise: how probable it is that a random action takes the place of a decision.
+        most_steps: after how many decisions to stop; some games hardly end.
+    """
+    starts, noises, thoughts = (
+        np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(3)
+    )
+    emulator, demonstrator = Emulator(game), make_demonstrator(game)
+    emulator.reset(int(starts.integers(MOST_NOOPS + 1)))
+    frames: list[np.ndarray] = []
+    actions: list[int] = []
+    rewards: list[float] = []
+    while not emulator.over and len(actions) < most_steps:
+        frames.append(emulator.frame())
+        action = demonstrator(emulator, thoughts)
+        if noises.random() < noise:
+            action = int(noises.integers(emulator.num_actions))
+        actions.append(action)
+        rewards.append(emulator.step(action))
+    return PlayedGame(
+        np.stack(frames), np.array(actions, np.int32), np.array(rewards, np.float32), emulator.over
+    )
+
+
+def make_demonstrator(game: Game) -> Demonstrator:
+    """A player for one game."""
+    makers: dict[str, Callable[[], Demonstrator]] = {
+        "Breakout": lambda: _Paddle(_BREAKOUT),
+        "Qbert": _Qbert,
+        "Pong": lambda: _Paddle(_PONG),
+        "Seaquest": _Seaquest,
+    }
+    return makers[game.name]()
+
+
+class _Table(NamedTuple):
+    """A game with a ball, which flies along, to and from a paddle, which moves across."""
+
+    along: int  # where in memory the ball is; 0 there means that there is none
+    across: int
+    paddle: int
+    line: int  # where along the paddle is
+    walls: tuple[int, int]  # where across the ball bounces
+    middle: float  # of the paddle: where across the ball is then, less the paddle's number
+    more: int  # the action that makes the paddle's number greater
+    less: int
+    tap: float  # how far one decision moves the paddle
+    coast: float  # how much of it comes after the decision
+    serve: int  # the action that brings a ball
+    aims: tuple[float, ...]  # distances from the paddle's middle with which to hit a ball
+    enough: float  # the reward of a hit that is good enough not to try more
+
+
+_PONG = _Table(
+    49, 54, 51, 187, (44, 207), 5.5, 3, 2, 22.5, 12.5, _NOOP, (0, 4, -4, 8, -8, 12, -12), 1
+)
+_BREAKOUT = _Table(101, 99, 72, 180, (55, 201), 9, 2, 3, 22, 11, 1, (0, 3, -3, 6, -6), 0)
+_LONGEST_SHOT = 80  # decisions
+
+
+def _bounce(position: float, low: float, high: float) -> float:
+    """Where something is between two walls that would be at `position` without them."""
+    span = high - low
+    return low + span - abs((position - low) % (2 * span) - span)
+
+
+def _coming(table: _Table, before: np.ndarray, ram: np.ndarray) -> bool:
+    """Whether the ball flies towards the paddle."""
+    return 0 < before[table.along] < ram[table.along]
+
+
+def _steer(table: _Table, before: np.ndarray, ram: np.ndarray, action: int, aim: float) -> int:
+    """What to do, given the memory one decision ago and now, `[128]`, and that decision."""
+    along, across, paddle = (int(ram[at]) for at in (table.along, table.across, table.paddle))
+    if along == 0:
+        return table.serve
+    target = float(across)
+    if _coming(table, before, ram):
+        slope = (across - int(before[table.across])) / (along - int(before[table.along]))
+        target = _bounce(across + slope * max(table.line - along, 0), *table.walls)
+    # After a move the paddle goes on: what counts is where it will come to rest.
+    rest = paddle + table.coast * ((action == table.more) - (action == table.less))
+    error = target - table.middle - aim - rest
+    if abs(error) <= table.tap / 2:
+        return _NOOP
+    return table.more if error > 0 else table.less
+
+
+class _Paddle:
+    """Plays Pong and Breakout: goes to where the ball will come, and tries how best to hit it."""
+
+    def __init__(self, table: _Table) -> None:
+        self._table = table
+        self._before = np.zeros(128, np.uint8)
+        self._aim: float | None = None  # None until the ball comes
+
+    def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
+        before, ram = self._before, emulator.ram()
+        self._before = ram
+        if not _coming(self._table, before, ram):
+            self._aim = None
+        elif self._aim is None:
+            self._aim = self._choose(emulator, before, random)
+        return _steer(self._table, before, ram, emulator.action, self._aim or 0)
+
+    def _choose(self, emulator: Emulator, before: np.ndarray, random: np.random.Generator) -> float:
+        """The aim that wins most; in a random order, or a ball might fly in a circle for ever."""
+        saved, best, most = emulator.save(), 0.0, -np.inf
+        for aim in random.permutation(self._table.aims):
+            value = self._outcome(emulator, before, aim)
+            emulator.restore(saved)
+            if value > most:
+                best, most = float(aim), value
+            if value >= self._table.enough:
+                break
+        return best
+
+    def _outcome(self, emulator: Emulator, before: np.ndarray, aim: float) -> float:
+        """The reward until the ball comes again, or it is clear that it is enough; -1 if lost."""
+        table, lives, ram = self._table, emulator.lives, emulator.ram()
+        total, returned = 0.0, False
+        for _ in range(_LONGEST_SHOT):
+            total += emulator.advance(_steer(table, before, ram, emulator.action, aim))
+            before, ram = ram, emulator.ram()
+            if emulator.lives < lives or total < 0:
+                return -1
+            coming = _coming(table, before, ram)
+            if ram[table.along] == 0 or (returned and coming):
+                break
+            returned = returned or not coming
+            if returned and total >= table.enough:
+                break
+        return total
+
+
+_TILES = (
+    21, 52, 54, 83, 85, 87, 98, 100, 102, 104, 1, 3, 5, 7, 9, 32, 34, 36, 38, 40, 42,
+)  # fmt: skip  # where in memory their colours are, row by row
+_TILE_PLACES = [(row, place) for row in range(6) for place in range(row + 1)]
+_HOPS = {5: (1, 0), 3: (1, 1), 2: (-1, 0), 4: (-1, -1)}  # by action: rows and places gone
+_LONGEST_HOP = 12  # decisions; most take 7
+_WAIT = 4  # decisions
+_HOPS_AHEAD = 2  # with 3 it saw no more, and put off what was to be done
+_DIED = -40.0  # the value of it, in tiles
+
+
+def _rests(ram: np.ndarray) -> bool:
+    """Whether Qbert stands somewhere, and can hop."""
+    return bool(ram[82] == 0 and ram[114] == 0 and ram[43] > 0)
+
+
+def _tile(ram: np.ndarray) -> tuple[int, int]:
+    """The row where Qbert stands, and the place in it."""
+    row = round((int(ram[67]) - 25) / 28)
+    return row, round(((int(ram[43]) - 77) / 12 + row) / 2)
+
+
+def _is_tile(row: int, place: int) -> bool:
+    return 0 <= place <= row < 6
+
+
+class _Qbert:
+    """Searches a tree of hops wherever it can hop, and does nothing in the air."""
+
+    def __init__(self) -> None:
+        self._colours: list[int] = []  # that tiles have had in this round, in order
+        self._order: list[int] = []  # of actions: the first of those that are equally good is done
+
+    def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
+        if not self._order:  # drawn once: games differ, but a game's decisions are consistent
+            self._order = [*random.permutation(list(_HOPS)).tolist(), _NOOP]
+        ram = emulator.ram()
+        colours = [int(ram[at]) for at in _TILES]
+        if len(set(colours)) == 1:  # a new round
+            self._colours = []
+        self._colours = list(dict.fromkeys(self._colours + colours))
+        return self._search(emulator, _HOPS_AHEAD)[1] if _rests(ram) else _NOOP
+
+    def _search(self, emulator: Emulator, depth: int) -> tuple[float, int]:
+        """The value of the best that can be done now, in tiles, and the action."""
+        saved, (row, place) = emulator.save(), _tile(emulator.ram())
+        best, most = _NOOP, -np.inf
+        for action in self._order:
+            down, aside = _HOPS.get(action, (0, 0))
+            if depth < _HOPS_AHEAD and not _is_tile(row + down, place + aside):
+                continue  # whether there is a disc beyond the edge is only tried for the first hop
+            value = self._hop(emulator, action)
+            if value > _DIED:
+                if depth > 1 and _rests(emulator.ram()):
+                    value += 0.95 * self._search(emulator, depth - 1)[0]
+                else:
+                    value -= 0.2 * self._distance(emulator.ram())
+            emulator.restore(saved)
+            if value > most + 1e-6:
+                best, most = action, value
+        return most, best
+
+    def _hop(self, emulator: Emulator, action: int) -> float:
+        """Hops until Qbert has landed, or waits; the reward, in tiles."""
+        lives, reward = emulator.lives, 0.0
+        for step in range(_LONGEST_HOP if action else _WAIT):
+            reward += emulator.advance(_NOOP if step else action)
+            if emulator.lives < lives:
+                return _DIED
+            if action and step and _rests(emulator.ram()):
+                break
+        return reward / 25
+
+    def _distance(self, ram: np.ndarray) -> int:
+        """How many hops it is to a tile whose colour has changed least often in this round."""
+        row, place = _tile(ram)
+        known = {colour: stage for stage, colour in enumerate(self._colours)}
+        stages = [known.get(int(ram[at]), len(known)) for at in _TILES]
+        return min(
+            abs(place - to_place) + abs(row - place - to_row + to_place)
+            for stage, (to_row, to_place) in zip(stages, _TILE_PLACES, strict=True)
+            if stage == min(stages)
+        )
+
+
+_SHOTS = (1, *range(10, 18))  # the actions that fire, and move in some direction or none
+_HOLD = 2  # decisions that an action of a plan is repeated for
+_HORIZON = 8  # actions in a plan
+_PLANS = 4  # that are tried at a time; 8 scored no more
+_BETTER = 0.05  # by how much, in hits, a plan must be better than the one that there is
+
+
+def _dies(ram: np.ndarray) -> bool:
+    """Whether the submarine is breaking up; the number of lives says so 24 decisions later."""
+    return bool(ram[105] > 0)
+
+
+def _prospects(ram: np.ndarray) -> float:
+    """What the end of a plan promises, in hits: divers, and the way up when it is time for it."""
+    oxygen, divers, depth = int(ram[102]), int(ram[62]), int(ram[97]) - 13
+    # To come up without a diver is death, too.
+    suffocating = max(0, 24 - oxygen) / 24 if divers else 0
+    return divers - max(suffocating, 0.3 * (divers >= 6)) * depth / 10
+
+
+class _Seaquest:
+    """Takes the best of random plans; what is left of it is the next one to be beaten."""
+
+    def __init__(self) -> None:
+        self._plan: list[int] = []  # of actions, the first of which is being done
+        self._held = 0  # for how many decisions it has been
+
+    def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
+        if _dies(emulator.ram()):
+            self._plan, self._held = [], 0
+            return _SHOTS[0]
+        if self._held % _HOLD == 0:
+            self._plan = self._choose(emulator, random, self._plan[1:] or [_SHOTS[0]])
+        self._held += 1
+        return self._plan[0]
+
+    def _choose(
+        self, emulator: Emulator, random: np.random.Generator, kept: list[int]
+    ) -> list[int]:
+        """The best plan. Not a slightly better one: what is done should follow from the frames."""
+        saved = emulator.save()
+        kept = kept + kept[-1:] * (_HORIZON - len(kept))
+        best, most = kept, self._value(emulator, kept)
+        for number in range(_PLANS):
+            plan = self._change(kept, random) if number % 2 else self._change([], random)
+            emulator.restore(saved)
+            value = self._value(emulator, plan)
+            if value > most + _BETTER * (1 + (plan[0] != kept[0])):
+                best, most = plan, value
+        emulator.restore(saved)
+        return best
+
+    def _change(self, plan: list[int], random: np.random.Generator) -> list[int]:
+        """A plan with some other actions, each repeated a few times; a new one if it is empty."""
+        plan, start = list(plan), int(random.integers(_HORIZON)) if plan else 0
+        changed = plan or [_SHOTS[0]] * _HORIZON
+        while start < _HORIZON:
+            stop = min(start + int(random.integers(1, 5)), _HORIZON)
+            changed[start:stop] = [int(random.choice(_SHOTS))] * (stop - start)
+            start = _HORIZON if plan and random.random() < 0.5 else stop
+        return changed
+
+    def _value(self, emulator: Emulator, plan: list[int]) -> float:
+        """The reward of a plan and what it leads to, in hits."""
+        total = 0.0
+        for step, action in enumerate(plan):
+            total += sum([emulator.advance(action) for _ in range(_HOLD)]) / 20
+            if _dies(emulator.ram()):
+                return total - 100 + step
+        return total + _prospects(emulator.ram())

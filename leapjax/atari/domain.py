@@ -1,0 +1,188 @@
+"""The games of Atari as a `Domain`."""
+
+import dataclasses
+import functools
+import importlib.util
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax.atari import replay
+from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
+from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_FRAMES, WIDTH, Game, find_game
+from leapjax.domain import Collection, Domain, DomainType, Source
+from leapjax.environments import Adapter
+from leapjax.errors import UserError, check_at_least
+from leapjax.models.trajectory import ModelConfig
+from leapjax.types import Window
+
+LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
+FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
+TOKENS = 4  # of a state, of our encoder
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Atari: data, games and augmentation."""
+
+    transitions: int = 50_000  # to learn from, by whole trajectories
+    replay_run: int = 1  # of the runs that DQN-Replay has of each game
+    sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
+    max_steps: int = MAX_FRAMES // FRAME_SKIP  # of a game: then it is cut off
+    shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
+
+    def __post_init__(self) -> None:
+        check_at_least(self, 1, "transitions", "replay_run", "max_steps")
+        check_at_least(self, 0, "shift")
+        if not 0 <= self.sticky <= 1:  # false for NaN too
+            raise ValueError(f"sticky must be in 0 .. 1, got {self.sticky}")
+        if self.shift >= WIDTH:
+            raise ValueError(f"shift must be less than {WIDTH}, got {self.shift}")
+
+
+def make(name: str, settings: Settings) -> Domain:
+    """A game by its name.
+
+    Raises:
+        UserError: there is none, or ale-py is not installed.
+    """
+    game = find_game(name)
+    if importlib.util.find_spec("ale_py") is None:
+        raise UserError("Atari needs ale-py, which is missing: pip install 'leapjax[atari]'")
+
+    def make_adapter() -> Adapter:
+        from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
+
+        return AtariAdapter(game, settings.sticky, settings.max_steps)
+
+    shift = functools.partial(shifted, most=settings.shift)
+    return Domain(
+        level=name,
+        make_adapter=make_adapter,
+        collect=functools.partial(no_episodes, name),
+        actions=(*game.actions, "end"),
+        max_steps=settings.max_steps,
+        blank=np.zeros((HEIGHT, WIDTH), np.uint8),
+        encoders={"paper": state_tokens, "leapjax": current_tokens},
+        augmentations=[shift] if settings.shift else (),
+        source=source(game, settings),
+        return_scale=game.return_scale,
+        signature={"actions": list(game.actions)},
+    )
+
+
+def state_tokens(model: ModelConfig, context: int) -> nn.Module:
+    """The paper's encoder."""
+    del context
+    return StateTokens(model.width, model.dtype)
+
+
+def current_tokens(model: ModelConfig, context: int) -> nn.Module:
+    """Ours."""
+    del context
+    return CurrentTokens(model.width, TOKENS, model.dtype)
+
+
+def source(game: Game, settings: Settings) -> Source:
+    """Where the trajectories of a game come from."""
+
+    def load(where: str, seed: int) -> Collection:
+        return replay.read(Path(where), game, settings.transitions, seed, settings.replay_run)
+
+    def write(where: str, progress: Callable[[int], None]) -> None:
+        from leapjax.atari.collect import collect  # noqa: PLC0415  (so)
+
+        collect(
+            Path(where),
+            game,
+            settings.transitions,
+            settings.replay_run,
+            longest=LONGEST,
+            progress=progress,
+        )
+
+    def exists(where: str) -> bool:
+        from leapjax.atari.collect import is_whole  # noqa: PLC0415  (so)
+
+        return is_whole(Path(where), game, settings.transitions, settings.replay_run)
+
+    return Source(FOLDER, exists, write, load, settings.transitions)
+
+
+def no_episodes(name: str, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
+    """Games are played by the transition, not by the episode: see `source`.
+
+    Raises:
+        UserError: always.
+    """
+    raise UserError(
+        f"{name} is not collected by episodes: python -m experiments.atari collect --game {name}"
+    )
+
+
+def shifted(key: jax.Array, window: Window, most: int) -> Window:
+    """A window whose frames are all moved by the same few pixels (Kostrikov et al., DrQ, 2020)."""
+    corner = jax.random.randint(key, (2,), 0, 2 * most + 1)
+
+    def move(frames: jax.Array) -> jax.Array:
+        around = [(0, 0)] * (frames.ndim - 2) + [(most, most)] * 2
+        wide = jnp.pad(frames, around, mode="edge")
+        start = [jnp.int32(0)] * (frames.ndim - 2) + [corner[0], corner[1]]
+        return jax.lax.dynamic_slice(wide, start, frames.shape)
+
+    context = window.context
+    moved = context._replace(observation=move(context.observation), past=move(context.past))
+    return window._replace(context=moved)
+
+
+# By game: T, N and the batch (paper, tables 6 and 8), and the return that is asked for, of
+# clipped rewards (Chen et al., 2021, give the first three of these games' in the same way).
+PAPER = {
+    "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
+}  # fmt: skip
+EPOCHS = 10
+
+
+def preset(name: str, preset: str) -> Mapping[str, Any]:
+    """What a preset sets for a game.
+
+    Raises:
+        UserError: an unknown game.
+    """
+    find_game(name)
+    shared = {"executed": 1, "episodes": 10, "demos": 100_000}  # as many as there are
+    if preset == "paper":
+        horizon, iterations, batch = PAPER[name]
+        transitions = 500_000
+        return {
+            **shared, "transitions": transitions, "steps": EPOCHS * transitions // batch,
+            "context": 25, "horizon": horizon, "iterations": iterations, "batch": batch,
+            "layers": 6, "heads": 8, "attention": "causal", "max_steps": 27_000,
+        }  # fmt: skip
+    return {
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 5000,
+        "layers": 2, "shift": 4, "max_steps": LONGEST,
+    }  # fmt: skip
+
+
+def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
+    """What a game changes of a method's own options."""
+    game = find_game(name)
+    options: dict[str, Any] = {"windows": "step"}
+    if method in ("leap", "dt"):
+        options["target_return"] = game.target
+    if method == "leap":
+        options |= {"end": False, "returns": True}
+        if preset == "paper":
+            options |= {"masking": "one", "microbatch": 0}
+    if preset == "leapjax":
+        options["learning_rate"] = 1e-3
+    return options
+
+
+ATARI = DomainType(Settings, make, tuple(GAMES), preset, tuned)

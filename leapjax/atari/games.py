@@ -1,0 +1,76 @@
+"""The games of the paper: their actions, and the scores that others have reached."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from leapjax.errors import UserError, did_you_mean
+
+HEIGHT = WIDTH = 84  # of a frame, in pixels (Mnih et al., 2015)
+FRAME_SKIP = 4  # frames that an action is repeated for
+MAX_FRAMES = 108_000  # of a game: half an hour
+
+
+class Game(NamedTuple):
+    """One game of the Arcade Learning Environment."""
+
+    name: str  # as the paper and DQN-Replay write it
+    rom: str  # as ale-py does
+    actions: tuple[str, ...]  # those that it has a use for, in ale-py's order
+    random: float  # score of random actions (Mnih et al., 2015)
+    human: float  # score of a professional tester of games
+    target: float  # return to ask for, of clipped rewards
+    return_scale: float  # what returns are divided by before a network sees them
+    paper: Mapping[str, float]  # gamer-normalised scores by method (paper, table 2), in percent
+    paper_without_return: float  # LEAP's, not conditioned on a return (paper, table 9)
+
+    def normalised(self, score: float) -> float:
+        """A score, 0 as high as random actions' and 100 as a gamer's."""
+        return 100 * (score - self.random) / (self.human - self.random)
+
+
+_JOYSTICK = (
+    "noop", "fire", "up", "right", "left", "down", "upright", "upleft", "downright", "downleft",
+    "upfire", "rightfire", "leftfire", "downfire", "uprightfire", "upleftfire", "downrightfire",
+    "downleftfire",
+)  # fmt: skip
+_METHODS = ("leap", "dt", "cql", "qr_dqn", "rem", "bc")
+
+
+def _paper(*scores: float) -> Mapping[str, float]:
+    return dict(zip(_METHODS, scores, strict=True))
+
+
+GAMES: dict[str, Game] = {
+    game.name: game
+    for game in (
+        Game(
+            "Breakout", "breakout", ("noop", "fire", "right", "left"), 1.7, 30.5, 100.0, 50.0,
+            _paper(400.9, 267.5, 211.1, 17.1, 8.9, 138.9), 182.0,
+        ),
+        Game(
+            "Qbert", "qbert", ("noop", "fire", "up", "right", "left", "down"),
+            163.9, 13455.0, 400.0, 200.0, _paper(19.5, 15.4, 104.2, 0.0, 0.0, 17.3), 41.0,
+        ),
+        Game(
+            "Pong", "pong", ("noop", "fire", "right", "left", "rightfire", "leftfire"),
+            -20.7, 14.6, 20.0, 10.0, _paper(108.9, 106.1, 111.9, 18.0, 0.5, 85.2), 100.7,
+        ),
+        Game(
+            "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 300.0, 100.0,
+            _paper(1.3, 2.5, 1.7, 0.4, 0.7, 2.1), 0.5,
+        ),
+    )
+}  # fmt: skip
+
+
+def find_game(name: str) -> Game:
+    """The game of that name.
+
+    Raises:
+        UserError: there is none; names those that there are.
+    """
+    if name not in GAMES:
+        raise UserError(
+            f"unknown game {name!r}: expected one of {', '.join(GAMES)}{did_you_mean(name, GAMES)}"
+        )
+    return GAMES[name]

@@ -1,0 +1,253 @@
+import functools
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import atari, report
+from leapjax.atari import collect, domain, encoders, replay
+from leapjax.atari.adapter import AtariAdapter
+from leapjax.atari.games import GAMES, find_game
+from leapjax.data import windows
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from leapjax.types import Demonstration
+
+PONG, BREAKOUT = GAMES["Pong"], GAMES["Breakout"]
+MODEL = ModelConfig(width=16, layers=1, heads=1, dropout=0.0)
+
+
+def frames(count, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (count, 84, 84)).astype(np.uint8)
+
+
+def demonstration(length, seed=0):
+    rng = np.random.default_rng(seed)
+    actions = rng.integers(0, 4, length).astype(np.int32)
+    rewards = rng.integers(0, 2, length).astype(np.float32)
+    return Demonstration(frames(length + 1, seed), actions, rewards, True, False, -1)
+
+
+def window(index, context=3, length=9):
+    steps = jax.tree.map(jnp.asarray, windows.concatenate([demonstration(length)]))
+    return windows.window(steps, index, context, 2, 4)
+
+
+def play(adapter, seed, steps):
+    seen, transitions = [adapter.reset(seed)], []
+    for index in range(steps):
+        transitions.append(adapter.step(index % (adapter.num_actions - 1)))
+        seen.append(transitions[-1].observation)
+        if transitions[-1].terminated or transitions[-1].truncated:
+            break
+    return np.stack(seen), transitions
+
+
+def test_a_game_is_the_same_for_the_same_seed_alone():
+    adapter = AtariAdapter(BREAKOUT, 0.0, 27_000)
+    first, _ = play(adapter, 3, 60)
+    again, _ = play(adapter, 3, 60)
+    other, _ = play(adapter, 4, 60)
+    assert first.shape == (61, 84, 84) and first.dtype == np.uint8
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_a_game_is_cut_off_where_it_is_asked_to_be():
+    seen, transitions = play(AtariAdapter(PONG, 0.0, 40), 0, 100)
+    assert transitions[-1].truncated and not transitions[-1].terminated
+    assert 30 <= len(transitions) <= 40  # the no-ops at its start are of the game
+    assert not transitions[-1].success and len(seen) == len(transitions) + 1
+
+
+def test_rewards_are_not_clipped():
+    adapter = AtariAdapter(GAMES["Qbert"], 0.0, 27_000)
+    _, transitions = play(adapter, 0, 300)
+    rewards = {t.reward for t in transitions}
+    assert rewards <= {0.0, 25.0, 50.0, 75.0, 100.0, 300.0, 500.0} and len(rewards) > 1
+
+
+def test_success_is_the_score_of_a_gamer():
+    easy = BREAKOUT._replace(human=0.0)
+    over = [play(AtariAdapter(game, 0.0, 300), 0, 400)[1][-1].success for game in (easy, BREAKOUT)]
+    assert over == [True, False]
+
+
+def test_a_state_is_the_last_four_frames():
+    given = jnp.asarray(frames(6))
+    states = np.asarray(encoders.stacked(given, 6))
+    assert states.shape == (6, 84, 84, 4)
+    for index in range(6):
+        for back in range(4):
+            expected = given[index - back] if index >= back else np.zeros((84, 84), np.uint8)
+            np.testing.assert_array_equal(states[index, :, :, 3 - back], expected)
+    np.testing.assert_array_equal(encoders.stacked(given, 1), states[-1:])
+    np.testing.assert_array_equal(encoders.stacked(given[:2], 1)[0], states[1])
+
+
+@pytest.mark.parametrize("architecture", ["paper", "leapjax"])
+def test_encoders_see_what_they_should(architecture):
+    made = domain.make("Breakout", domain.Settings())
+    context = window(8, context=6).context
+    encoder = made.encoders[architecture](MODEL, 6)
+    params = encoder.init(jax.random.key(0), context)
+    before = encoder.apply(params, context)
+    assert before.shape == ((7, 16) if architecture == "paper" else (domain.TOKENS, 16))
+    for changed in range(6):
+        past = context.past.at[changed].set(255 - context.past[changed])
+        after = encoder.apply(params, context._replace(past=past))
+        differs = np.abs(after - before).max(axis=1) > 1e-6
+        if architecture == "paper":  # of its own state, and of the three after it
+            expected = (np.arange(7) >= changed) & (np.arange(7) < changed + encoders.STACK)
+            np.testing.assert_array_equal(differs, expected)
+        else:
+            assert differs.all() if changed >= 3 else not differs.any()
+
+
+def test_a_shift_moves_all_frames_alike():
+    drawn = window(5)
+    move = jax.jit(functools.partial(domain.shifted, most=4))
+    corners = set()
+    for seed in range(12):
+        moved = move(jax.random.key(seed), drawn)
+        both = {"now": (drawn.context.observation[None], moved.context.observation[None])}
+        both["past"] = (drawn.context.past, moved.context.past)
+        found = []
+        for old, new in both.values():
+            wide = np.pad(old, ((0, 0), (4, 4), (4, 4)), mode="edge")
+            found.append(
+                {
+                    (y, x)
+                    for y in range(9)
+                    for x in range(9)
+                    if np.array_equal(wide[:, y : y + 84, x : x + 84], new)
+                }
+            )
+        assert found[0] == found[1] and len(found[0]) == 1
+        corners |= found[0]
+        np.testing.assert_array_equal(moved.actions, drawn.actions)
+    assert len(corners) > 6
+    still = domain.shifted(jax.random.key(0), drawn, 0)
+    np.testing.assert_array_equal(still.context.past, drawn.context.past)
+
+
+def test_presets_are_the_papers_and_ours():
+    settings = {name: domain.preset(name, "paper") for name in GAMES}
+    assert [s["batch"] for s in settings.values()] == [64, 64, 256, 128]
+    assert [(s["horizon"], s["iterations"]) for s in settings.values()] == [
+        (5, 10), (5, 10), (5, 10), (10, 30)
+    ]  # fmt: skip
+    assert all(s["attention"] == "causal" and s["executed"] == 1 for s in settings.values())
+    assert not domain.tuned("Pong", "leap", "leapjax")["end"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"transitions": 0}, {"sticky": 1.5}, {"sticky": float("nan")}, {"shift": -1}, {"shift": 84},
+     {"max_steps": 0}, {"replay_run": 0}],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_refused(changes):
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        domain.Settings(**changes)
+
+
+def test_an_unknown_game_names_its_nearest():
+    with pytest.raises(UserError, match="unknown game 'pongg': .*did you mean Pong"):
+        find_game("pongg")
+
+
+def test_without_ale_py_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(domain.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"pip install 'leapjax\[atari\]'"):
+        domain.make("Pong", domain.Settings())
+
+
+def test_a_normalised_score_is_between_random_and_a_gamer():
+    assert BREAKOUT.normalised(BREAKOUT.random) == 0
+    assert BREAKOUT.normalised(BREAKOUT.human) == pytest.approx(100)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    """A folder of a few short games, made by the real command."""
+    folder = tmp_path_factory.mktemp("atari")
+    command = ["collect", "--game", "Breakout", "--transitions", "900", "--longest", "60"]
+    arguments = [*command, "--folder", str(folder), "--workers", "1"]
+    assert atari.main(arguments) == 0
+    return folder, arguments
+
+
+def test_what_was_collected_is_what_was_played(collected):
+    folder, _ = collected
+    made = json.loads((folder / "Breakout" / "1" / "manifest.json").read_text())
+    games = [game for manifest in made for game in manifest["games"]]
+    found = replay.read(folder, BREAKOUT, 900, seed=0).demonstrations
+    total = sum(game["transitions"] for game in games)
+    assert 900 <= sum(len(d.actions) for d in found) <= total
+    assert {game["noise"] for game in games} == {0.0, 0.1, 0.3}
+    assert all(len(d.actions) <= 60 and d.observations.shape[1:] == (84, 84) for d in found)
+    assert max(game["score"] for game in games) > 0
+
+
+def test_collecting_goes_on_where_it_was_stopped(collected):
+    folder, arguments = collected
+    logs = replay.replay_logs(folder, BREAKOUT, 1)
+    shard = logs / "$store$_observation_ckpt.0.gz"
+    before, when = shard.read_bytes(), shard.stat().st_mtime_ns
+    assert collect.is_whole(folder, BREAKOUT, 900)
+    assert not collect.is_whole(folder, BREAKOUT, 100_000)
+    assert not collect.is_whole(folder, PONG, 900)
+    assert atari.main(arguments) == 0
+    assert shard.stat().st_mtime_ns == when  # nothing was left to do
+    (logs / "manifest.0.json").unlink()  # as if it had been killed before its end
+    assert not collect.is_whole(folder, BREAKOUT, 900)
+    assert atari.main(arguments) == 0
+    assert shard.stat().st_mtime_ns > when and shard.read_bytes() == before
+
+
+@pytest.mark.parametrize("method", ["leap", "dt"])
+def test_a_method_trains_on_them_and_plays(method, collected, tmp_path, monkeypatch, capsys):
+    folder, _ = collected
+    monkeypatch.chdir(tmp_path)
+    options = {
+        "game": "Breakout", "demonstrations": folder, "transitions": 900, "method": method,
+        "steps": 20, "batch": 4, "episodes": 2, "max-steps": 30, "layers": 1, "width": 16,
+        "heads": 1,
+    }  # fmt: skip
+    arguments = [str(part) for name, value in options.items() for part in (f"--{name}", value)]
+    assert atari.main(arguments) == 0
+    (row,) = [json.loads(line) for line in Path("runs/atari.jsonl").read_text().splitlines()]
+    assert row["level"] == "Breakout" and row["episodes"] == 2 and row["return_error"] is not None
+    assert 20 <= row["mean_length"] <= 30
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--game", "Pingpong"], "unknown game 'Pingpong'"),
+        (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
+        (["collect", "--game", "Pongg"], "unknown game 'Pongg'"),
+        (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert atari.main(arguments) == 2
+    said = capsys.readouterr().err
+    assert message in said and len(said.splitlines()) == 1
+
+
+def test_the_table_has_normalised_scores():
+    row = {
+        "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
+        "mean_return": 30.5, "return_error": 2.88,
+    }  # fmt: skip
+    names = report._names("atari", "Breakout", "bc", "leapjax", (), 0)
+    rows = [{**row, "method": "bc", "preset": "leapjax", "hash": names[0]}]
+    table = report.atari(rows)
+    assert "| Breakout | ours | - | - | 100.0 ± 10.0 |" in table
+    assert "| Breakout | our score | - | - | 30.5 ± 2.9 |" in table
+    assert "| Breakout | paper | 400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9 | - |" in table

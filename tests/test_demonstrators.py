@@ -1,0 +1,121 @@
+import functools
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ale_py")  # an extra
+
+from ale_py.vector_env import AtariVectorEnv
+
+from leapjax.atari.demonstrators import NOISES, PlayedGame, play
+from leapjax.atari.emulator import Emulator
+from leapjax.atari.games import GAMES
+
+games = pytest.mark.parametrize("name", GAMES)
+
+
+@functools.cache
+def played(name: str, seed: int = 0, noise: float = 0.0, most_steps: int = 12) -> PlayedGame:
+    return play(GAMES[name], seed, noise, most_steps)
+
+
+def play_at_random(name: str, steps: int) -> float:
+    emulator, rng = Emulator(GAMES[name]), np.random.default_rng(0)
+    return sum(emulator.step(int(rng.integers(emulator.num_actions))) for _ in range(steps))
+
+
+def same(one: PlayedGame, other: PlayedGame) -> bool:
+    return all(np.array_equal(mine, yours) for mine, yours in zip(one, other, strict=True))
+
+
+@games
+def test_frames_and_rewards_are_those_of_the_native_environment(name):
+    game = GAMES[name]
+    native = AtariVectorEnv(
+        game.rom, 1, noop_max=0, use_fire_reset=False, reward_clipping=False, num_threads=1
+    )
+    emulator = Emulator(game)
+    assert emulator.num_actions == native.single_action_space.n == len(game.actions)
+    observations, _ = native.reset(seed=0)
+    np.testing.assert_array_equal(emulator.frame(), observations[0, -1])
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        action = int(rng.integers(emulator.num_actions))
+        reward = emulator.step(action)
+        if emulator.over:  # the native one stops in the middle of the last four frames
+            break
+        observations, rewards, *_ = native.step(np.array([action]))
+        assert reward == rewards[0]
+        np.testing.assert_array_equal(emulator.frame(), observations[0, -1])
+    native.close()
+
+
+@games
+def test_a_restored_game_goes_on_the_same(name):
+    emulator = Emulator(GAMES[name])
+    actions = np.random.default_rng(0).integers(emulator.num_actions, size=60).tolist()
+    for action in actions[:30]:
+        emulator.step(action)
+    saved, frame = emulator.save(), emulator.frame()
+
+    def future(step):
+        return [(step(action), emulator.lives, *emulator.ram()) for action in actions[30:]]
+
+    first = future(emulator.step)
+    last = emulator.frame()
+    emulator.restore(saved)
+    assert emulator.action == actions[29]
+    np.testing.assert_array_equal(emulator.frame(), frame)
+    assert future(emulator.advance) == first
+    emulator.restore(saved)
+    assert future(emulator.step) == first
+    np.testing.assert_array_equal(emulator.frame(), last)
+
+
+@games
+def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
+    game = played(name, noise=0.5)
+    count = len(game.actions)
+    assert count == 12 and not game.over
+    assert game.frames.shape == (count, 84, 84) and game.frames.dtype == np.uint8
+    assert game.actions.dtype == np.int32 and game.rewards.dtype == np.float32
+    assert game.score == game.rewards.sum()
+    assert same(game, play(GAMES[name], 0, 0.5, 12))
+    assert not same(game, played(name, seed=1, noise=0.5))
+
+
+@games
+def test_noise_replaces_actions(name):
+    assert 0.0 in NOISES[name] and len(NOISES[name]) > 1
+    noisy = played(name, noise=1.0)
+    assert len(set(noisy.actions)) >= 4
+    assert not same(played(name), noisy)
+
+
+@games
+def test_what_was_recorded_is_what_was_played(name):
+    game, emulator = played(name, noise=0.5), Emulator(GAMES[name])
+    starts = np.random.default_rng(np.random.SeedSequence(0).spawn(3)[0])
+    emulator.reset(int(starts.integers(31)))
+    for frame, action, reward in zip(game.frames, game.actions, game.rewards, strict=True):
+        np.testing.assert_array_equal(emulator.frame(), frame)
+        assert emulator.step(int(action)) == reward
+
+
+def test_pong_returns_every_ball():
+    assert not (played("Pong", most_steps=200).rewards < 0).any()
+    assert play_at_random("Pong", 200) < 0
+
+
+def test_breakout_keeps_its_ball():
+    assert played("Breakout", most_steps=250).score >= 8
+    assert (played("Breakout", most_steps=250).actions == 1).sum() <= 10  # serves
+
+
+def test_qbert_colours_tiles():
+    assert played("Qbert", most_steps=80).score >= 100
+
+
+def test_seaquest_hits():
+    assert played("Seaquest", most_steps=80).score >= 40
+    assert play_at_random("Seaquest", 80) < 40

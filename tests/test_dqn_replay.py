@@ -1,0 +1,525 @@
+import gzip
+import io
+import os
+import tempfile
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from leapjax.atari import replay
+from leapjax.atari.games import GAMES
+from leapjax.atari.replay import CUT_AFTER, CUT_BEFORE, Episode
+from leapjax.data.storage import UNKNOWN_SEED
+from leapjax.errors import UserError
+
+PONG = GAMES["Pong"]
+STORED = {
+    "observation": np.uint8,
+    "action": np.int32,
+    "reward": np.float32,
+    "terminal": np.uint8,
+}
+PARTS = [*(f"$store$_{name}" for name in STORED), "add_count", "invalid_range"]
+OBSERVATION, ACTION, REWARD, TERMINAL, *_ = PARTS
+
+
+def episode(length: int, seed: int) -> Episode:
+    """Frames that tell every episode and every step apart."""
+    rng = np.random.default_rng(seed)
+    frames = np.zeros((length, 84, 84), np.uint8)
+    frames[:, :4, :4] = rng.integers(1, 256, (length, 4, 4))
+    frames[:, 0, 0] = np.arange(length) % 256
+    rewards = rng.integers(-1, 2, length).astype(np.float32)
+    return Episode(frames, rng.integers(0, 6, length, np.int32), rewards)
+
+
+def episodes(lengths, seed: int = 0) -> list[Episode]:
+    return [episode(length, 1000 * seed + i) for i, length in enumerate(lengths)]
+
+
+def rows_of(some, padding: int = 3) -> dict[str, np.ndarray]:
+    """The rows of whole episodes as Dopamine's buffer adds them, without a last stale row."""
+    columns: dict[str, list] = {name: [] for name in STORED}
+    for e in some:
+        n = len(e.actions)
+        columns["observation"] += [np.zeros((padding, 84, 84)), e.frames]
+        columns["action"] += [np.zeros(padding), e.actions]
+        columns["reward"] += [np.zeros(padding), e.rewards]
+        columns["terminal"] += [np.zeros(padding), np.zeros(n - 1), np.ones(1)]
+    return {
+        name: np.concatenate(c, dtype=STORED[name], casting="unsafe") for name, c in columns.items()
+    }
+
+
+def stale(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """With a last row of an earlier pass of the buffer: as misleading as can be."""
+    last = {"observation": np.full((1, 84, 84), 99), "action": [5], "reward": [1], "terminal": [1]}
+    return {name: np.concatenate([x, np.asarray(last[name], x.dtype)]) for name, x in rows.items()}
+
+
+def put(folder: Path, rows: dict[str, np.ndarray], number: int = 0, run: int = 1) -> Path:
+    """Writes a shard with NumPy and gzip alone."""
+    logs = folder / "Pong" / str(run) / "replay_logs"
+    logs.mkdir(parents=True, exist_ok=True)
+    count = len(rows["action"]) - 1
+    arrays = {f"$store$_{name}": x for name, x in rows.items()}
+    arrays |= {"add_count": np.array(count), "invalid_range": np.arange(count - 1, count + 4)}
+    for part, array in arrays.items():
+        with gzip.open(logs / f"{part}_ckpt.{number}.gz", "wb", compresslevel=1) as file:
+            np.save(file, array, allow_pickle=False)
+    return logs
+
+
+def read(folder: Path, transitions: int = 10**9, seed: int = 0, **options):
+    return replay.read(folder, PONG, transitions, seed, **options)
+
+
+def refused(folder: Path, game=PONG, **options) -> str:
+    with pytest.raises(UserError) as raised:
+        replay.read(folder, game, **{"transitions": 10**9, "seed": 0, **options})
+    message = str(raised.value)
+    assert "\n" not in message
+    return message
+
+
+def ids(demonstrations) -> list[bytes]:
+    """What tells trajectories apart, whatever their order."""
+    return [np.asarray(d.observations[:-1]).tobytes() for d in demonstrations]
+
+
+def assert_are(demonstrations, expected) -> None:
+    """They are these whole episodes, in some order."""
+    assert len(demonstrations) == len(expected)
+    by_frames = {e.frames.tobytes(): e for e in expected}
+    for name, d in zip(ids(demonstrations), demonstrations, strict=True):
+        e = by_frames.pop(name)
+        np.testing.assert_array_equal(d.observations[:-1], e.frames)
+        np.testing.assert_array_equal(d.observations[-1], e.frames[-1])
+        np.testing.assert_array_equal(d.actions, e.actions)
+        np.testing.assert_array_equal(d.rewards, e.rewards)
+        dtypes = (d.observations.dtype, d.actions.dtype, d.rewards.dtype)
+        assert dtypes == (np.uint8, np.int32, np.float32)
+        assert (d.terminated, d.truncated, d.seed) == (True, False, UNKNOWN_SEED)
+
+
+def conversions(folder: Path) -> list[Path]:
+    return sorted((folder / "Pong" / "1" / "leapjax").glob("*/frames.npy"))
+
+
+@pytest.fixture(scope="module")
+def three_shards(tmp_path_factory):
+    """36 episodes of 3 to 14 steps in three shards: nobody writes to them."""
+    folder = tmp_path_factory.mktemp("shards")
+    every = [episodes(range(3, 15), seed=number) for number in range(3)]
+    for number, some in enumerate(every):
+        put(folder, stale(rows_of(some)), number)
+    return folder, [e for some in every for e in some]
+
+
+def test_whole_trajectories_are_the_originals(three_shards):
+    folder, originals = three_shards
+    demonstrations, dropped = read(folder)
+    assert_are(demonstrations, originals)
+    assert not dropped
+
+
+def test_frames_are_views_of_one_memory_map(three_shards):
+    folder, _ = three_shards
+    demonstrations = read(folder).demonstrations
+    assert all(isinstance(d.observations, np.memmap) for d in demonstrations)
+    assert not demonstrations[0].observations.flags.writeable
+    assert len({id(d.observations._mmap) for d in demonstrations}) == 1
+
+
+def test_what_files_cut_is_left_out_and_counted(tmp_path):
+    some = episodes([20, 30, 40, 50])
+    rows = rows_of(some)
+    # Before rows 10 and after row 133: in the middle of the first and of the last.
+    put(tmp_path, stale({name: x[10:133] for name, x in rows.items()}))
+    demonstrations, dropped = read(tmp_path)
+    assert_are(demonstrations, some[1:3])
+    assert dropped == {CUT_BEFORE: 1, CUT_AFTER: 1}
+
+
+def test_a_file_that_ends_within_padding_cuts_nothing(tmp_path):
+    some = episodes([5, 6, 7])
+    put(tmp_path, stale({name: x[: 8 + 9 + 2] for name, x in rows_of(some).items()}))
+    demonstrations, dropped = read(tmp_path)
+    assert_are(demonstrations, some[:2])
+    assert not dropped
+
+
+def test_a_last_row_is_never_used(tmp_path):
+    some = episodes([5, 6])
+    put(tmp_path, rows_of(some))  # the row that ends the second episode is the stale one
+    demonstrations, dropped = read(tmp_path)
+    assert_are(demonstrations, some[:1])
+    assert dropped == {CUT_AFTER: 1}
+
+
+def test_black_frames_of_a_game_are_kept(tmp_path):
+    (e,) = episodes([9])
+    for part in e:
+        part[:5] = 0  # nothing tells these from padding but that padding is three rows
+    put(tmp_path, stale(rows_of([e])))
+    assert_are(read(tmp_path).demonstrations, [e])
+
+
+def test_data_without_padding_loses_no_frame(tmp_path):
+    some = episodes([2, 3, 4, 9, 1])
+    some[3].frames[:2] = 0
+    some[3].actions[:2] = 0
+    some[3].rewards[:2] = 0
+    put(tmp_path, stale(rows_of(some, padding=0)))
+    demonstrations, dropped = read(tmp_path)
+    assert_are(demonstrations, some[1:])  # of the first nobody knows whether it is whole
+    assert dropped == {CUT_BEFORE: 1}
+
+
+def test_sampling_stops_at_enough(three_shards):
+    folder, originals = three_shards
+    names = {e.frames.tobytes() for e in originals}
+    for wanted in (1, 30, 100):
+        demonstrations = read(folder, wanted).demonstrations
+        lengths = [len(d.actions) for d in demonstrations]
+        assert sum(lengths[:-1]) < wanted <= sum(lengths)
+        assert len(set(ids(demonstrations))) == len(demonstrations)  # none twice
+        assert set(ids(demonstrations)) <= names
+
+
+def test_a_visit_takes_ten_from_where_the_last_one_ended(three_shards):
+    folder, originals = three_shards
+    found = ids(read(folder, seed=5).demonstrations)
+    number = {e.frames.tobytes(): i // 12 for i, e in enumerate(originals)}
+    for shard in range(3):
+        here = [name for name in found if number[name] == shard]
+        assert here == [e.frames.tobytes() for e in originals[12 * shard : 12 * shard + 12]]
+    assert len({number[name] for name in found[:10]}) == 1
+
+
+def test_the_seed_decides(three_shards):
+    folder, _ = three_shards
+    first = {seed: ids(read(folder, 60, seed).demonstrations) for seed in range(6)}
+    for path in conversions(folder):  # made again, it is the same
+        path.with_name("steps.npz").unlink()
+        path.unlink()
+        path.parent.rmdir()
+    assert first == {seed: ids(read(folder, 60, seed).demonstrations) for seed in range(6)}
+    assert len({tuple(x) for x in first.values()}) > 1
+
+
+def test_a_second_call_only_opens_what_the_first_made(tmp_path, monkeypatch):
+    put(tmp_path, stale(rows_of(episodes([5, 6]))))
+    first = read(tmp_path)
+    (path,) = conversions(tmp_path)
+    before = path.stat()
+    monkeypatch.setattr(gzip, "open", None)  # whoever unpacks anything now fails
+    second = read(tmp_path)
+    assert ids(second.demonstrations) == ids(first.demonstrations)
+    assert second.dropped == first.dropped
+    assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
+
+
+def test_what_was_dropped_is_told_from_a_conversion_as_well(tmp_path):
+    put(tmp_path, {name: x[5:] for name, x in rows_of(episodes([9, 8, 7])).items()})
+    assert read(tmp_path).dropped == read(tmp_path).dropped == {CUT_BEFORE: 1, CUT_AFTER: 1}
+
+
+def test_changed_shards_and_other_arguments_are_converted_anew(tmp_path):
+    put(tmp_path, stale(rows_of(episodes([5, 6]))))
+    read(tmp_path)
+    changed = episodes([5, 6], seed=3)
+    put(tmp_path, stale(rows_of(changed)))
+    assert_are(read(tmp_path).demonstrations, changed)
+    read(tmp_path, 3)
+    read(tmp_path, seed=1)
+    assert len(conversions(tmp_path)) == 4
+
+
+def test_a_conversion_that_was_killed_is_made_anew(tmp_path):
+    some = episodes([5, 6])
+    put(tmp_path, stale(rows_of(some)))
+    left = tmp_path / "Pong" / "1" / "leapjax" / ".unfinished"
+    left.mkdir(parents=True)
+    (left / "frames.npy").write_bytes(b"half")
+    (left / "steps.npz").write_bytes(b"half")
+    assert_are(read(tmp_path).demonstrations, some)
+    assert not left.exists()
+
+
+def test_a_conversion_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    some = episodes([5, 6])
+    put(tmp_path, stale(rows_of(some)))
+
+    def full(*args, **kwargs):
+        raise OSError("No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(np, "savez", full)
+        message = refused(tmp_path)
+    assert "No space left" in message and "make room" in message
+    assert not conversions(tmp_path) and not list(tmp_path.rglob(".unfinished"))
+    assert_are(read(tmp_path).demonstrations, some)
+
+
+def test_a_damaged_conversion_is_named(tmp_path):
+    put(tmp_path, stale(rows_of(episodes([5, 6]))))
+    read(tmp_path)
+    (path,) = conversions(tmp_path)
+    path.write_bytes(path.read_bytes()[:5000])
+    assert str(path.parent) in refused(tmp_path)
+
+
+def test_beside_read_only_data_nothing_is_written(tmp_path, monkeypatch):
+    some = episodes([5, 6])
+    data, temporary = tmp_path / "data", tmp_path / "temporary"
+    temporary.mkdir()
+    put(data, stale(rows_of(some)))
+    before = sorted(data.rglob("*"))
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setattr(os, "access", lambda path, mode: data not in Path(path).parents)
+    assert_are(read(data).demonstrations, some)
+    assert sorted(data.rglob("*")) == before
+    (path,) = temporary.rglob("frames.npy")
+    changed = path.stat().st_mtime_ns
+    assert_are(read(data).demonstrations, some)
+    assert path.stat().st_mtime_ns == changed
+
+
+def test_frames_are_never_all_in_memory(tmp_path):
+    rows = stale(rows_of(episodes([1000, 1000])))
+    for number in range(4):
+        put(tmp_path, rows, number)
+    unpacked, trajectory = 4 * rows["observation"].nbytes, 1000 * 84 * 84
+    del rows
+    read(tmp_path, 1, seed=7)  # what is imported and kept for good is not of this
+    tracemalloc.start()
+    demonstrations = read(tmp_path, 1001).demonstrations
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(demonstrations) == 2
+    assert peak < unpacked / 10
+    assert peak < trajectory / 2  # not even one of the two was in memory as a whole
+
+
+def test_only_what_is_needed_is_unpacked(tmp_path):
+    logs = put(tmp_path, stale(rows_of(episodes([50] * 40))))
+    path = logs / f"{OBSERVATION}_ckpt.0.gz"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert len(read(tmp_path, 60).demonstrations) == 2
+    assert "ended before" in refused(tmp_path)
+
+
+def test_no_folder(tmp_path):
+    message = refused(tmp_path / "absent")
+    assert f"no folder {tmp_path / 'absent'}" in message
+    assert "Pong/1/replay_logs" in message and "gs://atari-replay-datasets" in message
+    assert "`python -m experiments.atari collect --game Pong`" in message
+
+
+def test_no_such_game_or_run(tmp_path):
+    put(tmp_path, stale(rows_of(episodes([5]))), run=2)
+    message = refused(tmp_path, GAMES["Breakout"])
+    assert f"no data of Breakout in {tmp_path}, only of Pong" in message
+    assert "no run 1 of Pong" in refused(tmp_path) and "only 2" in refused(tmp_path)
+    assert len(read(tmp_path, run=2).demonstrations) == 1
+
+
+def test_no_shards(tmp_path):
+    logs = replay.replay_logs(tmp_path, PONG, 1)
+    logs.mkdir(parents=True)
+    (logs / "checkpoint").write_text("0")
+    assert f"no shards in {logs}" in refused(tmp_path)
+
+
+def test_no_transitions(tmp_path):
+    assert "at least 1, got 0" in refused(tmp_path, transitions=0)
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_that_is_missing_or_empty(tmp_path, part):
+    put(tmp_path, stale(rows_of(episodes([5]))), 0)
+    path = put(tmp_path, stale(rows_of(episodes([5]))), 7) / f"{part}_ckpt.7.gz"
+    path.write_bytes(b"")
+    assert f"{path} is empty" in refused(tmp_path)
+    path.unlink()
+    assert f"{path} is missing" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("part", [OBSERVATION, ACTION, REWARD, TERMINAL])
+def test_a_part_that_is_damaged(tmp_path, part):
+    path = put(tmp_path, stale(rows_of(episodes([50])))) / f"{part}_ckpt.0.gz"
+    whole = path.read_bytes()
+
+    def told(content: bytes) -> str:
+        path.write_bytes(content)
+        message = refused(tmp_path)
+        assert str(path) in message and not conversions(tmp_path)
+        return message
+
+    for kept in (5, 40, len(whole) // 2):
+        assert "copy it again" in told(whole[:kept])
+    assert "Not a gzipped file" in told(b"<html>Not found</html>")
+    assert "cannot read" in told(whole[:15] + bytes(len(whole) - 15))
+    assert "magic string" in told(gzip.compress(b"no array at all, but compressed"))
+    assert "cannot read" in told(gzip.compress(b""))
+    raw = gzip.decompress(whole)
+    assert "ends before its last row" in told(gzip.compress(raw[: len(raw) * 9 // 10]))
+
+
+@pytest.mark.parametrize("part", [OBSERVATION, ACTION, REWARD, TERMINAL])
+def test_nothing_is_unpickled(tmp_path, part):
+    path = put(tmp_path, stale(rows_of(episodes([5])))) / f"{part}_ckpt.0.gz"
+    file = io.BytesIO()
+    np.save(file, np.array([Bomb()], object), allow_pickle=True)
+    path.write_bytes(gzip.compress(file.getvalue()))
+    message = refused(tmp_path)
+    assert str(path) in message and "object" in message
+    with gzip.open(path, "wb") as bare:
+        np.array([Bomb()], object).dump(bare)
+    assert str(path) in refused(tmp_path)
+
+
+class Bomb:
+    def __reduce__(self):
+        return pytest.fail, ("it was unpickled",)
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_parts_of_unequal_lengths(tmp_path, name):
+    rows = stale(rows_of(episodes([5])))
+    logs = put(tmp_path, {**rows, name: rows[name][:-1]})
+    message = refused(tmp_path)
+    assert str(logs) in message and f"8 of {name}" in message and "9 of" in message
+
+
+@pytest.mark.parametrize(
+    "name, change, told",
+    [
+        ("observation", lambda x: x[:, :42], "uint8 of shape (9, 42, 84)"),
+        ("observation", lambda x: x[..., None], "(9, 84, 84, 1)"),
+        ("observation", lambda x: x.astype(np.float32), "holds float32"),
+        ("observation", lambda x: np.asfortranarray(x), "(9, 84, 84)"),
+        ("action", lambda x: x.astype(np.int64), "holds int64"),
+        ("action", lambda x: x[:, None], "(9, 1)"),
+        ("reward", lambda x: x.astype(np.float64), "holds float64"),
+        ("terminal", lambda x: x[0], "of shape ()"),
+    ],
+)
+def test_arrays_of_another_kind(tmp_path, name, change, told):
+    rows = stale(rows_of(episodes([5])))
+    logs = put(tmp_path, {**rows, name: change(rows[name])})
+    message = refused(tmp_path)
+    assert str(logs / f"$store$_{name}_ckpt.0.gz") in message and told in message
+
+
+def test_a_header_that_claims_what_is_not_there(tmp_path):
+    path = put(tmp_path, stale(rows_of(episodes([5])))) / f"{TERMINAL}_ckpt.0.gz"
+    for part, dtype, row in (
+        (OBSERVATION, "|u1", (84, 84)), (ACTION, "<i4", ()), (REWARD, "<f4", ()),
+        (TERMINAL, "|u1", ()),
+    ):  # fmt: skip
+        with gzip.open(path.with_name(f"{part}_ckpt.0.gz"), "wb") as file:
+            header = {"descr": dtype, "fortran_order": False, "shape": (10**15, *row)}
+            np.lib.format.write_array_header_1_0(file, header)
+            file.write(bytes(10))
+    message = refused(tmp_path)
+    assert str(path) in message and "before its last row" in message
+
+
+@pytest.mark.parametrize("action", [-1, 6])
+def test_actions_of_another_game(tmp_path, action):
+    some = episodes([5, 6])
+    some[1].actions[2] = action
+    path = put(tmp_path, stale(rows_of(some))) / f"{ACTION}_ckpt.0.gz"
+    message = refused(tmp_path)
+    assert str(path) in message and "expected 0 to 5 of Pong" in message
+    assert str(action) in message and "another game or action set" in message
+
+
+def test_rewards_that_are_no_numbers(tmp_path):
+    some = episodes([5])
+    some[0].rewards[1] = np.nan
+    path = put(tmp_path, stale(rows_of(some))) / f"{REWARD}_ckpt.0.gz"
+    assert f"{path}: rewards that are not finite" in refused(tmp_path)
+
+
+def test_no_whole_trajectory(tmp_path):
+    rows = rows_of(episodes([30]))
+    logs = put(tmp_path, {name: x[5:-3] for name, x in rows.items()})
+    message = refused(tmp_path)
+    assert f"no whole trajectory in {logs}" in message and f"1 {CUT_AFTER}" in message
+
+
+def test_no_room(tmp_path, monkeypatch):
+    put(tmp_path, stale(rows_of(episodes([5]))))
+    monkeypatch.setattr(replay.files, "SPARE", 2**60)
+    assert "make room" in refused(tmp_path)
+
+
+def test_what_is_written_is_read(tmp_path):
+    logs = replay.replay_logs(tmp_path, PONG, 1)
+    some = [episodes([1, 2, 3, 4, 30], seed) for seed in range(2)]
+    for number, shard in enumerate(some):
+        assert not replay.has_shard(logs, number)
+        replay.write_shard(logs, number, shard)
+        assert replay.has_shard(logs, number)
+    demonstrations, dropped = read(tmp_path)
+    assert_are(demonstrations, some[0] + some[1])
+    assert not dropped
+
+
+def test_what_is_written_is_in_the_format(tmp_path):
+    some = episodes([4, 9])
+    replay.write_shard(tmp_path, 3, [e._replace(rewards=e.rewards * 7) for e in some])
+    assert {p.name for p in tmp_path.iterdir()} == {f"{part}_ckpt.3.gz" for part in PARTS}
+    arrays = {}
+    for part in PARTS:
+        with gzip.open(tmp_path / f"{part}_ckpt.3.gz") as file:
+            arrays[part] = np.load(file, allow_pickle=False)
+            assert not file.read()
+    for name, rows in rows_of(some).items():  # whose rewards are within [-1, 1]
+        array = arrays[f"$store$_{name}"]
+        assert array.dtype == STORED[name]
+        np.testing.assert_array_equal(array[:-1], rows)
+        assert not array[-1].any()
+    assert arrays["add_count"] == 19
+    np.testing.assert_array_equal(arrays["invalid_range"], [18, 19, 0, 1, 2])
+
+
+@pytest.mark.parametrize("written_before", [False, True])
+@pytest.mark.parametrize("killed_at", [0, 3, 5])
+def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, killed_at, written_before):
+    if written_before:
+        replay.write_shard(tmp_path, 0, episodes([4]))
+    write, calls = replay._write, []
+
+    def killed(*args):
+        if len(calls) == killed_at:
+            raise KeyboardInterrupt
+        calls.append(args)
+        write(*args)
+
+    monkeypatch.setattr(replay, "_write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        replay.write_shard(tmp_path, 0, episodes([5, 6]))
+    assert not replay.has_shard(tmp_path, 0)
+
+
+def test_a_shard_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="cannot write"):
+        replay.write_shard(tmp_path / "file" / "replay_logs", 0, episodes([4]))
+
+
+def test_episodes_that_are_none(tmp_path):
+    (e,) = episodes([4])
+    for wrong in (
+        [], [e._replace(rewards=e.rewards[1:])], [e._replace(frames=e.frames[:, 1:])],
+        [Episode(*(part[:0] for part in e))],
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="episode"):
+            replay.write_shard(tmp_path, 0, wrong)
+    assert not list(tmp_path.iterdir())
