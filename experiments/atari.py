@@ -22,7 +22,7 @@ from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
 from leapjax import files
-from leapjax.atari.domain import FOLDER, Settings, make
+from leapjax.atari.domain import FOLDER, LONGEST, Settings, make
 from leapjax.atari.games import find_game
 from leapjax.checkpoints import read_json
 
@@ -43,8 +43,8 @@ class Collect:
     """Where to; a game that was begun there goes on."""
     run: int = 1
     """Number of the run: each has games of its own."""
-    longest: int = 5_000
-    """Decisions of a game, which is cut off then."""
+    longest: int = LONGEST
+    """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
     """Processes; None: one on each core."""
     record: bool = False

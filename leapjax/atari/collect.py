@@ -18,14 +18,13 @@ from typing import Any
 
 from leapjax import files
 from leapjax.atari import demonstrators, replay
-from leapjax.atari.games import Game, find_game
+from leapjax.atari.games import FRAME_SKIP, MAX_FRAMES, Game, find_game
 from leapjax.data.seeds import TRAINING_START, TRAINING_STRIDE
 from leapjax.errors import UserError
 
 SHARD = 1_000  # transitions of a file, at least: what a killed program loses at most of each core
 GAMES = 1_000  # of a file, at most
 BYTES = 200  # of a transition on the disk, more or less
-LONGEST = 5_000  # decisions of a game: a ball can fly on for ever
 POLL = 0.2  # seconds
 
 Manifest = dict[str, Any]
@@ -36,7 +35,7 @@ def collect(
     game: Game,
     transitions: int,
     run: int = 1,
-    longest: int = LONGEST,
+    longest: int = MAX_FRAMES // FRAME_SKIP,
     workers: int | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Manifest]:
@@ -95,7 +94,7 @@ def is_whole(folder: Path, game: Game, transitions: int, run: int = 1) -> bool:
     return False
 
 
-def make_shard(folder: Path, name: str, run: int, number: int, longest: int = LONGEST) -> Manifest:
+def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> Manifest:
     """Plays and writes one file; what is in it."""
     game = find_game(name)
     logs = replay.replay_logs(folder, game, run)
