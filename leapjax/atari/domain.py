@@ -34,10 +34,11 @@ class Settings:
     replay_run: int = 1  # of the runs that DQN-Replay has of each game
     sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
     max_steps: int = MAX_FRAMES // FRAME_SKIP  # of a game: then it is cut off
+    features: int = 32  # of the first convolution; the others have twice as many
     shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "transitions", "replay_run", "max_steps")
+        check_at_least(self, 1, "transitions", "replay_run", "max_steps", "features")
         check_at_least(self, 0, "shift")
         if not 0 <= self.sticky <= 1:  # false for NaN too
             raise ValueError(f"sticky must be in 0 .. 1, got {self.sticky}")
@@ -60,6 +61,14 @@ def make(name: str, settings: Settings) -> Domain:
 
         return AtariAdapter(game, settings.sticky, settings.max_steps)
 
+    def state_tokens(model: ModelConfig, context: int) -> nn.Module:
+        del context
+        return StateTokens(model.width, settings.features, model.dtype)
+
+    def current_tokens(model: ModelConfig, context: int) -> nn.Module:
+        del context
+        return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
+
     shift = functools.partial(shifted, most=settings.shift)
     return Domain(
         level=name,
@@ -76,18 +85,6 @@ def make(name: str, settings: Settings) -> Domain:
     )
 
 
-def state_tokens(model: ModelConfig, context: int) -> nn.Module:
-    """The paper's encoder."""
-    del context
-    return StateTokens(model.width, model.dtype)
-
-
-def current_tokens(model: ModelConfig, context: int) -> nn.Module:
-    """Ours."""
-    del context
-    return CurrentTokens(model.width, TOKENS, model.dtype)
-
-
 def source(game: Game, settings: Settings) -> Source:
     """Where the trajectories of a game come from."""
 
@@ -97,14 +94,8 @@ def source(game: Game, settings: Settings) -> Source:
     def write(where: str, progress: Callable[[int], None]) -> None:
         from leapjax.atari.collect import collect  # noqa: PLC0415  (so)
 
-        collect(
-            Path(where),
-            game,
-            settings.transitions,
-            settings.replay_run,
-            longest=LONGEST,
-            progress=progress,
-        )
+        count, run = settings.transitions, settings.replay_run
+        collect(Path(where), game, count, run, LONGEST, progress=progress)
 
     def exists(where: str) -> bool:
         from leapjax.atari.collect import is_whole  # noqa: PLC0415  (so)
@@ -165,8 +156,8 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
             "layers": 6, "heads": 8, "attention": "causal", "max_steps": 27_000,
         }  # fmt: skip
     return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 5000,
-        "layers": 2, "shift": 4, "max_steps": LONGEST,
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 3000,
+        "layers": 2, "features": 16, "shift": 4, "max_steps": LONGEST,
     }  # fmt: skip
 
 

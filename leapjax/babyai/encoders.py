@@ -19,7 +19,7 @@ from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
-from leapjax.models.convolutions import Convolution
+from leapjax.models.linear import linear
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, pad_token
 
@@ -30,6 +30,32 @@ NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
 BARRIER = 8.0  # steps that one goes round for each nat
 _OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
+
+
+def patches(image: jax.Array, side: int, padding: tuple[int, int]) -> jax.Array:
+    """`[X, Y, C]` to `[X', Y', side * side * C]`: the neighbourhood of every cell."""
+    image = jnp.pad(image, (padding, padding, (0, 0)))
+    width, height = image.shape[0] - side + 1, image.shape[1] - side + 1
+    shifted = [image[x : x + width, y : y + height] for x in range(side) for y in range(side)]
+    return jnp.concatenate(shifted, axis=-1)
+
+
+class Convolution(nn.Module):
+    """A convolution as one matrix product, for small maps of many channels."""
+
+    features: int
+    side: int = 3
+    padding: tuple[int, int] = (1, 1)
+    stride: int = 1
+    dtype: Dtype = jnp.float32  # of the matrix product; parameters are float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        """`[X, Y, C]` to `[X', Y', features]`."""
+        kernel_init = nn.initializers.he_normal()
+        product = linear(self.features, kernel_init, dtype=self.dtype)
+        near = patches(image, self.side, self.padding)
+        return product(near[:: self.stride, :: self.stride])
 
 
 class Instruction(NamedTuple):
