@@ -161,10 +161,19 @@ def plan_many(name: str, level: Level, count: int) -> str:
 
 
 def random_contexts(domain: Domain, length: int, batch: int) -> Any:
-    """`[B]` contexts of the right shapes with random grids and poses, and one instruction."""
+    """`[B]` contexts of the right shapes with random grids and poses, and one instruction.
+
+    Or with random frames.
+    """
     blank = blank_context(domain, length)
     contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
     key = jax.random.key(2)
+    if isinstance(blank.observation, np.ndarray):
+        frames = [
+            jax.random.randint(key, leaf.shape, 0, 256).astype(jnp.uint8)
+            for leaf in (contexts.observation, contexts.past)
+        ]
+        return contexts._replace(observation=frames[0], past=frames[1])
     grid = jax.random.randint(key, contexts.observation.grid.shape, 0, 4).astype(jnp.uint8)
     pose = jax.random.randint(key, (batch, 3), 1, 4)
     words = jnp.ones_like(contexts.observation.instruction)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import planning, scaling, training
+from benchmarks import atari, planning, scaling, training
 from benchmarks.flops import matmul_flops
 from experiments.common.config import make_domain, preset, specify, with_options
 from experiments.common.runtime import Cluster
@@ -18,6 +18,7 @@ from leapjax.models.linear import rows_times_matrix
 from tests.programs import only_long
 
 HORIZON = 5
+SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
 
 
 def tiny_preset(*names):
@@ -98,6 +99,20 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
     # The products of a step are those of encoder and transformer, values and gradients.
     products = 1e9 * sum(part["gflop"] for part in row["parts"])
     assert 0.9 * products < row["flops_per_step"] < 1.1 * products
+
+
+def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkeypatch):
+    monkeypatch.setattr(atari, "preset", lambda *names: with_options(preset(*names), SMALL))
+    rows = tmp_path / "rows.json"
+    arguments = ["--presets", "leapjax", "--batches", "2", "--no-training", "--seconds", "0.01"]
+    assert atari.main([*arguments, "--json", str(rows)]) == 0
+    (row,) = json.loads(rows.read_text())
+    assert (row["level"], row["batch"]) == ("Breakout", 2)
+    for part in ("planning", "encoding", "playing"):
+        assert row[f"{part}_seconds"] > 0
+    # The convolutions alone: 20 * 20, 9 * 9 and 7 * 7 places, of 2, 4 and 4 features.
+    products = 400 * 256 * 2 + 81 * 32 * 4 + 49 * 36 * 4
+    assert row["encoding_flops"] > 2 * 2 * products
 
 
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):

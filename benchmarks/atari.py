@@ -1,0 +1,146 @@
+"""What playing and training cost on Atari: `python -m benchmarks.atari`.
+
+Training steps as `benchmarks.training` measures them; states encoded per second; decisions per
+second for some games that are played together, by what they are made of: the games themselves,
+the encoder, and the iterations over the plan.
+"""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import training
+from benchmarks.flops import matmul_flops
+from benchmarks.planning import random_contexts
+from benchmarks.timing import Row, fastest, write_rows
+from experiments.common import program, runtime
+from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
+from leapjax import pretrained
+from leapjax.batching import compile_planner
+from leapjax.domain import Domain
+
+GAMES_PLAYED = (1, 16, 64)  # together
+DECISIONS = 50  # of each game, to measure
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure training and playing."""
+
+    games: tuple[str, ...] = ("Breakout",)
+    """Which games; they differ in their actions, and in how fast they are."""
+    presets: tuple[str, ...] = ("leapjax", "paper")
+    """Which presets."""
+    batches: tuple[int, ...] = GAMES_PLAYED
+    """Games that are played together."""
+    training: bool = True
+    """Measure training too."""
+    json: Path | None = None
+    """Write the rows here."""
+    seconds: float = 3.0
+    """Time to spend on each measurement, at least."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures, prints tables, and writes what was asked for."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.atari", given, lambda: run(options))
+
+
+def run(options: Options) -> None:
+    """Measures every game and preset."""
+    runtime.use_every_core()  # and no compilation cache: compile times are real
+    # The longest game only sizes a table of the paper's network.
+    configs = [
+        with_options(preset("atari", game, "leap", name), {"max_steps": 1000})
+        for game in options.games
+        for name in options.presets
+    ]
+    console = Console()
+    playing = [
+        row for config in configs for row in measure(config, options.batches, options.seconds)
+    ]
+    console.print(table(playing))
+    trained = []
+    if options.training:
+        trained = [training.measure(config, options.seconds) for config in configs]
+        console.print(training.table(trained))
+    write_rows(options.json, [*playing, *trained])
+
+
+def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[Row]:
+    """One preset of one game, with so many games at a time."""
+    domain = make_domain(config)
+    energy = (agent := pretrained.make_agent(specify(config, 0, domain), domain)).energy
+    params = jax.jit(agent.init)(jax.random.key(0)).params
+    encode = jax.jit(jax.vmap(energy.encode, in_axes=(None, 0)))
+    rows: list[Row] = []
+    for batch in batches:
+        plan = compile_planner(energy, config.planner, (batch,))
+        contexts = random_contexts(domain, config.context, batch)
+        keys = jax.random.split(jax.random.key(1), batch)
+        begun = time.perf_counter()
+        jax.block_until_ready(plan(params, keys, contexts))
+        first = time.perf_counter() - begun
+        planning = fastest(partial(plan, params, keys, contexts), seconds)
+        jax.block_until_ready(encode(params, contexts))
+        rows.append(
+            {
+                "level": config.level,
+                "preset": config.preset,
+                "batch": batch,
+                "compile_seconds": first - planning,
+                "planning_seconds": planning,
+                "encoding_seconds": fastest(partial(encode, params, contexts), seconds),
+                "playing_seconds": playing_seconds(domain, batch),
+                "encoding_flops": matmul_flops(encode, params, contexts),
+            }
+        )
+    return rows
+
+
+def playing_seconds(domain: Domain, batch: int) -> float:
+    """What one decision in each of some games takes the emulator."""
+    adapters = [domain.make_adapter() for _ in range(batch)]
+    for seed, adapter in enumerate(adapters):
+        adapter.reset(seed)
+    actions = np.random.default_rng(0).integers(domain.num_actions - 1, size=(DECISIONS, batch))
+    begun = time.perf_counter()
+    for decision in actions:
+        for adapter, action in zip(adapters, decision, strict=True):
+            adapter.step(int(action))
+    return (time.perf_counter() - begun) / DECISIONS
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows for a terminal."""
+    columns = ("game", "preset", "games", "ms/decision", "planner", "of it encoder", "emulator")
+    result = Table(*columns, "decisions/s", "contexts encoded/s")
+    for row in rows:
+        whole = row["planning_seconds"] + row["playing_seconds"]
+        result.add_row(
+            row["level"],
+            row["preset"],
+            str(row["batch"]),
+            f"{1e3 * whole:.1f}",
+            f"{1e3 * row['planning_seconds']:.1f}",
+            f"{1e3 * row['encoding_seconds']:.1f}",
+            f"{1e3 * row['playing_seconds']:.1f}",
+            f"{row['batch'] / whole:.0f}",
+            f"{row['batch'] / row['encoding_seconds']:.0f}",
+        )
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
