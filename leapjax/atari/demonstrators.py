@@ -104,6 +104,7 @@ _PONG = _Table(
 )
 _BREAKOUT = _Table(101, 99, 72, 180, (55, 201), 9, 2, 3, 22, 11, 1, (0, 3, -3, 6, -6), 0)
 _LONGEST_SHOT = 80  # decisions
+_SERVES = 0.2  # the probability of asking for a ball, where there is none
 
 
 def _bounce(position: float, low: float, high: float) -> float:
@@ -143,13 +144,16 @@ class _Paddle:
         self._aim: float | None = None  # None until the ball comes
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
-        before, ram = self._before, emulator.ram()
+        table, before, ram = self._table, self._before, emulator.ram()
         self._before = ram
-        if not _coming(self._table, before, ram):
+        # Not at once: of what is over in a moment there is too little to learn from.
+        if ram[table.along] == 0 and table.serve and random.random() > _SERVES:
+            return _NOOP
+        if not _coming(table, before, ram):
             self._aim = None
         elif self._aim is None:
             self._aim = self._choose(emulator, before, random)
-        return _steer(self._table, before, ram, emulator.action, self._aim or 0)
+        return _steer(table, before, ram, emulator.action, self._aim or 0)
 
     def _choose(self, emulator: Emulator, before: np.ndarray, random: np.random.Generator) -> float:
         """The aim that wins most; in a random order, or a ball might fly in a circle for ever."""
