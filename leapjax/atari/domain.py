@@ -137,6 +137,7 @@ PAPER = {
     "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
 }  # fmt: skip
 EPOCHS = 10
+IMITATORS = ("leap", "bc", "dt")  # they sample what to do; to ask for a ball can be improbable
 
 
 def preset(name: str, preset: str) -> Mapping[str, Any]:
@@ -156,7 +157,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
             "layers": 6, "heads": 8, "attention": "causal", "max_steps": 27_000,
         }  # fmt: skip
     return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 3000,
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 4000,
         "layers": 2, "features": 16, "shift": 4, "max_steps": LONGEST,
     }  # fmt: skip
 
@@ -173,6 +174,8 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
             options |= {"masking": "one", "microbatch": 0}
     if preset == "leapjax":
         options["learning_rate"] = 1e-3
+    if method in IMITATORS:
+        options["temperature"] = 0.5 if preset == "leapjax" else 1.0
     return options
 
 
