@@ -103,6 +103,7 @@ ANALYSES = {
     program.ANALYSIS.name: program.ANALYSIS
     for program in (properties, stochastic, suboptimal, ablation)
 }
+EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
 SEARCHES_FIGURE = Path("docs/searches.png")
 LANDSCAPE_FIGURE, AGGREGATE_FIGURE = Path("docs/landscape.png"), Path("docs/aggregate.png")
@@ -437,7 +438,8 @@ def atari(rows: Sequence[Row]) -> str:
         raw = {title: f"{mean:.1f} ± {error:.1f}" for title, (mean, error) in cells.items()}
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
-            lines.append([name, what, *(by_title.get(title, "-") for title in ATARI)])
+            if by_title:
+                lines.append([name, what, *(by_title.get(title, "-") for title in ATARI)])
     return _table("game | | " + " | ".join(ATARI), lines)
 
 

@@ -16,6 +16,7 @@ from experiments import report
 from experiments.common import results
 
 ROOT = Path(__file__).parent.parent
+DOMAINS = tuple(f"leapjax.{name}" for name in ("babyai", "atari", "gymnasium", "stars", "sudoku"))
 LIBRARY = sorted((ROOT / "leapjax").rglob("*.py"))
 
 
@@ -75,26 +76,28 @@ def test_models_and_planners_meet_only_in_agents():
         assert not both or where in ("agents", "pretrained.py"), path
 
 
-def test_only_babyai_knows_minigrid():
-    """Nothing but the table of domains knows a domain; `leapjax.babyai` alone knows MiniGrid."""
+def test_only_babyai_knows_minigrid_and_only_atari_its_emulator():
+    """And nothing but the table of domains knows a domain."""
     for path in LIBRARY:
-        inside = path.relative_to(ROOT / "leapjax").parts[0] == "babyai"
+        inside = path.relative_to(ROOT / "leapjax").parts[0]
         tree = ast.parse(path.read_text())
         used = {
             alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names
         }
         used |= {n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-        if not inside:
-            assert not {name for name in used if name.split(".")[0] == "minigrid"}, path
-        if not inside and path.name != "domains.py":
-            assert not {name for name in used if name.startswith("leapjax.babyai")}, path
+        packages = {name.split(".")[0] for name in used}
+        assert inside == "babyai" or "minigrid" not in packages, path
+        assert inside == "atari" or "ale_py" not in packages, path
+        others = tuple(domain for domain in DOMAINS if domain != f"leapjax.{inside}")
+        if path.name != "domains.py":
+            assert not {name for name in used if name.startswith(others)}, path
 
 
 def test_what_experiments_share_knows_no_domain():
     shared = sorted((ROOT / "experiments" / "common").rglob("*.py"))
     assert len(shared) > 5
     for path in shared:
-        assert not {n for n in imports(path) if n.startswith("leapjax.babyai")}, path
+        assert not {n for n in imports(path) if n.startswith(DOMAINS)}, path
 
 
 def test_there_is_no_cycle_of_imports():
@@ -145,7 +148,7 @@ def test_the_tables_are_what_the_rows_say():
 
 
 def test_no_row_is_stale():
-    rows = report.rows_of(ROOT, "babyai", *report.PUZZLES, *report.ANALYSES)
+    rows = report.rows_of(ROOT, *report.EXPERIMENTS)
     stale = [row for row in rows if not report.is_used(row)]
     assert not [(row["level"], row["preset"], row["hash"]) for row in stale]
 
@@ -186,7 +189,7 @@ def test_neither_imports_nor_a_command_line_start_a_backend():
 def test_the_episodes_that_are_kept_are_those_of_the_rows():
     rows = {
         results.episodes_path(ROOT / "results" / f"{row['experiment']}.jsonl", row["hash"]): row
-        for row in report.rows_of(ROOT, "babyai", *report.PUZZLES, *report.ANALYSES)
+        for row in report.rows_of(ROOT, *report.EXPERIMENTS)
     }
     for path in (ROOT / "results" / "episodes").iterdir():
         played = np.loadtxt(path, delimiter=",", skiprows=1)
