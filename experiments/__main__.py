@@ -1,8 +1,10 @@
 """All programs by name: `python -m experiments NAME`; once installed, `leapjax NAME`."""
 
+import ast
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from experiments.common import program
 from leapjax.errors import did_you_mean
@@ -20,7 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("-h", "--help"):
         print("usage: leapjax NAME [OPTIONS]; leapjax NAME --help says which\n")
         for each in PROGRAMS:
-            said = (importlib.import_module(f"experiments.{each}").__doc__ or "").splitlines()[0]
+            # Read, not imported: all of them would take seconds.
+            source = Path(__file__).with_name(f"{each}.py").read_text(encoding="utf-8")
+            said = (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
             print(f"  {each:12} {said.split(': `')[0]}")
         return 0
     if name not in PROGRAMS:

@@ -1,7 +1,7 @@
-"""Energies of good and bad games (paper, figure 'Energy vs. Reward on Atari').
+"""Energies of good and bad games (paper, 'Energy vs. Reward'): `python -m experiments.atari_energy`.
 
-`python -m experiments.atari_energy --checkpoint runs/NAME`: the energy that a trained LEAP gives to
-what was done in the trajectories that it learned from, beside what each of them was rewarded with.
+The energy that a trained LEAP (`--checkpoint runs/NAME`) gives to what was done in the trajectories
+that it learned from, beside what each of them was rewarded with.
 """
 
 import dataclasses
