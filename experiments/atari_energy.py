@@ -1,4 +1,4 @@
-"""Energies of good and bad games (paper, 'Energy vs. Reward'): `python -m experiments.atari_energy`.
+"""Energies of good and bad games (paper, 'Energy vs. Reward'): `experiments.atari_energy --help`.
 
 The energy that a trained LEAP (`--checkpoint runs/NAME`) gives to what was done in the trajectories
 that it learned from, beside what each of them was rewarded with.
