@@ -157,8 +157,8 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
             "layers": 6, "heads": 8, "attention": "causal", "max_steps": 27_000,
         }  # fmt: skip
     return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 6000,
-        "layers": 2, "features": 16, "shift": 4, "max_steps": LONGEST,
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 4000,
+        "layers": 2, "features": 16, "max_steps": LONGEST,
     }  # fmt: skip
 
 

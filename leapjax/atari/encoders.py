@@ -18,6 +18,7 @@ STACK = 4  # frames that a state is made of
 Layers = tuple[tuple[int, int, int], ...]
 LAYERS: Layers = ((8, 4, 1), (4, 2, 2), (3, 1, 2))
 HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # the same for frames of half the side
+HIDDEN = 256  # units between features and tokens, of our encoder
 CHANGES = 10.0  # how much more is made of what has changed in a frame than of what has not
 
 
@@ -100,6 +101,10 @@ class CurrentTokens(nn.Module):
         known = jnp.maximum(jnp.arange(past + 1), past - context.step)
         read = Features(HALVED, self.features, self.dtype, name="features")
         features = read(changes(stacked(frames[known], 1)))
-        scale = features.shape[-1] ** -0.5
+        # Wide and not small: what is shown to the transformer must be about positions already.
+        hidden = nn.Dense(
+            HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
+        )
+        scale = HIDDEN**-0.5
         state = dense(self.tokens * self.width, scale=scale, dtype=self.dtype, name="state")
-        return state(features[0]).reshape(self.tokens, self.width)
+        return state(nn.relu(hidden(features[0]))).reshape(self.tokens, self.width)
