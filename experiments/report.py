@@ -105,7 +105,7 @@ ANALYSES = {
 }
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 ITERATIONS_FIGURE, METHODS_FIGURE = Path("docs/iterations.png"), Path("docs/methods.png")
-SEARCHES_FIGURE = Path("docs/searches.png")
+SEARCHES_FIGURE, ENERGY_FIGURE = Path("docs/searches.png"), Path("docs/atari-energy.png")
 LANDSCAPE_FIGURE, AGGREGATE_FIGURE = Path("docs/landscape.png"), Path("docs/aggregate.png")
 
 
@@ -124,6 +124,7 @@ def rewrite() -> None:
     plots.iterations_by_level(success_by_passes(rows_of(Path(), *PUZZLES)), SEARCHES_FIGURE)
     plots.intervals(aggregates(rows), AGGREGATE_FIGURE)
     plots.landscape(read_json(Path("results/landscape.json")), LANDSCAPE_FIGURE)
+    plots.energy_against_reward(read_json(Path("results/atari-energy.json")), ENERGY_FIGURE)
 
 
 def rows_of(root: Path, *names: str) -> list[Row]:
@@ -137,7 +138,7 @@ def documents(root: Path) -> dict[Path, str]:
     for name in ANALYSES:
         rows[name] = rows_of(root, name)
     rows["atari"] = rows_of(root, "atari")
-    for name in ("planning", "training", "quality", "landscape", "atari-data"):
+    for name in ("planning", "training", "quality", "landscape", "atari-data", "atari-energy"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Any], str], str]] = {
         "results": (success, "babyai"),
@@ -153,6 +154,7 @@ def documents(root: Path) -> dict[Path, str]:
         "arms": (arms, "puzzles"),
         "atari": (atari, "atari"),
         "atari-data": (atari_data, "atari-data"),
+        "atari-energy": (atari_energy, "atari-energy"),
         "quality": (quality, "quality"),
         "landscape": (landscape, "landscape"),
         **{name: (functools.partial(analysed, each), name) for name, each in ANALYSES.items()},
@@ -473,6 +475,15 @@ def atari_data(found: Mapping[str, Any]) -> str:
             ]
         )
     return _table("game | games | transitions | mean score | range | by random actions", lines)
+
+
+def atari_energy(found: Mapping[str, Any]) -> str:
+    """How energies of trajectories and their rewards are correlated."""
+    lines = [
+        [name, str(len(of["energies"])), f"{of['correlation']:.2f}", f"{of['p_value']:.1g}"]
+        for name, of in found.items()
+    ]
+    return _table("game | trajectories | rank correlation of energy and reward | p", lines)
 
 
 def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
