@@ -111,6 +111,11 @@ def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -
         steps = jax.tree.map(jnp.asarray, windows.padded(windows.concatenate([game])))
         means.append(float(energies(planner.energy, planner.params, steps, jnp.asarray(places))))
         returns.append(float(game.rewards.sum()))
+    if len(set(returns)) < 2:
+        raise UserError(
+            f"all {len(returns)} trajectories of {specification.level} have one reward: there is "
+            "nothing to compare energies with"
+        )
     found = stats.spearmanr(means, returns)
     return {
         "energies": means,
