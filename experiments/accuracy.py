@@ -68,6 +68,9 @@ def report(options: Options) -> None:
 def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
     """Some demonstrations that a run has learned from."""
     count = min(count, origin.demos)
+    if domain.source is not None:
+        where = origin.demonstrations or domain.source.default
+        return domain.source.load(where, origin.seed).demonstrations[:count]
     if origin.demonstrations is not None:
         return storage.load(origin.demonstrations, domain, count).demonstrations
     return _collect(domain, count, origin.seed)

@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 from scipy import stats
 
+from experiments.accuracy import learned
 from experiments.common import plots, program, results, runtime
 from experiments.common.config import check_counts
 from leapjax import files, pretrained
@@ -67,25 +68,18 @@ def report(options: Options) -> None:
     console = Console()
     for checkpoint in options.checkpoint:
         planner = pretrained.load(checkpoint)
-        each = correlate(planner, trajectories(planner), options.windows)
-        found[planner.specification.level] = each
+        specification = planner.specification
+        domain, origin = pretrained.make_domain(specification), specification.origin
+        each = correlate(planner, learned(domain, origin, origin.demos), options.windows)
+        found[specification.level] = each
         console.print(
-            f"{planner.specification.level}: rank correlation {each['correlation']:.2f} of energy "
+            f"{specification.level}: rank correlation {each['correlation']:.2f} of energy "
             f"and reward (p = {each['p_value']:.2g}, {len(each['energies'])} trajectories)"
         )
     files.write_text(path, json.dumps(found, indent=1) + "\n")
     picture = options.runs / "atari-energy.png"
     plots.energy_against_reward(found, picture)
     console.print(f"picture: {picture}", highlight=False, markup=False)
-
-
-def trajectories(planner: Pretrained) -> list[Demonstration]:
-    """What a planner learned from."""
-    specification = planner.specification
-    source = pretrained.make_domain(specification).source
-    assert source is not None  # as all games have
-    where = specification.origin.demonstrations or source.default
-    return source.load(where, specification.origin.seed).demonstrations
 
 
 def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -> dict[str, Any]:

@@ -39,15 +39,16 @@ class Recording(NamedTuple):
 
 
 class Source(NamedTuple):
-    """Demonstrations that are kept in a format of their own, not as Minari data sets."""
+    """Where demonstrations are kept, and how: as Minari data sets, or in a format of their own."""
 
     default: str  # where they are, if nobody says
     exists: Callable[[str], bool]
-    make: Callable[[str, Callable[[int], None]], None]
-    # (where, progress) -> writes them, continuing where it was stopped
+    make: Callable[[str, Callable[[int], None]], str]
+    # (where, progress) -> writes them; what was made, in words
     load: Callable[[str, int], Collection]
-    # (where, training seed) -> as many as the domain's settings say
-    transitions: int  # that `make` makes, and tells the progress of
+    # (where, training seed) -> as many as are asked for; UserError if there are fewer
+    amount: int  # that `make` makes, and tells the progress of
+    unit: str  # of the amount, such as "demonstrations"
 
 
 def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
@@ -100,7 +101,7 @@ class Domain(NamedTuple):
     replay: Callable[[Recording], Demonstration | str | None] | None = None
     # what an episode of other observations is as a demonstration; or why it is none; or None,
     # where nothing is known of such observations
-    source: Source | None = None  # of demonstrations, in the place of Minari and `collect`
+    source: Source | None = None  # of demonstrations; None: `collect`, kept by leapjax.data.storage
     rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on

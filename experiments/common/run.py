@@ -8,7 +8,6 @@ import concurrent.futures
 import contextlib
 import csv
 import dataclasses
-import functools
 import json
 import sys
 import time
@@ -129,41 +128,33 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
     return wait
 
 
+def source_of(run: Run) -> Source:
+    """Where the demonstrations come from that the domain makes."""
+    return run.domain.source or storage.source(run.domain, run.config.demos, run.seed)
+
+
 def dataset(run: Run) -> str:
     """The id of the demonstrations to train on, or where they are."""
-    config, source = run.config, run.domain.source
-    if source is not None:
-        return config.demonstrations or source.default
-    return config.demonstrations or storage.dataset_id(run.domain, config.demos, run.seed)
+    return run.config.demonstrations or source_of(run).default
 
 
 def must_collect(run: Run) -> bool:
     """Whether the demonstrations to train on do not exist yet."""
     wanted = run.config.demos and run.config.demonstrations is None
-    exists = storage.exists if run.domain.source is None else run.domain.source.exists
-    return bool(wanted) and processes.first_does(lambda: not exists(dataset(run)))
+    return bool(wanted) and processes.first_does(lambda: not source_of(run).exists(dataset(run)))
 
 
 def collect(run: Run) -> None:
     """Makes the demonstrations to train on."""
 
-    def save() -> None:
-        storage.check_writable()
-        count = run.config.demos
-        with Meter(run.console, "demonstrations", count) as meter:
-            collection = run.domain.collect(count, run.seed, meter.update)
-        dropped = reasons(collection)
-        summary = f"{count} demonstrations of {run.domain.level}"
-        summary += f"; dropped: {dropped}" if dropped else ""
+    def make() -> None:
+        source = source_of(run)
+        with Meter(run.console, source.unit, source.amount) as meter:
+            summary = source.make(dataset(run), meter.update)
         run.console.print(summary)
-        storage.save(dataset(run), collection, run.domain, summary)
 
-    def make(source: Source) -> None:
-        with Meter(run.console, "transitions", source.transitions) as meter:
-            source.make(dataset(run), meter.update)
-
-    begun, source = time.perf_counter(), run.domain.source
-    processes.first_does(save if source is None else functools.partial(make, source))
+    begun = time.perf_counter()
+    processes.first_does(make)
     run.seconds["demos"] += time.perf_counter() - begun
 
 
@@ -174,19 +165,13 @@ def load(run: Run) -> list[Demonstration]:
         UserError: they cannot be read, are fewer than asked for, or hold no rewards where the
             method learns from them.
     """
-    config, name, source = run.config, dataset(run), run.domain.source
+    config, name = run.config, dataset(run)
     if not config.demos:
         return []
     begun = time.perf_counter()
     # Each process reads for itself: the data need not be on one shared disk.
-    if source is None:
-        loaded = processes.together(lambda: storage.load(name, run.domain, config.demos))
-    else:
-        loaded = processes.together(lambda: source.load(name, run.seed))
+    loaded = processes.together(lambda: source_of(run).load(name, run.seed))
     data, dropped = loaded.demonstrations[: config.demos], reasons(loaded)
-    if len(data) < config.demos and source is None:
-        also = f" that can be used ({dropped})" if dropped else ""
-        raise UserError(f"{name} has {len(data)} episodes{also}, fewer than --demos {config.demos}")
     run.seconds["demos"] += time.perf_counter() - begun
     if dropped:
         run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)

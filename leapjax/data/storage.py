@@ -12,7 +12,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from leapjax import files
-from leapjax.domain import Collection, Domain, Recording
+from leapjax.domain import Collection, Domain, Recording, Source
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
@@ -40,6 +40,31 @@ FORMAT = 2  # raised whenever what a demonstration holds changes: old caches are
 def dataset_id(domain: Domain, count: int, seed: int) -> str:
     """The id under which `count` demonstrations for a training seed are cached."""
     return f"leapjax/{domain.level}/bot-{count}-seed{seed}-v{FORMAT}"
+
+
+def source(domain: Domain, count: int, seed: int) -> Source:
+    """`count` demonstrations of a domain for a training seed, kept as a Minari data set."""
+
+    def make(name: str, progress: Callable[[int], None]) -> str:
+        check_writable()
+        collection = domain.collect(count, seed, progress)
+        dropped = reasons(collection)
+        summary = f"{count} demonstrations of {domain.level}"
+        summary += f"; dropped: {dropped}" if dropped else ""
+        save(name, collection, domain, summary)
+        return summary
+
+    def whole(name: str, seed: int) -> Collection:
+        del seed
+        loaded = load(name, domain, count)
+        found, dropped = len(loaded.demonstrations), reasons(loaded)
+        if found < count:
+            also = f" that can be used ({dropped})" if dropped else ""
+            raise UserError(f"{name} has {found} episodes{also}, fewer than --demos {count}")
+        return loaded
+
+    default = dataset_id(domain, count, seed)
+    return Source(default, exists, make, whole, count, "demonstrations")
 
 
 def observation_space(blank: PyTree) -> gym.Space:
