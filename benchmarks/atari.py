@@ -81,7 +81,8 @@ def run(options: Options) -> None:
 def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[Row]:
     """One preset of one game, with so many games at a time."""
     domain = make_domain(config)
-    energy = (agent := pretrained.make_agent(specify(config, 0, domain), domain)).energy
+    agent = pretrained.make_agent(specify(config, 0, domain), domain)
+    energy = agent.energy
     params = jax.jit(agent.init)(jax.random.key(0)).params
     encode = jax.jit(jax.vmap(energy.encode, in_axes=(None, 0)))
     rows: list[Row] = []

@@ -69,9 +69,7 @@ def run(options: Collect) -> None:
     for name in ("transitions", "run", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    settings = Settings(transitions=options.transitions, replay_run=options.run)
-    source = make(options.game, settings).source
-    assert source is not None
+    make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console()

@@ -23,20 +23,18 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     """Draws the beginning of one game, every second decision of it."""
     adapter = run.domain.make_adapter()
     assert isinstance(adapter, AtariAdapter)
-    actions, seed = run.domain.actions, seeds[0]
+    actions, title = run.domain.actions, run.domain.level
     frames: list[Frame] = []
-    frame, score, step = adapter.reset(seed), 0.0, 0
+    step = 0
     for event in watched(
-        adapter, planner, planner.specification.context, seed, run.seed, run.config.executed,
+        adapter, planner, planner.specification.context, seeds[0], run.seed, run.config.executed,
         MOST_DECISIONS,
     ):  # fmt: skip
-        if isinstance(event, Plan):
+        if not isinstance(event, Plan):
+            step += 1
+        elif step % SHOWN == 0:
             plan = np.asarray(event.actions[0])
-            if step % SHOWN == 0:
-                frames.append((picture(frame, plan, actions, score, run.domain.level), STEP_MS))
-            continue
-        _, transition = event
-        frame, score, step = transition.observation, score + transition.reward, step + 1
+            frames.append((picture(adapter.frame, plan, actions, adapter.score, title), STEP_MS))
     save_animation(frames, path)
 
 

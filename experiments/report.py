@@ -135,9 +135,8 @@ def rows_of(root: Path, *names: str) -> list[Row]:
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
     rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
-    for name in ANALYSES:
+    for name in ("atari", *ANALYSES):
         rows[name] = rows_of(root, name)
-    rows["atari"] = rows_of(root, "atari")
     for name in ("planning", "training", "quality", "landscape", "atari-data", "atari-energy"):
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Any], str], str]] = {

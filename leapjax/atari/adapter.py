@@ -10,7 +10,8 @@ from leapjax.environments import Transition
 class AtariAdapter:
     """One game: unclipped rewards, up to 30 no-ops at the start, over when the game is.
 
-    It succeeds with as high a score as a gamer's.
+    It succeeds with as high a score as a gamer's. What is to be seen now, and the score so far, are
+    `frame` and `score`.
     """
 
     def __init__(self, game: Game, sticky: float, max_steps: int) -> None:
@@ -22,23 +23,24 @@ class AtariAdapter:
             max_num_frames_per_episode=max_steps * FRAME_SKIP, reward_clipping=False,
             use_fire_reset=False,
         )  # fmt: skip
-        self._score = 0.0
+        self.frame = np.zeros((HEIGHT, WIDTH), np.uint8)
+        self.score = 0.0
 
     def reset(self, seed: int) -> np.ndarray:
         """Starts the game of a seed: the frame `[84, 84]` uint8."""
-        self._score = 0.0
         observations, _ = self._env.reset(seed=seed)
-        return np.array(observations[0, -1])
+        self.frame, self.score = np.array(observations[0, -1]), 0.0
+        return self.frame
 
     def step(self, action: int) -> Transition:
         """Takes one action, for four frames of the game."""
         observations, rewards, terminated, truncated, _ = self._env.step(np.array([action]))
-        self._score += float(rewards[0])
+        self.frame, self.score = np.array(observations[0, -1]), self.score + float(rewards[0])
         over = bool(terminated[0] or truncated[0])
         return Transition(
-            np.array(observations[0, -1]),
+            self.frame,
             float(rewards[0]),
             bool(terminated[0]),
             bool(truncated[0]),
-            over and self._score >= self._game.human,
+            over and self.score >= self._game.human,
         )

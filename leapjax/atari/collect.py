@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from multiprocessing.pool import AsyncResult
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 
 from leapjax import files
 from leapjax.atari import demonstrators, replay
-from leapjax.atari.games import FRAME_SKIP, MAX_FRAMES, Game, find_game
+from leapjax.atari.games import Game, find_game
 from leapjax.data.seeds import TRAINING_START, TRAINING_STRIDE
 from leapjax.errors import UserError
 
@@ -34,8 +34,8 @@ def collect(
     folder: Path,
     game: Game,
     transitions: int,
-    run: int = 1,
-    longest: int = MAX_FRAMES // FRAME_SKIP,
+    run: int,
+    longest: int,
     workers: int | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Manifest]:
@@ -57,41 +57,29 @@ def collect(
     workers = workers or len(os.sched_getaffinity(0))
     with files.only_process_in(logs):
         files.check_room(logs, transitions * BYTES)
-        found: dict[int, Manifest] = {}
-        done = 0
-        # Not forked: this process may run threads.
-        context = multiprocessing.get_context("spawn")
-        waiting = (number for number in itertools.count() if _known(logs, number) is None)
-        with context.Pool(workers, _ignore_interrupts) as pool:
-
-            def submit() -> AsyncResult[Manifest]:
-                shard = folder, game.name, run, next(waiting), longest
-                return pool.apply_async(make_shard, shard)
-
-            running: list[AsyncResult[Manifest]] = []
-            for number in itertools.count():
-                if done >= transitions:
-                    break
-                while _known(logs, number) is None:
+        made = _made(logs, transitions)
+        if _count(made) < transitions:  # else no process needs to be started
+            waiting = (number for number in itertools.count() if _known(logs, number) is None)
+            # Not forked: this process may run threads.
+            with multiprocessing.get_context("spawn").Pool(workers, _ignore_interrupts) as pool:
+                running: list[AsyncResult[Manifest]] = []
+                while _count(made) < transitions:
                     running = [each for each in running if not _finished(each)]
-                    running += [submit() for _ in range(workers - len(running))]
+                    for _ in range(workers - len(running)):
+                        shard = folder, game.name, run, next(waiting), longest
+                        running.append(pool.apply_async(make_shard, shard))
                     time.sleep(POLL)
-                found[number] = _known(logs, number) or {}
-                done += _transitions(found[number])
-                progress(min(done, transitions))
-    manifests = list(found.values())
-    files.write_text(logs.parent / "manifest.json", json.dumps(manifests, indent=1) + "\n")
-    return manifests
+                    made = _made(logs, transitions, made)
+                    progress(min(_count(made), transitions))
+    progress(transitions)
+    files.write_text(logs.parent / "manifest.json", json.dumps(made, indent=1) + "\n")
+    return made
 
 
 def is_whole(folder: Path, game: Game, transitions: int, run: int = 1) -> bool:
     """Whether `collect` has nothing left to do."""
-    logs, done = replay.replay_logs(folder, game, run), 0
-    for manifest in _known_shards(logs):
-        done += _transitions(manifest)
-        if done >= transitions:
-            return True
-    return False
+    made = _made(replay.replay_logs(folder, game, run), transitions)
+    return _count(made) >= transitions
 
 
 def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> Manifest:
@@ -134,23 +122,26 @@ def _known(logs: Path, number: int) -> Manifest | None:
         return None
     try:
         manifest = json.loads(files.read_text(path))
-        _transitions(manifest)
+        _count([manifest])
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
     return manifest
 
 
-def _known_shards(logs: Path) -> Iterator[Manifest]:
-    """What is in the files that were made here, up to the first that was not."""
-    for number in itertools.count():
-        manifest = _known(logs, number)
-        if manifest is None:
-            return
-        yield manifest
+def _made(logs: Path, transitions: int, before: Sequence[Manifest] = ()) -> list[Manifest]:
+    """What is in the files that were made here, up to so many transitions, or to a gap.
+
+    `before` are those that are known already.
+    """
+    made = list(before)
+    while _count(made) < transitions and (manifest := _known(logs, len(made))) is not None:
+        made.append(manifest)
+    return made
 
 
-def _transitions(manifest: Manifest) -> int:
-    return sum(int(game["transitions"]) for game in manifest["games"])
+def _count(manifests: Sequence[Manifest]) -> int:
+    """The transitions of some files."""
+    return sum(int(game["transitions"]) for each in manifests for game in each["games"])
 
 
 def _finished(result: AsyncResult[Manifest]) -> bool:

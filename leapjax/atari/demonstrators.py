@@ -10,12 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from leapjax.atari.emulator import MOST_NOOPS, Emulator
-from leapjax.atari.games import FRAME_SKIP, MAX_FRAMES, Game
+from leapjax.atari.games import MAX_STEPS, Game
 
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
 # what to do now; leaves the emulator as it found it. One plays one game, from its start on.
 
-MOST_STEPS = MAX_FRAMES // FRAME_SKIP
 NOISES: dict[str, tuple[float, ...]] = {
     "Breakout": (0.0, 0.1, 0.3),
     "Qbert": (0.0, 0.1, 0.3),
@@ -40,7 +39,7 @@ class PlayedGame(NamedTuple):
         return float(self.rewards.sum())
 
 
-def play(game: Game, seed: int, noise: float, most_steps: int = MOST_STEPS) -> PlayedGame:
+def play(game: Game, seed: int, noise: float, most_steps: int = MAX_STEPS) -> PlayedGame:
     """Plays a game; the same one for the same arguments.
 
     Args:

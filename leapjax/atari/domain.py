@@ -14,7 +14,7 @@ import numpy as np
 
 from leapjax.atari import replay
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
-from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_FRAMES, WIDTH, Game, find_game
+from leapjax.atari.games import GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, check_at_least
@@ -33,7 +33,7 @@ class Settings:
     transitions: int = 50_000  # to learn from, by whole trajectories
     replay_run: int = 1  # of the runs that DQN-Replay has of each game
     sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
-    max_steps: int = MAX_FRAMES // FRAME_SKIP  # of a game: then it is cut off
+    max_steps: int = MAX_STEPS  # of a game: then it is cut off
     features: int = 32  # of the first convolution; the others have twice as many
     shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
 
@@ -91,18 +91,19 @@ def source(game: Game, settings: Settings) -> Source:
     def load(where: str, seed: int) -> Collection:
         return replay.read(Path(where), game, settings.transitions, seed, settings.replay_run)
 
-    def write(where: str, progress: Callable[[int], None]) -> None:
+    def write(where: str, progress: Callable[[int], None]) -> str:
         from leapjax.atari.collect import collect  # noqa: PLC0415  (so)
 
         count, run = settings.transitions, settings.replay_run
         collect(Path(where), game, count, run, LONGEST, progress=progress)
+        return f"{count} transitions of {game.name} in {where}"
 
     def exists(where: str) -> bool:
         from leapjax.atari.collect import is_whole  # noqa: PLC0415  (so)
 
         return is_whole(Path(where), game, settings.transitions, settings.replay_run)
 
-    return Source(FOLDER, exists, write, load, settings.transitions)
+    return Source(FOLDER, exists, write, load, settings.transitions, "transitions")
 
 
 def no_episodes(name: str, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
@@ -131,8 +132,7 @@ def shifted(key: jax.Array, window: Window, most: int) -> Window:
     return window._replace(context=moved)
 
 
-# By game: T, N and the batch (paper, tables 6 and 8), and the return that is asked for, of
-# clipped rewards (Chen et al., 2021, give the first three of these games' in the same way).
+# By game: T, N and the batch (paper, tables 6 and 8).
 PAPER = {
     "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
 }  # fmt: skip
@@ -154,7 +154,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
         return {
             **shared, "transitions": transitions, "steps": EPOCHS * transitions // batch,
             "context": 25, "horizon": horizon, "iterations": iterations, "batch": batch,
-            "layers": 6, "heads": 8, "attention": "causal", "max_steps": 27_000,
+            "layers": 6, "heads": 8, "attention": "causal",
         }  # fmt: skip
     return {
         **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 4000,

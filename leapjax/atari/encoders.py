@@ -32,8 +32,8 @@ def stacked(frames: jax.Array, count: int) -> jax.Array:
 def changes(stacks: jax.Array) -> jax.Array:
     """Stacks `[n, 84, 84, 4]` as the last frame and what changed before it: `[n, 42, 42, 4]`.
 
-    What moves is a few pixels of thousands: a network that is shown it learns ten times faster
-    (docs/tried.md). Averages over two by two pixels.
+    What moves is a few pixels of thousands: a network that is not shown it learns hardly anything
+    for a thousand steps (docs/tried.md). Averages over two by two pixels.
     """
     x = stacks.astype(jnp.float32) / 255
     x = jnp.concatenate([x[..., -1:], CHANGES * jnp.diff(x, axis=-1)], axis=-1)

@@ -8,6 +8,7 @@ from leapjax.errors import UserError, did_you_mean
 HEIGHT = WIDTH = 84  # of a frame, in pixels (Mnih et al., 2015)
 FRAME_SKIP = 4  # frames that an action is repeated for
 MAX_FRAMES = 108_000  # of a game: half an hour
+MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # decisions
 
 
 class Game(NamedTuple):

@@ -68,6 +68,11 @@ def forbid_early_end(logits: jax.Array, positions: jax.Array) -> jax.Array:
     return jnp.where(end & (positions[:, None] == 0), -jnp.inf, logits)
 
 
+def attention_mask(config: ModelConfig, tokens: int, prefix: int = 0) -> jax.Array | None:
+    """What each token of a plan may attend to, `[tokens, prefix + tokens]`; None: to all."""
+    return causal_mask(tokens, prefix) if config.attention == "causal" else None
+
+
 class PaperModel(nn.Module):
     """The network of the paper's appendix: state and action tokens, interleaved.
 
@@ -134,7 +139,7 @@ class PaperModel(nn.Module):
         asked = self.each * (self.sizes.context + jnp.arange(self.sizes.horizon)) + self.each - 2
         x = memory.at[asked + 1].add(jnp.tanh(self.action(actions)))
         x = self.drop(x, deterministic=deterministic)
-        mask = causal_mask(x.shape[0]) if self.config.attention == "causal" else None
+        mask = attention_mask(self.config, x.shape[0])
         h = self.transformer(x, asked[positions], mask=mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
 
@@ -189,8 +194,7 @@ class LeapModel(nn.Module):
         check_plan(actions, self.sizes.horizon)
         x = self.action(actions) + self.position(jnp.arange(self.sizes.horizon))
         x = self.drop(x, deterministic=deterministic)
-        horizon, prefix = self.sizes.horizon, memory[0].keys.shape[0]
-        mask = causal_mask(horizon, prefix) if self.config.attention == "causal" else None
+        mask = attention_mask(self.config, self.sizes.horizon, memory[0].keys.shape[0])
         h = self.transformer(x, positions, memory, mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
 
