@@ -86,7 +86,7 @@ def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
 
 @games
 def test_noise_replaces_actions(name):
-    assert 0.0 in NOISES[name] and len(NOISES[name]) > 1
+    assert len(set(NOISES[name])) == 3 and max(NOISES[name]) <= 0.5
     noisy = played(name, noise=1.0)
     assert len(set(noisy.actions)) >= 4
     assert not same(played(name), noisy)
@@ -109,7 +109,8 @@ def test_pong_returns_every_ball():
 
 def test_breakout_keeps_its_ball():
     assert played("Breakout", most_steps=250).score >= 8
-    assert (played("Breakout", most_steps=250).actions == 1).sum() <= 10  # serves
+    # To do nothing asks for a ball, too: there is no moment without one to be learned apart.
+    assert not (played("Breakout", most_steps=250).actions == 0).any()
 
 
 def test_qbert_colours_tiles():

@@ -53,8 +53,8 @@ class Meter:
         if now - self._shown < LOG_INTERVAL and done != self._total:
             return
         self._shown = now
-        left = (self._total - done) / rate if rate else float("inf")
+        left = f"{(self._total - done) / rate:.0f}s" if rate else "unknown"
         self._console.print(
-            f"{self._title} {done}/{self._total}  {rate:.1f}/s  ETA {left:.0f}s  {note}",
+            f"{self._title} {done}/{self._total}  {rate:.1f}/s  ETA {left}  {note}",
             highlight=False,
         )

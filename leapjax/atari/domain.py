@@ -157,8 +157,8 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
             "layers": 6, "heads": 8, "attention": "causal",
         }  # fmt: skip
     return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 4000,
-        "layers": 2, "features": 16, "max_steps": LONGEST,
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 6000,
+        "layers": 2, "width": 64, "features": 16, "max_steps": LONGEST,
     }  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     if preset == "leapjax":
         options["learning_rate"] = 1e-3
     if method in IMITATORS:
-        options["temperature"] = 0.5 if preset == "leapjax" else 1.0
+        options["temperature"] = 0.25 if preset == "leapjax" else 1.0
     return options
 
 
