@@ -159,7 +159,6 @@ _TILE_PLACES = [(row, place) for row in range(6) for place in range(row + 1)]
 _HOPS = {5: (1, 0), 3: (1, 1), 2: (-1, 0), 4: (-1, -1)}  # by action: rows and places gone
 _LONGEST_HOP = 12  # decisions; most take 7
 _WAIT = 4  # decisions
-_WAITS = 0.5  # how probable it is to wait, where it could hop
 _HOPS_AHEAD = 2  # with 3 it saw no more, and put off what was to be done
 _DIED = -40.0  # the value of it, in tiles
 
@@ -180,15 +179,17 @@ def _is_tile(row: int, place: int) -> bool:
 
 
 class _Qbert:
-    """Searches a tree of hops wherever it can hop, and does nothing in the air.
+    """Searches a tree of hops wherever it can hop.
 
-    Nor always at once where it stands: whoever misses the moment, and has never seen Qbert stand
-    still, stands still for ever.
+    In the air it asks for the hop after that already. Whoever learns from it need not tell the
+    moment to hop: from one that asks at that moment alone one learns to do nothing.
     """
 
     def __init__(self) -> None:
         self._colours: list[int] = []  # that tiles have had in this round, in order
         self._order: list[int] = []  # of actions: the first of those that are equally good is done
+        self._next = _NOOP  # the hop after the one that is being done
+        self._lives = 0
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
         if not self._order:  # drawn once: games differ, but a game's decisions are consistent
@@ -198,28 +199,33 @@ class _Qbert:
         if len(set(colours)) == 1:  # a new round
             self._colours = []
         self._colours = list(dict.fromkeys(self._colours + colours))
-        if not _rests(ram) or random.random() < _WAITS:
-            return _NOOP
-        return self._search(emulator, _HOPS_AHEAD)[1]
+        if emulator.lives < self._lives:
+            self._next = _NOOP
+        self._lives = emulator.lives
+        if not _rests(ram):
+            return self._next
+        _, action, self._next = self._search(emulator, _HOPS_AHEAD)
+        return action
 
-    def _search(self, emulator: Emulator, depth: int) -> tuple[float, int]:
-        """The value of the best that can be done now, in tiles, and the action."""
+    def _search(self, emulator: Emulator, depth: int) -> tuple[float, int, int]:
+        """The value of the best that can be done now, in tiles, the action, and the one after."""
         saved, (row, place) = emulator.save(), _tile(emulator.ram())
-        best, most = _NOOP, -np.inf
+        most, best, after = -np.inf, _NOOP, _NOOP
         for action in self._order:
             down, aside = _HOPS.get(action, (0, 0))
             if depth < _HOPS_AHEAD and not _is_tile(row + down, place + aside):
                 continue  # whether there is a disc beyond the edge is only tried for the first hop
-            value = self._hop(emulator, action)
+            value, then = self._hop(emulator, action), _NOOP
             if value > _DIED:
                 if depth > 1 and _rests(emulator.ram()):
-                    value += 0.95 * self._search(emulator, depth - 1)[0]
+                    more, then, _ = self._search(emulator, depth - 1)
+                    value += 0.95 * more
                 else:
                     value -= 0.2 * self._distance(emulator.ram())
             emulator.restore(saved)
             if value > most + 1e-6:
-                best, most = action, value
-        return most, best
+                most, best, after = value, action, then
+        return most, best, after
 
     def _hop(self, emulator: Emulator, action: int) -> float:
         """Hops until Qbert has landed, or waits; the reward, in tiles."""
