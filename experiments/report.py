@@ -134,7 +134,10 @@ def rows_of(root: Path, *names: str) -> list[Row]:
 
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
-    rows = {"babyai": rows_of(root, "babyai"), "puzzles": rows_of(root, *PUZZLES)}
+    rows: dict[str, Any] = {
+        "babyai": rows_of(root, "babyai"),
+        "puzzles": rows_of(root, *PUZZLES),
+    }
     for name in ("atari", *ANALYSES):
         rows[name] = rows_of(root, name)
     for name in ("planning", "training", "quality", "landscape", "atari-data", "atari-energy"):
@@ -151,7 +154,7 @@ def documents(root: Path) -> dict[Path, str]:
         "acting": (acting, "babyai"),
         "searches": (searches, "puzzles"),
         "arms": (arms, "puzzles"),
-        "atari": (atari, "atari"),
+        "atari": (functools.partial(atari, data=rows["atari-data"]), "atari"),
         "atari-data": (atari_data, "atari-data"),
         "atari-energy": (atari_energy, "atari-energy"),
         "quality": (quality, "quality"),
@@ -414,11 +417,13 @@ def arms(rows: Sequence[Row]) -> str:
     return _table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
 
 
-def atari(rows: Sequence[Row]) -> str:
+def atari(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
 
-    With the standard error, over seeds where there are several and over games where there is one.
+    With the standard error, over seeds where there are several and over games where there is one;
+    and the mean score of the games that were learned from.
     """
+    columns = [*ATARI, "the data"]
     lines = []
     for name, game in GAMES.items():
         of = {
@@ -438,10 +443,16 @@ def atari(rows: Sequence[Row]) -> str:
         }
         raw = {title: f"{mean:.1f} ± {error:.1f}" for title, (mean, error) in cells.items()}
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
+        if cells and name in data:
+            reached = float(np.mean([played["score"] for played in data[name]]))
+            normal["the data"], raw["the data"] = (
+                f"{game.normalised(reached):.1f}",
+                f"{reached:.1f}",
+            )
         for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
             if by_title:
-                lines.append([name, what, *(by_title.get(title, "-") for title in ATARI)])
-    return _table("game | | " + " | ".join(ATARI), lines)
+                lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
+    return _table("game | | " + " | ".join(columns), lines)
 
 
 def _mean_score(rows: Sequence[Row]) -> tuple[float, float]:

@@ -267,7 +267,9 @@ def test_the_table_has_normalised_scores():
     }  # fmt: skip
     names = report._names("atari", "Breakout", "bc", "leapjax", (), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": names[0]}]
-    table = report.atari(rows)
-    assert "| Breakout | ours | - | - | 100.0 ± 10.0 |" in table
-    assert "| Breakout | our score | - | - | 30.5 ± 2.9 |" in table
-    assert "| Breakout | paper | 400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9 | - |" in table
+    table = report.atari(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
+    none = "- | - | - | - | -"
+    assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
+    assert f"| Breakout | our score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
+    paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
+    assert f"| Breakout | paper | {paper} | - | - |" in table
