@@ -18,6 +18,7 @@ from leapjax.models.trajectory import (
     Sizes,
     build,
 )
+from leapjax.models.transformer import causal_mask
 from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
 from tests.enumerable import all_plans, quick_jit
@@ -432,6 +433,35 @@ def test_with_causal_attention_no_action_sees_a_later_one(architecture):
             seen[changed] &= architecture == "leapjax" or attention == "full"
             differs = np.abs(after - before)[:, :3].max(axis=1) > 1e-7
             np.testing.assert_array_equal(differs, seen)
+
+
+@pytest.mark.parametrize("past", [0, 2])
+def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
+    """The paper's network, conditioned on returns; with full attention it keeps all tokens."""
+    encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), past)
+    configs = [ModelConfig("paper", 2, 2, 16, attention=each) for each in ("causal", "full")]
+    module, full = (build(each, Sizes(4, past, HORIZON, 9), encoder, True) for each in configs)
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(past))
+    returns = jnp.arange(past + 1.0)
+    actions, positions = jnp.array([1, mask_token(4), 2]), jnp.array([2, 0])
+
+    def scores(module, actions):
+        return module.logits(module.encode(context, returns=returns), actions, positions)
+
+    def over_all(module, actions):
+        prefix, tokens = module.encode(context, returns=returns)
+        assert prefix is None and len(tokens) == 3 * (past + HORIZON)
+        asked = 3 * (past + np.arange(HORIZON)) + 1
+        x = tokens.at[asked + 1].add(jnp.tanh(module.action(actions)))
+        return module.head(module.transformer(x, asked[positions], mask=causal_mask(len(x))))
+
+    params = module.init(jax.random.key(0), actions, method=scores)
+    found = module.apply(params, actions, method=scores)
+    wanted = full.apply(params, actions, method=over_all)
+    assert np.ptp(wanted[0]) > 1e-4
+    # The end is never first.
+    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found[1, :-1], wanted[1, :-1], rtol=1e-4, atol=1e-6)
 
 
 def test_unknown_precision_is_refused():

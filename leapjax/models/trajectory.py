@@ -80,6 +80,9 @@ class PaperModel(nn.Module):
     attention, as the paper has it in Atari); an action is read off its state token and all
     tokens share one embedding of the time at the end of the plan, as in the authors' code.
     Where it is conditioned on returns to go, the token of one precedes each state's.
+
+    With causal attention no token of the context depends on the plan: their keys and values are
+    computed once per plan, and a pass runs over the plan's tokens only.
     """
 
     config: ModelConfig
@@ -105,14 +108,17 @@ class PaperModel(nn.Module):
     def encode(
         self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
     ) -> PyTree:
-        """The embeddings that every pass shares: `[2 (K + T), D]`, or `3 (K + T)` of them.
+        """What every pass shares: the context's keys and values, per layer, and embeddings.
+
+        Those are of the plan's tokens, `[2 T, D]`, or 3 for each step where it is conditioned. With
+        full attention, or no past, there are no keys and values, and the embeddings are of all
+        tokens, `[2 (K + T), D]`.
 
         Args:
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
         """
-        del deterministic
         horizon = self.sizes.horizon
 
         def with_plan(known: jax.Array) -> jax.Array:  # every position has the current one
@@ -125,7 +131,13 @@ class PaperModel(nn.Module):
             steps.insert(0, with_plan(jnp.tanh(self.goal(returns[:, None]))))
         tokens = jnp.stack(steps, axis=1).reshape(-1, self.config.width)
         time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
-        return tokens + self.position(jnp.arange(tokens.shape[0])) + time
+        tokens = tokens + self.position(jnp.arange(tokens.shape[0])) + time
+        if self.config.attention != "causal" or self.sizes.context == 0:
+            return None, tokens
+        known, planned = jnp.split(tokens, [self.each * self.sizes.context])
+        known = self.drop(known, deterministic=deterministic)
+        mask = causal_mask(known.shape[0])
+        return self.transformer.prefix(known, mask, deterministic), planned
 
     def logits(
         self,
@@ -136,11 +148,13 @@ class PaperModel(nn.Module):
     ) -> jax.Array:
         """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
         check_plan(actions, self.sizes.horizon)
-        asked = self.each * (self.sizes.context + jnp.arange(self.sizes.horizon)) + self.each - 2
-        x = memory.at[asked + 1].add(jnp.tanh(self.action(actions)))
+        prefix, tokens = memory
+        before = tokens.shape[0] - self.each * self.sizes.horizon  # tokens of the context
+        asked = before + self.each * jnp.arange(self.sizes.horizon) + self.each - 2
+        x = tokens.at[asked + 1].add(jnp.tanh(self.action(actions)))
         x = self.drop(x, deterministic=deterministic)
-        mask = attention_mask(self.config, x.shape[0])
-        h = self.transformer(x, asked[positions], mask=mask, deterministic=deterministic)
+        mask = attention_mask(self.config, x.shape[0], 0 if prefix is None else len(prefix[0].keys))
+        h = self.transformer(x, asked[positions], prefix, mask, deterministic)
         return forbid_early_end(self.head(h), positions)
 
 
