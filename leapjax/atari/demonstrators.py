@@ -181,8 +181,9 @@ def _is_tile(row: int, place: int) -> bool:
 class _Qbert:
     """Searches a tree of hops wherever it can hop.
 
-    In the air it asks for the hop after that already. Whoever learns from it need not tell the
-    moment to hop: from one that asks at that moment alone one learns to do nothing.
+    Where it cannot, it asks for the hop that comes after, or for some hop. Whoever learns from it
+    need not tell the moment to hop: from one that asks at that moment alone, or does nothing
+    between two lives, one learns to do nothing for ever.
     """
 
     def __init__(self) -> None:
@@ -203,9 +204,15 @@ class _Qbert:
             self._next = _NOOP
         self._lives = emulator.lives
         if not _rests(ram):
-            return self._next
+            return self._next or self._some_hop(ram)
         _, action, self._next = self._search(emulator, _HOPS_AHEAD)
         return action
+
+    def _some_hop(self, ram: np.ndarray) -> int:
+        """A hop that does not leave the pyramid."""
+        row, place = _tile(ram)
+        hops = {action: (row + down, place + aside) for action, (down, aside) in _HOPS.items()}
+        return next((action for action in self._order if _is_tile(*hops.get(action, (-1, 0)))), 3)
 
     def _search(self, emulator: Emulator, depth: int) -> tuple[float, int, int]:
         """The value of the best that can be done now, in tiles, the action, and the one after."""
