@@ -445,10 +445,8 @@ def atari(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         if cells and name in data:
             reached = float(np.mean([played["score"] for played in data[name]]))
-            normal["the data"], raw["the data"] = (
-                f"{game.normalised(reached):.1f}",
-                f"{reached:.1f}",
-            )
+            normal |= {"the data": f"{game.normalised(reached):.1f}"}
+            raw |= {"the data": f"{reached:.1f}"}
         for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])

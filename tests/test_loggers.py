@@ -1,13 +1,15 @@
 """Where measurements go, and what is kept of every episode."""
 
 import csv
+import io
 import struct
 import sys
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
-from experiments.common import config, experiment, loggers, results
+from experiments.common import config, experiment, loggers, progress, results
 from leapjax import domains, scores
 from leapjax.errors import UserError
 from tests.frozen_lake import FROZEN_LAKE
@@ -108,3 +110,14 @@ def test_loggers_that_there_are_not_are_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(UserError, match=r"pip install 'leapjax\[tensorboard\]'"):
         config.parse("babyai", ["--loggers", "tensorboard"])
+
+
+def test_a_log_says_how_long_it_will_take_once_that_is_known(monkeypatch):
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0.0)
+    out = io.StringIO()
+    with progress.Meter(Console(file=out, width=100), "games", 10) as meter:
+        meter.update(0)
+        meter.update(10, "score 3")
+    first, last = out.getvalue().splitlines()
+    assert first.split() == ["games", "0/10", "0.0/s", "ETA", "unknown"]
+    assert last.startswith("games 10/10 ") and last.endswith("ETA 0s  score 3")

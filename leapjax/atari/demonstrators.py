@@ -211,8 +211,11 @@ class _Qbert:
     def _some_hop(self, ram: np.ndarray) -> int:
         """A hop that does not leave the pyramid."""
         row, place = _tile(ram)
-        hops = {action: (row + down, place + aside) for action, (down, aside) in _HOPS.items()}
-        return next((action for action in self._order if _is_tile(*hops.get(action, (-1, 0)))), 3)
+        for action in self._order:
+            down, aside = _HOPS.get(action, (0, 0))
+            if action and _is_tile(row + down, place + aside):
+                return action
+        return 3  # it is in no place now
 
     def _search(self, emulator: Emulator, depth: int) -> tuple[float, int, int]:
         """The value of the best that can be done now, in tiles, the action, and the one after."""

@@ -101,8 +101,8 @@ class CurrentTokens(nn.Module):
         known = jnp.maximum(jnp.arange(past + 1), past - context.step)
         read = Features(HALVED, self.features, self.dtype, name="features")
         features = read(changes(stacked(frames[known], 1)))
-        # Wide and not small: what is shown to the transformer must be about positions already. Its
-        # normalisation halves the steps to an accuracy (docs/tried.md).
+        # Wide, not small, and normalised: what is shown to the transformer must be about positions
+        # already (docs/tried.md).
         hidden = nn.Dense(
             HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
         )
