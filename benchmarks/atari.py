@@ -8,13 +8,14 @@ the encoder, and the iterations over the plan.
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 import tyro
+from jax.sharding import NamedSharding
 from rich.console import Console
 from rich.table import Table
 
@@ -24,9 +25,10 @@ from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, fastest, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
-from leapjax import pretrained
+from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
+from leapjax.types import Energy, Params, PyTree
 
 GAMES_PLAYED = (1, 16, 64)  # together
 DECISIONS = 50  # of each game, to measure
@@ -84,7 +86,6 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     energy = agent.energy
     params = jax.jit(agent.init)(jax.random.key(0)).params
-    encode = jax.jit(jax.vmap(energy.encode, in_axes=(None, 0)))
     rows: list[Row] = []
     for batch in batches:
         plan = compile_planner(energy, config.planner, (batch,))
@@ -94,7 +95,8 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
         jax.block_until_ready(plan(params, keys, contexts))
         first = time.perf_counter() - begun
         planning = fastest(partial(plan, params, keys, contexts), seconds)
-        jax.block_until_ready(encode(params, contexts))
+        encode, placed = split_encoder(energy, params, contexts, batch)
+        jax.block_until_ready(encode(*placed))
         rows.append(
             {
                 "level": config.level,
@@ -102,12 +104,27 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
                 "batch": batch,
                 "compile_seconds": first - planning,
                 "planning_seconds": planning,
-                "encoding_seconds": fastest(partial(encode, params, contexts), seconds),
+                "encoding_seconds": fastest(partial(encode, *placed), seconds),
                 "playing_seconds": playing_seconds(domain, batch),
-                "encoding_flops": matmul_flops(encode, params, contexts),
+                "encoding_flops": matmul_flops(
+                    jax.vmap(energy.encode, in_axes=(None, 0)), params, contexts
+                ),
             }
         )
     return rows
+
+
+def split_encoder(
+    energy: Energy, params: Params, contexts: PyTree, batch: int
+) -> tuple[Callable[..., PyTree], tuple[PyTree, ...]]:
+    """What encodes so many contexts on as many devices as a planner does, and its arguments."""
+
+    def rows(_: None, params: Params, contexts: PyTree) -> PyTree:
+        return jax.vmap(energy.encode, in_axes=(None, 0))(params, contexts)
+
+    mesh = sharding.make_mesh(batch)
+    split = jax.device_put(contexts, NamedSharding(mesh, sharding.SPLIT))
+    return sharding.split_batches(rows, mesh), (None, sharding.replicate(params, mesh), split)
 
 
 def playing_seconds(domain: Domain, batch: int) -> float:
