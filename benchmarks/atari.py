@@ -8,7 +8,7 @@ the encoder, and the iterations over the plan.
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -28,7 +28,6 @@ from experiments.common.config import AnyConfig, make_domain, preset, specify, w
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
-from leapjax.types import Energy, Params, PyTree
 
 GAMES_PLAYED = (1, 16, 64)  # together
 DECISIONS = 50  # of each game, to measure
@@ -86,6 +85,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     energy = agent.energy
     params = jax.jit(agent.init)(jax.random.key(0)).params
+    encode = jax.vmap(energy.encode, in_axes=(None, 0))
     rows: list[Row] = []
     for batch in batches:
         plan = compile_planner(energy, config.planner, (batch,))
@@ -95,8 +95,12 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
         jax.block_until_ready(plan(params, keys, contexts))
         first = time.perf_counter() - begun
         planning = fastest(partial(plan, params, keys, contexts), seconds)
-        encode, placed = split_encoder(energy, params, contexts, batch)
-        jax.block_until_ready(encode(*placed))
+        # On as many devices as the planner.
+        mesh = sharding.make_mesh(batch)
+        split = sharding.split_batches(lambda _, *given: encode(*given), mesh)
+        placed = jax.device_put(contexts, NamedSharding(mesh, sharding.SPLIT))
+        encoding = partial(split, None, sharding.replicate(params, mesh), placed)
+        jax.block_until_ready(encoding())
         rows.append(
             {
                 "level": config.level,
@@ -104,27 +108,12 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
                 "batch": batch,
                 "compile_seconds": first - planning,
                 "planning_seconds": planning,
-                "encoding_seconds": fastest(partial(encode, *placed), seconds),
+                "encoding_seconds": fastest(encoding, seconds),
                 "playing_seconds": playing_seconds(domain, batch),
-                "encoding_flops": matmul_flops(
-                    jax.vmap(energy.encode, in_axes=(None, 0)), params, contexts
-                ),
+                "encoding_flops": matmul_flops(encode, params, contexts),
             }
         )
     return rows
-
-
-def split_encoder(
-    energy: Energy, params: Params, contexts: PyTree, batch: int
-) -> tuple[Callable[..., PyTree], tuple[PyTree, ...]]:
-    """What encodes so many contexts on as many devices as a planner does, and its arguments."""
-
-    def rows(_: None, params: Params, contexts: PyTree) -> PyTree:
-        return jax.vmap(energy.encode, in_axes=(None, 0))(params, contexts)
-
-    mesh = sharding.make_mesh(batch)
-    split = jax.device_put(contexts, NamedSharding(mesh, sharding.SPLIT))
-    return sharding.split_batches(rows, mesh), (None, sharding.replicate(params, mesh), split)
 
 
 def playing_seconds(domain: Domain, batch: int) -> float:

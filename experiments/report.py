@@ -489,7 +489,8 @@ def atari_energy(found: Mapping[str, Any]) -> str:
     """How energies of trajectories and their rewards are correlated."""
     lines = [
         [name, str(len(of["energies"])), f"{of['correlation']:.2f}", f"{of['p_value']:.1g}"]
-        for name, of in found.items()
+        for name in GAMES
+        if (of := found.get(name))
     ]
     return _table("game | trajectories | rank correlation of energy and reward | p", lines)
 
