@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from experiments import atari, atari_energy, report
-from leapjax.atari import collect, domain, encoders, replay
+from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
+from leapjax.atari.emulator import Emulator
 from leapjax.atari.games import GAMES, find_game
 from leapjax.data import windows
 from leapjax.errors import UserError
@@ -111,7 +112,7 @@ def test_encoders_see_what_they_should(architecture):
 
 def test_a_shift_moves_all_frames_alike():
     drawn = window(5)
-    move = jax.jit(functools.partial(domain.shifted, most=4))
+    move = jax.jit(functools.partial(augmentation.shifted, most=4))
     corners = set()
     for seed in range(12):
         moved = move(jax.random.key(seed), drawn)
@@ -132,8 +133,89 @@ def test_a_shift_moves_all_frames_alike():
         corners |= found[0]
         np.testing.assert_array_equal(moved.actions, drawn.actions)
     assert len(corners) > 6
-    still = domain.shifted(jax.random.key(0), drawn, 0)
+    still = augmentation.shifted(jax.random.key(0), drawn, 0)
     np.testing.assert_array_equal(still.context.past, drawn.context.past)
+
+
+@pytest.mark.parametrize("name", GAMES)
+def test_every_other_window_is_in_a_mirror(name):
+    game, drawn = GAMES[name], window(5)
+    past = jax.random.randint(jax.random.key(1), (6, 84, 84), 0, 256).astype(jnp.uint8)
+    ids = jnp.arange(len(game.actions) + 3)  # the end action, MASK and PAD among them
+    context = drawn.context._replace(observation=past[-1], past=past[:-1], actions=ids)
+    drawn = drawn._replace(context=context, actions=ids[::-1])
+    show = jax.jit(
+        functools.partial(augmentation.mirrored, mirror=game.mirror, actions=game.actions)
+    )
+    shown = [show(jax.random.key(seed), drawn) for seed in range(40)]
+    as_played = [bool((each.actions == drawn.actions).all()) for each in shown]
+    assert 8 < sum(as_played) < 32
+    for each, kept in zip(shown, as_played, strict=True):
+        same(each.context.past, past[:-1] if kept else augmentation.reflect(past[:-1], game.mirror))
+        same(each.context.observation, past[-1] if kept else reflected(past[-1], game.mirror))
+        same(each.context.actions, each.actions[::-1])
+        same(each.context.step, drawn.context.step)
+    swapped = shown[as_played.index(False)].actions[::-1]
+    same(swapped[swapped], ids)  # twice in the mirror is as before
+    same(swapped[len(game.actions) :], ids[len(game.actions) :])
+
+
+def reflected(frame, mirror):
+    """An oracle: pixel by pixel."""
+    frame = np.array(frame)
+    result = frame.copy()
+    for row in range(*mirror.rows):
+        for column in range(*mirror.columns):
+            if mirror.axis == 0:
+                result[row, column] = frame[sum(mirror.rows) - 1 - row, column]
+            else:
+                result[row, column] = frame[row, sum(mirror.columns) - 1 - column]
+    return result
+
+
+def same(found, expected):
+    np.testing.assert_array_equal(found, expected)
+
+
+# Where in memory a player is, along the axis of the mirror.
+PLACES = {"Breakout": 72, "Qbert": 43, "Pong": 51, "Seaquest": 70}
+
+
+@pytest.mark.parametrize("name", GAMES)
+def test_in_a_mirror_actions_do_the_opposite(name):
+    game = GAMES[name]
+    emulator = Emulator(game)
+    emulator.reset(20)
+    for _ in range(40):  # until the game has begun
+        emulator.step(1)
+    for step in range(20):  # Qbert hops away from the top, and lands
+        emulator.step(3 if step < 2 and name == "Qbert" else 0)
+    start = emulator.save()
+
+    def way(action):
+        emulator.restore(start)
+        before = int(emulator.ram()[PLACES[name]])
+        for _ in range(6):
+            emulator.step(game.actions.index(action))
+        return int(emulator.ram()[PLACES[name]]) - before
+
+    pairs = {a: game.mirror.actions[a] for a in game.actions if a in game.mirror.actions}
+    assert len(pairs) >= 2
+    for action, other in pairs.items():
+        assert way(action) * way(other) < 0
+
+
+def test_the_mirror_of_breakout_is_in_its_middle():
+    game = GAMES["Breakout"]
+    frame = Emulator(game).frame()  # walls and bricks
+
+    def error(mirror):
+        return np.abs(augmentation.reflect(frame, mirror) * 1.0 - frame).mean()
+
+    first, stop = game.mirror.columns
+    right = error(game.mirror)
+    assert right < error(game.mirror._replace(columns=(first + 1, stop))) / 3
+    assert right < error(game.mirror._replace(columns=(first, stop - 1))) / 3
 
 
 def test_presets_are_the_papers_and_ours():

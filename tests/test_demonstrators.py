@@ -86,7 +86,7 @@ def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
 
 @games
 def test_noise_replaces_actions(name):
-    assert len(set(NOISES[name])) == 3 and max(NOISES[name]) <= 0.5
+    assert len(set(NOISES)) == 3 and max(NOISES) <= 0.5
     noisy = played(name, noise=1.0)
     assert len(set(noisy.actions)) >= 4
     assert not same(played(name), noisy)
@@ -121,5 +121,5 @@ def test_qbert_colours_tiles():
 
 
 def test_seaquest_hits():
-    assert played("Seaquest", most_steps=80).score >= 40
-    assert play_at_random("Seaquest", 80) < 40
+    assert played("Seaquest", most_steps=150).score >= 100
+    assert play_at_random("Seaquest", 150) < 100

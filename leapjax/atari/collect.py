@@ -86,7 +86,7 @@ def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> 
     """Plays and writes one file; what is in it."""
     game = find_game(name)
     logs = replay.replay_logs(folder, game, run)
-    noises = demonstrators.NOISES[name]
+    noises = demonstrators.NOISES
     first = TRAINING_START + run * TRAINING_STRIDE + number * GAMES
     played: list[replay.Episode] = []
     games: list[dict[str, Any]] = []

@@ -1,7 +1,7 @@
 """Players that are built in, so that data can be made without a download.
 
 They know what the emulator's memory means. A paddle follows a rule; Qbert searches a tree of hops
-in the emulator, and Seaquest takes the best of random plans.
+in the emulator, Seaquest's tries what comes of each direction.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,10 @@ from leapjax.atari.games import MAX_STEPS, Game
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
 # what to do now; leaves the emulator as it found it. One plays one game, from its start on.
 
-NOISES: dict[str, tuple[float, ...]] = {
-    "Breakout": (0.1, 0.3, 0.5),
-    "Qbert": (0.0, 0.1, 0.3),
-    "Pong": (0.1, 0.3, 0.5),
-    "Seaquest": (0.1, 0.3, 0.5),
-}  # probabilities of a random action: returns vary with it, and what is lost must be found again
-# A paddle that is always where it should be teaches nothing about how to come back: cloned from
-# less noise, it misses a ball and stays (docs/tried.md).
+NOISES = (0.1, 0.3, 0.5)  # probabilities of a random action, so that returns vary
+# None plays without: what is lost must be found again, and who goes in circles must get out. A
+# paddle that is always where it should be teaches nothing about how to come back: cloned, it
+# misses a ball and stays (docs/tried.md).
 
 _NOOP = 0  # in every game
 
@@ -188,13 +184,11 @@ class _Qbert:
 
     def __init__(self) -> None:
         self._colours: list[int] = []  # that tiles have had in this round, in order
-        self._order: list[int] = []  # of actions: the first of those that are equally good is done
         self._next = _NOOP  # the hop after the one that is being done
         self._lives = 0
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
-        if not self._order:  # drawn once: games differ, but a game's decisions are consistent
-            self._order = [*random.permutation(list(_HOPS)).tolist(), _NOOP]
+        del random  # whoever learns from it can learn which of two equally good hops it does
         ram = emulator.ram()
         colours = [int(ram[at]) for at in _TILES]
         if len(set(colours)) == 1:  # a new round
@@ -211,9 +205,8 @@ class _Qbert:
     def _some_hop(self, ram: np.ndarray) -> int:
         """A hop that does not leave the pyramid."""
         row, place = _tile(ram)
-        for action in self._order:
-            down, aside = _HOPS.get(action, (0, 0))
-            if action and _is_tile(row + down, place + aside):
+        for action, (down, aside) in _HOPS.items():
+            if _is_tile(row + down, place + aside):
                 return action
         return 3  # it is in no place now
 
@@ -221,7 +214,7 @@ class _Qbert:
         """The value of the best that can be done now, in tiles, the action, and the one after."""
         saved, (row, place) = emulator.save(), _tile(emulator.ram())
         most, best, after = -np.inf, _NOOP, _NOOP
-        for action in self._order:
+        for action in (*_HOPS, _NOOP):  # of those that are equally good the first one is done
             down, aside = _HOPS.get(action, (0, 0))
             if depth < _HOPS_AHEAD and not _is_tile(row + down, place + aside):
                 continue  # whether there is a disc beyond the edge is only tried for the first hop
@@ -231,7 +224,7 @@ class _Qbert:
                     more, then, _ = self._search(emulator, depth - 1)
                     value += 0.95 * more
                 else:
-                    value -= 0.2 * self._distance(emulator.ram())
+                    value -= 0.08 * self._distance(emulator.ram())
             emulator.restore(saved)
             if value > most + 1e-6:
                 most, best, after = value, action, then
@@ -261,10 +254,12 @@ class _Qbert:
 
 
 _SHOTS = (1, *range(10, 18))  # the actions that fire, and move in some direction or none
-_HOLD = 2  # decisions that an action of a plan is repeated for
-_HORIZON = 8  # actions in a plan
-_PLANS = 4  # that are tried at a time; 8 scored no more
-_BETTER = 0.05  # by how much, in hits, a plan must be better than the one that there is
+_HOLD = 2  # decisions that what is chosen is done for
+_HORIZON = 12  # decisions that it is tried for; 16 score no more, 8 less
+_FADES = 0.97  # what a hit is worth, one decision later
+_BETTER = 0.02  # by how much, in hits, something else must be better than to go on
+_HOME = (76, 60)  # in memory, across and down: where the submarine goes when nothing is near
+_AWAY = 0.05  # hits that it costs to be on one of the edges
 
 
 def _dies(ram: np.ndarray) -> bool:
@@ -273,60 +268,49 @@ def _dies(ram: np.ndarray) -> bool:
 
 
 def _prospects(ram: np.ndarray) -> float:
-    """What the end of a plan promises, in hits: divers, and the way up when it is time for it."""
-    oxygen, divers, depth = int(ram[102]), int(ram[62]), int(ram[97]) - 13
+    """What the end of a trial promises, in hits: divers, the way up in time, and the middle."""
+    oxygen, divers, across, down = (int(ram[at]) for at in (102, 62, 70, 97))
     # To come up without a diver is death, too.
     suffocating = max(0, 24 - oxygen) / 24 if divers else 0
-    return divers - max(suffocating, 0.3 * (divers >= 6)) * depth / 10
+    up = max(suffocating, 0.3 * (divers >= 6)) * (down - 13) / 10
+    away = abs(across - _HOME[0]) / 70 + abs(down - _HOME[1]) / 50
+    return divers - up - _AWAY * away
 
 
 class _Seaquest:
-    """Takes the best of random plans; what is left of it is the next one to be beaten."""
+    """Tries in the emulator to go on in each direction, and takes the best.
+
+    Random plans win as much, but whoever learns from them sees what cannot be told from frames:
+    which plan happened to be drawn.
+    """
 
     def __init__(self) -> None:
-        self._plan: list[int] = []  # of actions, the first of which is being done
-        self._held = 0  # for how many decisions it has been
+        self._action = _SHOTS[0]
+        self._held = 0  # for how many decisions it has been done
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
+        del random
         if _dies(emulator.ram()):
-            self._plan, self._held = [], 0
-            return _SHOTS[0]
+            self._action, self._held = _SHOTS[0], 0
+            return self._action
         if self._held % _HOLD == 0:
-            self._plan = self._choose(emulator, random, self._plan[1:] or [_SHOTS[0]])
+            self._action = self._choose(emulator)
         self._held += 1
-        return self._plan[0]
+        return self._action
 
-    def _choose(
-        self, emulator: Emulator, random: np.random.Generator, kept: list[int]
-    ) -> list[int]:
-        """The best plan. Not a slightly better one: what is done should follow from the frames."""
-        saved = emulator.save()
-        kept = kept + kept[-1:] * (_HORIZON - len(kept))
-        best, most = kept, self._value(emulator, kept)
-        for number in range(_PLANS):
-            plan = self._change(kept, random) if number % 2 else self._change([], random)
+    def _choose(self, emulator: Emulator) -> int:
+        """What is best, if it is clearly better than what is being done."""
+        saved, values = emulator.save(), {}
+        for action in _SHOTS:
+            values[action] = self._value(emulator, action) + _BETTER * (action == self._action)
             emulator.restore(saved)
-            value = self._value(emulator, plan)
-            if value > most + _BETTER * (1 + (plan[0] != kept[0])):
-                best, most = plan, value
-        emulator.restore(saved)
-        return best
+        return max(values, key=values.__getitem__)
 
-    def _change(self, plan: list[int], random: np.random.Generator) -> list[int]:
-        """A plan with some other actions, each repeated a few times; a new one if it is empty."""
-        plan, start = list(plan), int(random.integers(_HORIZON)) if plan else 0
-        changed = plan or [_SHOTS[0]] * _HORIZON
-        while start < _HORIZON:
-            stop = min(start + int(random.integers(1, 5)), _HORIZON)
-            changed[start:stop] = [int(random.choice(_SHOTS))] * (stop - start)
-            start = _HORIZON if plan and random.random() < 0.5 else stop
-        return changed
-
-    def _value(self, emulator: Emulator, plan: list[int]) -> float:
-        """The reward of a plan and what it leads to, in hits."""
+    def _value(self, emulator: Emulator, action: int) -> float:
+        """The reward of doing one thing all the time, and what that leads to, in hits."""
         total = 0.0
-        for step, action in enumerate(plan):
-            total += sum([emulator.advance(action) for _ in range(_HOLD)]) / 20
+        for step in range(_HORIZON):
+            total += emulator.advance(action) / 20 * _FADES**step
             if _dies(emulator.ram()):
                 return total - 100 + step
         return total + _prospects(emulator.ram())

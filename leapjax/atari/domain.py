@@ -8,22 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from leapjax.atari import replay
+from leapjax.atari.augmentation import mirrored, shifted
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
 from leapjax.atari.games import GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, check_at_least
 from leapjax.models.trajectory import ModelConfig
-from leapjax.types import Window
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
 TOKENS = 4  # of a state, of our encoder
+TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +34,7 @@ class Settings:
     sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
     max_steps: int = MAX_STEPS  # of a game: then it is cut off
     features: int = 32  # of the first convolution; the others have twice as many
+    mirror: bool = False  # show every other window in a mirror, to learn from more
     shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
 
     def __post_init__(self) -> None:
@@ -69,6 +69,7 @@ def make(name: str, settings: Settings) -> Domain:
         del context
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 
+    mirror = functools.partial(mirrored, mirror=game.mirror, actions=game.actions)
     shift = functools.partial(shifted, most=settings.shift)
     return Domain(
         level=name,
@@ -78,7 +79,7 @@ def make(name: str, settings: Settings) -> Domain:
         max_steps=settings.max_steps,
         blank=np.zeros((HEIGHT, WIDTH), np.uint8),
         encoders={"paper": state_tokens, "leapjax": current_tokens},
-        augmentations=[shift] if settings.shift else (),
+        augmentations=[mirror] * settings.mirror + [shift] * (settings.shift > 0),
         source=source(game, settings),
         return_scale=game.return_scale,
         signature={"actions": list(game.actions)},
@@ -117,21 +118,6 @@ def no_episodes(name: str, count: int, seed: int, progress: Callable[[int], None
     )
 
 
-def shifted(key: jax.Array, window: Window, most: int) -> Window:
-    """A window whose frames are all moved by the same few pixels (Kostrikov et al., DrQ, 2020)."""
-    corner = jax.random.randint(key, (2,), 0, 2 * most + 1)
-
-    def move(frames: jax.Array) -> jax.Array:
-        around = [(0, 0)] * (frames.ndim - 2) + [(most, most)] * 2
-        wide = jnp.pad(frames, around, mode="edge")
-        start = [jnp.int32(0)] * (frames.ndim - 2) + [corner[0], corner[1]]
-        return jax.lax.dynamic_slice(wide, start, frames.shape)
-
-    context = window.context
-    moved = context._replace(observation=move(context.observation), past=move(context.past))
-    return window._replace(context=moved)
-
-
 # By game: T, N and the batch (paper, tables 6 and 8).
 PAPER = {
     "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
@@ -147,7 +133,9 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
         UserError: an unknown game.
     """
     find_game(name)
-    shared = {"executed": 1, "episodes": 10, "demos": 100_000}  # as many as there are
+    shared = {
+        "executed": 1, "episodes": 10, "test_seed": TEST_SEED, "demos": 100_000,  # all there are
+    }  # fmt: skip
     if preset == "paper":
         horizon, iterations, batch = PAPER[name]
         transitions = 500_000
@@ -157,8 +145,8 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
             "layers": 6, "heads": 8, "attention": "causal",
         }  # fmt: skip
     return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 6000,
-        "layers": 2, "width": 64, "features": 16, "max_steps": LONGEST,
+        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 10_000,
+        "layers": 2, "width": 64, "features": 16, "mirror": True, "max_steps": LONGEST,
     }  # fmt: skip
 
 

@@ -11,6 +11,15 @@ MAX_FRAMES = 108_000  # of a game: half an hour
 MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # decisions
 
 
+class Mirror(NamedTuple):
+    """A reflection that the rules of a game do not notice."""
+
+    axis: int  # of frames that is reversed: 0 exchanges above and below, 1 the sides
+    rows: tuple[int, int]  # from and up to which frames are reflected: scores stay as they are
+    columns: tuple[int, int]
+    actions: Mapping[str, str]  # what becomes of those that change
+
+
 class Game(NamedTuple):
     """One game of the Arcade Learning Environment."""
 
@@ -21,6 +30,7 @@ class Game(NamedTuple):
     human: float  # score of a professional tester of games
     target: float  # return to ask for, of clipped rewards
     return_scale: float  # what returns are divided by before a network sees them
+    mirror: Mirror
     paper: Mapping[str, float]  # gamer-normalised scores by method (paper, table 2), in percent
     paper_without_return: float  # LEAP's, not conditioned on a return (paper, table 9)
 
@@ -37,6 +47,17 @@ _JOYSTICK = (
 _METHODS = ("leap", "dt", "cql", "qr_dqn", "rem", "bc")
 
 
+def _exchange(*pairs: tuple[str, str]) -> Mapping[str, str]:
+    return dict(pairs) | {second: first for first, second in pairs}
+
+
+_SIDES = _exchange(
+    ("right", "left"), ("upright", "upleft"), ("downright", "downleft"), ("rightfire", "leftfire"),
+    ("uprightfire", "upleftfire"), ("downrightfire", "downleftfire"),
+)  # fmt: skip
+_HOPS = _exchange(("up", "left"), ("right", "down"))  # of Qbert, who hops along diagonals
+
+
 def _paper(*scores: float) -> Mapping[str, float]:
     return dict(zip(_METHODS, scores, strict=True))
 
@@ -46,18 +67,22 @@ GAMES: dict[str, Game] = {
     for game in (
         Game(
             "Breakout", "breakout", ("noop", "fire", "right", "left"), 1.7, 30.5, 100.0, 50.0,
+            Mirror(1, (12, 84), (0, 84), _SIDES),
             _paper(400.9, 267.5, 211.1, 17.1, 8.9, 138.9), 182.0,
         ),
         Game(
             "Qbert", "qbert", ("noop", "fire", "up", "right", "left", "down"),
-            163.9, 13455.0, 400.0, 200.0, _paper(19.5, 15.4, 104.2, 0.0, 0.0, 17.3), 41.0,
+            163.9, 13455.0, 400.0, 200.0, Mirror(1, (10, 84), (0, 84), _HOPS),
+            _paper(19.5, 15.4, 104.2, 0.0, 0.0, 17.3), 41.0,
         ),
         Game(
             "Pong", "pong", ("noop", "fire", "right", "left", "rightfire", "leftfire"),
-            -20.7, 14.6, 20.0, 10.0, _paper(108.9, 106.1, 111.9, 18.0, 0.5, 85.2), 100.7,
+            -20.7, 14.6, 20.0, 10.0, Mirror(0, (14, 77), (0, 84), _SIDES),
+            _paper(108.9, 106.1, 111.9, 18.0, 0.5, 85.2), 100.7,
         ),
         Game(
             "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 300.0, 100.0,
+            Mirror(1, (8, 67), (4, 84), _SIDES),
             _paper(1.3, 2.5, 1.7, 0.4, 0.7, 2.1), 0.5,
         ),
     )
