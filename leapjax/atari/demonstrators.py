@@ -91,12 +91,11 @@ class _Table(NamedTuple):
     tap: float  # how far one decision moves the paddle
     coast: float  # how much of it comes after the decision
     stay: int  # moves nowhere; in Breakout it asks for a ball, too: moments without one are rare
-    aim: float  # how far from the paddle's middle to hit a ball
-    spread: float  # around that: of a ball that is always hit alike, the way may be a circle
+    spread: float  # how far from its middle to hit a ball, at most: always hit alike, it may circle
 
 
-_PONG = _Table(49, 54, 51, 187, (44, 207), 5.5, 3, 2, 22.5, 12.5, _NOOP, -3, 1)
-_BREAKOUT = _Table(101, 99, 72, 180, (55, 201), 9, 2, 3, 22, 11, 1, 0, 3)
+_PONG = _Table(49, 54, 51, 187, (44, 207), 5, 3, 2, 22.5, 12.5, _NOOP, 1)
+_BREAKOUT = _Table(101, 99, 72, 180, (55, 201), 9, 2, 3, 22, 11, 1, 3)
 _AHEAD = 2.0  # decisions that a ball's way is followed: further on, it wins no more
 
 
@@ -138,13 +137,13 @@ class _Paddle:
     def __init__(self, table: _Table) -> None:
         self._table = table
         self._before = np.zeros(128, np.uint8)
-        self._aim = table.aim
+        self._aim = 0.0  # where to hit the next ball, away from the middle
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
         table, before, ram = self._table, self._before, emulator.ram()
         self._before = ram
         if not _coming(table, before, ram):
-            self._aim = table.aim + random.uniform(-1, 1) * table.spread
+            self._aim = random.uniform(-1, 1) * table.spread
         return _steer(table, before, ram, emulator.action, self._aim)
 
 
@@ -253,13 +252,14 @@ class _Qbert:
         )
 
 
-_SHOTS = (1, *range(10, 18))  # the actions that fire, and move in some direction or none
+# The actions that fire, and move in some direction or, last, in none: of those that are equally
+# good the first one is done, and to do nothing must not be learned from where nothing can be done.
+_SHOTS = (13, 10, 11, 12, 14, 15, 16, 17, 1)
 _HOLD = 2  # decisions that what is chosen is done for
 _HORIZON = 12  # decisions that it is tried for; 16 score no more, 8 less
 _FADES = 0.97  # what a hit is worth, one decision later
-_BETTER = 0.02  # by how much, in hits, something else must be better than to go on
 _HOME = (76, 60)  # in memory, across and down: where the submarine goes when nothing is near
-_AWAY = 0.05  # hits that it costs to be on one of the edges
+_AWAY = 0.2  # hits that it costs to be on one of the edges
 
 
 def _dies(ram: np.ndarray) -> bool:
@@ -286,23 +286,19 @@ class _Seaquest:
 
     def __init__(self) -> None:
         self._action = _SHOTS[0]
-        self._held = 0  # for how many decisions it has been done
+        self._decisions = 0
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
         del random
-        if _dies(emulator.ram()):
-            self._action, self._held = _SHOTS[0], 0
-            return self._action
-        if self._held % _HOLD == 0:
+        if self._decisions % _HOLD == 0:
             self._action = self._choose(emulator)
-        self._held += 1
+        self._decisions += 1
         return self._action
 
     def _choose(self, emulator: Emulator) -> int:
-        """What is best, if it is clearly better than what is being done."""
         saved, values = emulator.save(), {}
         for action in _SHOTS:
-            values[action] = self._value(emulator, action) + _BETTER * (action == self._action)
+            values[action] = self._value(emulator, action)
             emulator.restore(saved)
         return max(values, key=values.__getitem__)
 

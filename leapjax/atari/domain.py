@@ -134,7 +134,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     """
     find_game(name)
     shared = {
-        "executed": 1, "episodes": 10, "test_seed": TEST_SEED, "demos": 100_000,  # all there are
+        "executed": 1, "episodes": 20, "test_seed": TEST_SEED, "demos": 100_000,  # all there are
     }  # fmt: skip
     if preset == "paper":
         horizon, iterations, batch = PAPER[name]
