@@ -45,6 +45,8 @@ class Options:
     """Games that are played together."""
     training: bool = True
     """Measure training too."""
+    run: int = 16
+    """Windows in a row whose states preset `paper` encodes once; beside windows drawn alone."""
     json: Path | None = None
     """Write the rows here."""
     seconds: float = 3.0
@@ -74,7 +76,9 @@ def run(options: Options) -> None:
     console.print(table(playing))
     trained = []
     if options.training:
-        trained = [training.measure(config, options.seconds) for config in configs]
+        papers = [config for config in configs if config.model.architecture == "paper"]
+        in_runs = [with_options(config, {"run": options.run}) for config in papers]
+        trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
         console.print(training.table(trained))
     write_rows(options.json, [*playing, *trained])
 

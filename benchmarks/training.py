@@ -169,8 +169,8 @@ def _is_float(leaf: jax.Array) -> bool:
 
 def measure(config: AnyConfig, seconds: float) -> Row:
     """One preset on one level."""
-    batch = config.training.batch
-    mesh = sharding.make_mesh(batch)
+    batch, windows = config.training.batch, config.training.run
+    mesh = sharding.make_mesh(batch // windows)
     step = Stepper(config, mesh)
     taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
     flops = step.flops()
@@ -182,9 +182,10 @@ def measure(config: AnyConfig, seconds: float) -> Row:
         "horizon": config.planner.horizon,
         "context": config.context,
         "batch": batch,
+        "run": windows,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
-        "parts": step.parts(mesh, seconds),
+        "parts": step.parts(mesh, seconds) if windows == 1 else [],  # those of runs are shared
         "flops_per_step": flops,
         "gflops": flops / taken / 1e9,
         "peak_gflops": peak,
@@ -211,11 +212,11 @@ def random_steps(domain: Domain) -> Steps:
 
 def table(rows: Sequence[Row]) -> Table:
     """The rows for a terminal."""
-    result = Table("level", "preset", "steps/s", "ms/step", "GFLOP/s", "peak", "fraction", "run")
+    result = Table("level", "preset", "steps/s", "ms/step", "GFLOP/s", "peak", "fraction", "in all")
     for row in rows:
         result.add_row(
             row["level"],
-            row["preset"],
+            row["preset"] + (f", runs of {row['run']}" if row["run"] > 1 else ""),
             f"{row['steps_per_second']:.1f}",
             f"{1e3 / row['steps_per_second']:.1f}",
             f"{row['gflops']:.0f}",

@@ -73,6 +73,19 @@ def test_rewards_are_not_clipped():
     assert rewards <= {0.0, 25.0, 50.0, 75.0, 100.0, 300.0, 500.0} and len(rewards) > 1
 
 
+def test_a_state_is_the_same_in_a_longer_context():
+    made = domain.make("Breakout", domain.Settings())
+    whole = window(12, context=9).context
+    encoder = made.encoders["paper"](MODEL, 9)
+    params = encoder.init(jax.random.key(0), whole)
+    tokens = encoder.apply(params, whole)
+    last = encoder.apply(params, whole._replace(past=whole.past[4:]))
+    assert tokens.shape[0] == 10 and last.shape[0] == 6
+    known = encoders.STACK - 1  # at the front the frames before are not known
+    np.testing.assert_allclose(last[known:], tokens[4 + known :], atol=1e-6)
+    assert (np.abs(last[:known] - tokens[4 : 4 + known]).max(axis=1) > 1e-6).all()
+
+
 def test_success_is_the_score_of_a_gamer():
     easy = BREAKOUT._replace(human=0.0)
     over = [play(AtariAdapter(game, 0.0, 300), 0, 400)[1][-1].success for game in (easy, BREAKOUT)]

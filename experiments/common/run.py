@@ -263,7 +263,8 @@ def training_mesh(config: AnyConfig) -> Mesh:
         UserError: they cannot share the batch.
     """
     try:
-        return sharding.make_mesh(config.training.batch, jax.devices(), config.cluster.fsdp)
+        examples = config.training.batch // config.training.run
+        return sharding.make_mesh(examples, jax.devices(), config.cluster.fsdp)
     except ValueError as error:
         raise UserError(f"--batch, --fsdp: {error}") from None
 

@@ -3,10 +3,12 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.data.windows import Steps
+from leapjax.errors import UserError
 from leapjax.types import TransitionWindow, Window
 
 
@@ -24,10 +26,46 @@ def window_batches(
     def window(steps: Steps, index: jax.Array) -> Window:
         return cut(steps, index, setup.context, setup.horizon, setup.domain.num_actions - 1)
 
+    _check_single(setup)
+
     def batch(key: jax.Array, steps: Steps) -> Window:
         return _draw(setup, window, key, steps)[0]
 
     return batch
+
+
+def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
+    """An agent's `batch` of runs of S windows, `[B / S, S, ...]`, each augmented as a whole.
+
+    A run that gets to the end of its demonstration stays at its last window.
+    """
+    domain, training = setup.domain, setup.training
+
+    def window(steps: Steps, index: jax.Array) -> Window:
+        return windows.window(steps, index, setup.context, setup.horizon, domain.num_actions - 1)
+
+    def batch(key: jax.Array, steps: Steps) -> Window:
+        step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+        count = training.batch // training.run
+        starts = windows.sample_steps(step_key, steps, count, training.windows)
+        ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
+        each = jax.vmap(window, in_axes=(None, 0))
+        drawn = jax.vmap(each, in_axes=(None, 0))(steps, starts[:, None] + ahead)
+        for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+            alike = jax.vmap(augment, in_axes=(None, 0))
+            drawn = jax.vmap(alike)(jax.random.split(augment_key, count), drawn)
+        return drawn
+
+    return batch
+
+
+def _check_single(setup: Setup) -> None:
+    """Refuses runs of windows, where nothing is won by them."""
+    if setup.training.run > 1:
+        raise UserError(
+            f"--run {setup.training.run}: only LEAP with architecture paper encodes the states of "
+            "windows in a row once"
+        )
 
 
 def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
@@ -36,6 +74,8 @@ def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionW
     def window(steps: Steps, index: jax.Array) -> Window:
         end = setup.domain.num_actions - 1
         return windows.transition_window(steps, index, setup.context, end)
+
+    _check_single(setup)
 
     def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
         drawn, indices = _draw(setup, window, key, steps)

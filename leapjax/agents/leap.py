@@ -1,6 +1,7 @@
 """LEAP: train a masked language model on demonstrations, plan by Gibbs sampling."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,9 @@ from jax.sharding import Mesh
 
 from leapjax import schedules
 from leapjax.agents import learning, returns
-from leapjax.agents.batches import window_batches
+from leapjax.agents.batches import run_batches, window_batches
 from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
 from leapjax.models.trajectory import Model
@@ -79,15 +81,24 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 
     def window_loss(
-        params: Params, extra: PyTree, window: Window, key: jax.Array
+        params: Params,
+        extra: PyTree,
+        window: Window,
+        key: jax.Array,
+        states: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Masked cross-entropy of one window (paper, equation 1), and its accuracy."""
+        """Masked cross-entropy of one window (paper, equation 1), and its accuracy.
+
+        `states`, `[K + 1, D]`, is what the network sees in it, if that is known.
+        """
         del extra
+        seen: Any = {} if states is None else {"states": states}
         mask_key, encode_key, *_ = keys = jax.random.split(key, 2 + sizes.horizon)
         masks = schedules.sample_masks(mask_key, sizes.horizon, masking)  # [C, T]
         memory = module.apply(
             params, window.context, deterministic=False, method="encode",
             rngs={"dropout": encode_key}, returns=to_go(window.context, window.return_to_go),
+            **seen,
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
@@ -113,16 +124,38 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         accuracy = jnp.where(counted, hits, 0).sum() / jnp.maximum(counted.sum(), 1)
         return -jnp.where(counted, likelihoods, 0).sum() / masks.sum(), {"accuracy": accuracy}
 
+    def run_loss(
+        params: Params, extra: PyTree, run: Window, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The mean of S windows in a row, `[S, ...]`; each of their states is encoded once.
+
+        So a state sees the frames before it even at the front of a window, where those before
+        the window are unknown if it is encoded alone (Atari's first three).
+        """
+        states: Any = module.apply(params, windows.joined(run), method="see")  # [K + S, D]
+        keys = jax.random.split(key, run.actions.shape[0])
+
+        def loss(window: Window, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+            place = window.context.step - run.context.step[0]
+            seen = jax.lax.dynamic_slice_in_dim(states, place, sizes.context + 1)
+            return window_loss(params, extra, window, key, seen)
+
+        losses, metrics = jax.vmap(loss)(run, keys)
+        return losses.mean(), jax.tree.map(jnp.mean, metrics)
+
+    # To the other architecture, what a state is depends on the window that it is seen in.
+    in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
     update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
+        run_loss if in_runs else window_loss, optimizer, mesh, microbatch=setup.training.microbatch
     )
+    batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
         memory = module.encode(context, returns=to_go(context))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = learning.make_init(setup, module, touch, optimizer)
-    return Agent(init, window_batches(setup), update, energy)
+    return Agent(init, batch, update, energy)
 
 
 LEAP = Method(Settings, make_agent, PRESETS)

@@ -60,10 +60,11 @@ class TrainingConfig:
     clip: float = 1.0  # global norm of the gradient
     windows: str = "episode"  # drawn by "episode", by "step", or at the "start" of episodes
     microbatch: int = 0  # examples a device takes the gradient of at a time; 0: all of its own
+    run: int = 1  # windows in a row that make an example; each state of theirs is encoded once
 
     def __post_init__(self) -> None:
         check_at_least(self, 0, "steps", "microbatch")
-        check_at_least(self, 1, "batch")
+        check_at_least(self, 1, "batch", "run")
         ranges = {
             "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
             "warmup": (0, math.inf), "clip": (0, math.inf),
@@ -73,6 +74,8 @@ class TrainingConfig:
                 raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"betas must be in [0, 1), got {self.betas}")
+        if self.batch % self.run:
+            raise ValueError(f"a batch of {self.batch} windows is not made of runs of {self.run}")
         if self.windows not in windows.SAMPLINGS:
             known = ", ".join(windows.SAMPLINGS)
             raise ValueError(f"unknown windows {self.windows!r}: expected one of {known}")

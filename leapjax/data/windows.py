@@ -189,6 +189,27 @@ def context_at(unrolled: Context, place: int, context: int) -> Context:
     )
 
 
+def joined(run: Window) -> Context:
+    """The context `[K + S - 1]` that holds all states of S windows in a row, leaves `[S, ...]`.
+
+    It is that of the last of them, and goes back as far as that of the first.
+    """
+    context = run.context
+    first = jax.tree.map(lambda leaf: leaf[0], context)
+
+    def join(past: jax.Array, observations: jax.Array) -> jax.Array:
+        return jnp.concatenate([past, observations[:-1]])
+
+    return Context(
+        observation=_at(context.observation, -1),
+        past=jax.tree.map(join, first.past, context.observation),
+        actions=join(first.actions, run.actions[:, 0]),
+        rewards=join(first.rewards, jnp.zeros(len(run.actions))),  # as in `unrolled_window`
+        step=context.step[-1],
+        return_so_far=context.return_so_far[-1],
+    )
+
+
 def before(context: Context) -> Context:
     """The context of a transition (K + 1 past steps) as it was before its step (K of them)."""
     reward = context.rewards[-1]

@@ -105,8 +105,16 @@ class PaperModel(nn.Module):
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
+    def see(self, context: Context) -> jax.Array:
+        """A token `[K + 1, D]` for each state of a context of any length."""
+        return self.states(context)
+
     def encode(
-        self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
+        self,
+        context: Context,
+        deterministic: bool = True,
+        returns: jax.Array | None = None,
+        states: jax.Array | None = None,
     ) -> PyTree:
         """What every pass shares: the context's keys and values, per layer, and embeddings.
 
@@ -118,15 +126,17 @@ class PaperModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
+            states: what `see` has made of the context, if it has.
         """
         horizon = self.sizes.horizon
+        states = self.see(context) if states is None else states
 
         def with_plan(known: jax.Array) -> jax.Array:  # every position has the current one
             return jnp.concatenate([known, jnp.repeat(known[-1:], horizon - 1, axis=0)])
 
         actions = jnp.tanh(self.action(context.actions))
         actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
-        steps = [with_plan(self.states(context)), actions]  # of [K + T, D]
+        steps = [with_plan(states), actions]  # of [K + T, D]
         if returns is not None:
             steps.insert(0, with_plan(jnp.tanh(self.goal(returns[:, None]))))
         tokens = jnp.stack(steps, axis=1).reshape(-1, self.config.width)

@@ -1,0 +1,133 @@
+"""Runs: windows in a row that make one example, so that each of their states is encoded once."""
+
+import dataclasses
+import itertools
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax.agents import bc, cql, leap
+from leapjax.agents.batches import run_batches
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.data import windows
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from tests import toy
+
+CONTEXT, HORIZON, RUN = 2, 3, 4
+MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0.0)
+TRAINING = TrainingConfig(steps=10, batch=12, run=RUN, windows="step")
+
+
+class StateTokens(nn.Module):
+    """A token for each state of a context."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, context):
+        states = jnp.concatenate([context.past, context.observation[None]])
+        return nn.Dense(self.width)(states)
+
+
+DOMAIN = toy.DOMAIN._replace(
+    encoders={**toy.DOMAIN.encoders, "paper": lambda model, context: StateTokens(model.width)}
+)
+
+
+def setup(run=RUN, domain=DOMAIN, **settings) -> Setup:
+    training = dataclasses.replace(TRAINING, run=run)
+    chosen = leap.Settings(masking="each", **settings)
+    return Setup(domain, CONTEXT, HORIZON, MODEL, training, chosen)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
+
+
+@pytest.fixture(scope="module")
+def runs(data):
+    return jax.jit(run_batches(setup(domain=DOMAIN._replace(augmentations=()))))(
+        jax.random.key(0), data
+    )
+
+
+def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs, data):
+    steps, starts = np.asarray(runs.context.step), set()
+    assert steps.shape == (TRAINING.batch // RUN, RUN)
+    stopped = 0
+    for run in range(len(steps)):
+        of_run = [jax.tree.map(lambda x, at=(run, at): x[at], runs) for at in range(RUN)]
+        for before, now in itertools.pairwise(of_run):
+            if now.context.step == before.context.step:
+                stopped += 1
+                assert now.actions[1] == toy.END  # one action was left
+                continue
+            assert now.context.step == before.context.step + 1
+            np.testing.assert_array_equal(now.context.past[-1], before.context.observation)
+            assert now.context.actions[-1] == before.actions[0]
+        starts.add((int(steps[run, 0]), *np.asarray(runs.context.observation[run, 0])))
+    assert stopped > 0 and len(starts) > 1
+
+
+@pytest.mark.parametrize("returns", [False, True])
+def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
+    agent = leap.make_agent(setup(returns=returns))
+    alone = leap.make_agent(setup(run=1, returns=returns))
+    state = jax.jit(agent.init)(jax.random.key(0))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), runs)
+    together, metrics = jax.jit(agent.update)(state, runs, jax.random.key(1))
+    one_by_one, expected = jax.jit(alone.update)(state, flat, jax.random.key(1))
+    for name in ("loss", "accuracy", "gradient_norm"):
+        assert float(metrics[name]) == pytest.approx(float(expected[name]), rel=1e-5)
+    changed = 0.0
+    for now, other, old in zip(
+        *(jax.tree.leaves(s.optimizer) for s in (together, one_by_one, state)), strict=True
+    ):
+        np.testing.assert_allclose(now, other, rtol=1e-4, atol=1e-7)
+        changed = max(changed, float(np.abs(np.asarray(now, float) - np.asarray(old)).max()))
+    assert changed > 1e-3
+
+
+def test_each_state_of_a_run_is_in_its_joined_context(runs):
+    for run in range(TRAINING.batch // RUN):
+        one = jax.tree.map(lambda x, run=run: x[run], runs)
+        whole = windows.joined(one)
+        states = np.concatenate([whole.past, whole.observation[None]])
+        assert states.shape[0] == CONTEXT + RUN
+        places = one.context.step - one.context.step[0]
+        for window, place in enumerate(places):
+            np.testing.assert_array_equal(states[place : place + CONTEXT], one.context.past[window])
+            np.testing.assert_array_equal(states[place + CONTEXT], one.context.observation[window])
+        np.testing.assert_array_equal(whole.actions[:CONTEXT], one.context.actions[0])
+        assert whole.step == one.context.step[-1]
+
+
+def test_a_run_is_augmented_as_a_whole(data):
+    def turn(key, window):
+        return window._replace(return_to_go=jax.random.uniform(key))
+
+    domain = DOMAIN._replace(augmentations=(turn,))
+    drawn = jax.jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
+    marks = np.asarray(drawn.return_to_go)
+    assert (marks == marks[:, :1]).all() and len(np.unique(marks)) == len(marks)
+
+
+def test_where_runs_win_nothing_they_are_refused():
+    with pytest.raises(ValueError, match="batch of 12 windows is not made of runs of 5"):
+        dataclasses.replace(TRAINING, run=5)
+    with pytest.raises(ValueError, match="run"):
+        dataclasses.replace(TRAINING, run=0)
+    model = dataclasses.replace(MODEL, architecture="leapjax")
+    single = setup()._replace(horizon=1)
+    for method, made in (
+        (leap.LEAP, setup()._replace(model=model)),
+        (bc.BC, single._replace(settings=bc.Settings())),
+        (cql.CQL, single._replace(settings=cql.Settings())),
+    ):
+        with pytest.raises(UserError, match="--run 4: only LEAP with architecture paper"):
+            method.make_agent(made, None)
