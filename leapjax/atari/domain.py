@@ -163,7 +163,9 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     if preset == "leapjax":
         options["learning_rate"] = 1e-3
     if method in IMITATORS:
-        options["temperature"] = 0.25 if preset == "leapjax" else 1.0
+        options["temperature"] = 0.1 if preset == "leapjax" else 1.0
+    if method == "cql" and preset == "leapjax":
+        options["alpha"] = 1.0  # with less it learns nothing in so few steps (docs/tried.md)
     return options
 
 
