@@ -11,10 +11,11 @@ class Transition(NamedTuple):
     """What one environment step gave."""
 
     observation: PyTree
-    reward: float
+    reward: float  # as demonstrations have it, since planners see it
     terminated: bool
     truncated: bool
     success: bool  # by the environment's own measure
+    score: float | None = None  # what it adds to an episode's return as reported; None: the reward
 
 
 class Adapter(Protocol):

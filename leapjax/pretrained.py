@@ -161,11 +161,28 @@ def find(path: str | os.PathLike[str]) -> Path:
     return PUBLISHED / folder if published else folder
 
 
+def asking_for(specification: Specification, target_return: float) -> Specification:
+    """The same planner, asked for another return.
+
+    Raises:
+        UserError: it is not conditioned on returns.
+    """
+    settings = specification.method_settings
+    if not hasattr(settings, "target_return"):
+        raise UserError(f"{specification.method} cannot be asked for a return")
+    try:
+        settings = dataclasses.replace(settings, target_return=target_return)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    return dataclasses.replace(specification, method_settings=settings)
+
+
 def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
     chunk_sizes: Sequence[int] = CHUNK_SIZES,
     level: str | None = None,
+    target_return: float | None = None,
 ) -> Pretrained:
     """A trained planner from the folder of its run, or one that comes with the library.
 
@@ -175,13 +192,17 @@ def load(
         planner: search settings, of the same horizon; None for those it was trained with.
         chunk_sizes: see `leapjax.compile_planner`.
         level: to plan for, where it is another than it was trained on, and its network serves both.
+        target_return: to ask for, where that is another than it was trained for.
 
     Raises:
-        UserError: no such run, one that cannot be read, another horizon, or a level that needs
-            another network.
+        UserError: no such run, one that cannot be read, another horizon, a level that needs
+            another network, or a return that it cannot be asked for.
     """
     folder = find(path)
     specification = read_specification(folder)
+    whose = identity(specification)
+    if target_return is not None:
+        specification = asking_for(specification, target_return)
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:
         raise UserError(f"{folder} plans {horizon} actions, not {planner.horizon}: its horizon")
@@ -201,7 +222,6 @@ def load(
         domain = other
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
-    whose = identity(specification)
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:

@@ -18,7 +18,7 @@ class Episodes(NamedTuple):
     seeds: np.ndarray  # [E] level seeds
     successes: np.ndarray  # [E] bool
     lengths: np.ndarray  # [E] int: environment steps
-    returns: np.ndarray  # [E] float: sums of rewards
+    returns: np.ndarray  # [E] float: sums of rewards, or of scores where those are something else
     plans: int  # plans made in all
     planning_seconds: float  # of the planner alone, compilation included
     seconds: float  # in all
@@ -174,7 +174,7 @@ def evaluate(
         History(adapter.reset(int(s)), context, end + 1)
         for adapter, s in zip(adapters, seeds, strict=True)
     ]
-    successes = np.zeros(len(seeds), bool)
+    successes, scores = np.zeros(len(seeds), bool), np.zeros(len(seeds))
     active = list(range(len(seeds)))
     planned, planning_seconds, replan = 0, 0.0, 0
     while active:
@@ -195,6 +195,8 @@ def evaluate(
                 if action >= end:  # or MASK, of a plan that is executed before it is complete
                     break
                 transition = adapters[episode].step(int(action))
+                score = transition.score
+                scores[episode] += transition.reward if score is None else score
                 histories[episode].advance(int(action), transition.observation, transition.reward)
                 too_long = max_steps is not None and histories[episode].step >= max_steps
                 over = transition.terminated or transition.truncated or too_long
@@ -210,7 +212,7 @@ def evaluate(
         np.asarray(seeds),
         successes,
         np.array([history.step for history in histories]),
-        np.array([history.return_so_far for history in histories]),
+        scores,
         planned,
         planning_seconds,
         time.perf_counter() - begun,

@@ -66,11 +66,13 @@ def test_a_game_is_cut_off_where_it_is_asked_to_be():
     assert not transitions[-1].success and len(seen) == len(transitions) + 1
 
 
-def test_rewards_are_not_clipped():
+def test_a_planner_sees_clipped_rewards_and_scores_count():
     adapter = AtariAdapter(GAMES["Qbert"], 0.0, 27_000)
     _, transitions = play(adapter, 0, 300)
-    rewards = {t.reward for t in transitions}
-    assert rewards <= {0.0, 25.0, 50.0, 75.0, 100.0, 300.0, 500.0} and len(rewards) > 1
+    scores = {t.score for t in transitions}
+    assert scores <= {0.0, 25.0, 50.0, 75.0, 100.0, 300.0, 500.0} and len(scores) > 1
+    assert all(t.reward == min(t.score, 1.0) for t in transitions)
+    assert adapter.score == sum(t.score for t in transitions)
 
 
 def test_a_state_is_the_same_in_a_longer_context():

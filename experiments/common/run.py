@@ -312,11 +312,14 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
                 f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
                 f"not {wanted[name]}"
             )
-    return pretrained.load(checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play)
+    target = getattr(run.config.method_settings, "target_return", None)
+    return pretrained.load(
+        checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play, target
+    )
 
 
 def _training_settings(specification: Specification) -> dict[str, Any]:
-    """What a trained planner cannot be asked to change: all but how it searches."""
+    """What a trained planner cannot be asked to change: all but how it searches, and for what."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -329,7 +332,11 @@ def _training_settings(specification: Specification) -> dict[str, Any]:
     return {
         name: value
         for name, value in settings.items()
-        if name == "planner.horizon" or name.split(".")[0] not in ("planner", "signature")
+        if name == "planner.horizon"
+        or (
+            name != "method_settings.target_return"
+            and name.split(".")[0] not in ("planner", "signature")
+        )
     }
 
 

@@ -8,9 +8,10 @@ from leapjax.environments import Transition
 
 
 class AtariAdapter:
-    """One game: unclipped rewards, up to 30 no-ops at the start, over when the game is.
+    """One game: up to 30 no-ops at the start, over when the game is.
 
-    It succeeds with as high a score as a gamer's. What is to be seen now, and the score so far, are
+    A planner sees rewards as the data have them, clipped; what counts is the score. It succeeds
+    with as high a score as a gamer's. What is to be seen now, and the score so far, are
     `frame` and `score`.
     """
 
@@ -39,8 +40,9 @@ class AtariAdapter:
         over = bool(terminated[0] or truncated[0])
         return Transition(
             self.frame,
-            float(rewards[0]),
+            float(np.clip(rewards[0], -1, 1)),
             bool(terminated[0]),
             bool(truncated[0]),
             over and self.score >= self._game.human,
+            float(rewards[0]),
         )

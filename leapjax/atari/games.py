@@ -72,7 +72,7 @@ GAMES: dict[str, Game] = {
         ),
         Game(
             "Qbert", "qbert", ("noop", "fire", "up", "right", "left", "down"),
-            163.9, 13455.0, 400.0, 200.0, Mirror(1, (10, 84), (0, 84), _HOPS),
+            163.9, 13455.0, 200.0, 200.0, Mirror(1, (10, 84), (0, 84), _HOPS),
             _paper(19.5, 15.4, 104.2, 0.0, 0.0, 17.3), 41.0,
         ),
         Game(
@@ -81,7 +81,7 @@ GAMES: dict[str, Game] = {
             _paper(108.9, 106.1, 111.9, 18.0, 0.5, 85.2), 100.7,
         ),
         Game(
-            "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 300.0, 100.0,
+            "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 600.0, 100.0,
             Mirror(1, (8, 67), (4, 84), _SIDES),
             _paper(1.3, 2.5, 1.7, 0.4, 0.7, 2.1), 0.5,
         ),

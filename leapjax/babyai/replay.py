@@ -41,7 +41,7 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
     for step, action in enumerate(recording.actions, start=1):
         if terminated or truncated or not same:
             return DIFFERENT
-        state, reward, terminated, truncated, success = adapter.step(int(action))
+        state, reward, terminated, truncated, success, _ = adapter.step(int(action))
         states.append(state)
         same = _is(adapter, images[step], missions[step])
         same = same and bool(np.isclose(reward, recording.rewards[step - 1]))
