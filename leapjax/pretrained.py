@@ -168,8 +168,11 @@ def asking_for(specification: Specification, target_return: float) -> Specificat
         UserError: it is not conditioned on returns.
     """
     settings = specification.method_settings
-    if not hasattr(settings, "target_return"):
-        raise UserError(f"{specification.method} cannot be asked for a return")
+    if not hasattr(settings, "target_return") or not getattr(settings, "returns", True):
+        raise UserError(
+            f"a return of {target_return} cannot be asked for: this {specification.method} has not "
+            "learned what leads to which return"
+        )
     try:
         settings = dataclasses.replace(settings, target_return=target_return)
     except ValueError as error:

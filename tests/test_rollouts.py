@@ -297,6 +297,24 @@ def test_an_episode_is_a_success_only_where_the_environment_says_so():
     assert late.plans == np.ceil(LIMIT / HORIZON)
 
 
+class Scored(Corridor):
+    """Counts ten for each step; what a planner sees stays the reward."""
+
+    def step(self, action: int) -> Transition:
+        return super().step(action)._replace(score=10.0)
+
+
+def test_scores_are_reported_and_rewards_are_seen():
+    def left_until_a_reward(params, context):  # the first step to the right gives 3 / 4
+        seen = (context.return_so_far == 0.75) & (context.rewards[-1] == 0.75)
+        return jnp.where(seen, jnp.full(HORIZON, LEFT), jnp.full(HORIZON, RIGHT))
+
+    plan = compiled(scripted_energy(left_until_a_reward))
+    episodes = leap.evaluate(Scored, [3], plan, None, context=1, executed=1, max_steps=2)
+    assert Scored.made[-1].taken == [RIGHT, LEFT]
+    np.testing.assert_array_equal(episodes.returns, [20.0])
+
+
 def play(seeds, **options):
     episodes = leap.evaluate(
         Corridor, seeds, stroller(), None, context=1, progress=give_up_after(200), **options

@@ -312,10 +312,13 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
                 f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
                 f"not {wanted[name]}"
             )
-    target = getattr(run.config.method_settings, "target_return", None)
-    return pretrained.load(
-        checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play, target
+    target, known = (
+        getattr(s.method_settings, "target_return", None) for s in (run.specification, trained)
     )
+    return pretrained.load(
+        checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play,
+        None if target == known else target,
+    )  # fmt: skip
 
 
 def _training_settings(specification: Specification) -> dict[str, Any]:

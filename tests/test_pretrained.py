@@ -1,0 +1,43 @@
+"""Planners that were trained before, asked for something else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from leapjax import pretrained
+from leapjax.domain import blank_context
+from leapjax.errors import UserError
+from tests.programs import untrained_run
+
+
+def test_a_planner_can_be_asked_for_another_return(tmp_path):
+    folder = untrained_run(tmp_path, "--method", "dt")
+
+    def energies(target):
+        planner = pretrained.load(folder, target_return=target)
+        domain = pretrained.make_domain(planner.specification)
+        context = blank_context(domain, planner.specification.context)
+        first = jnp.zeros(1, jnp.int32)
+        # Untrained, all of its heads are zero: numbers from nowhere show what reaches them.
+        params = jax.tree.map(
+            lambda leaf: leaf + jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), planner.params
+        )
+        memory = planner.energy.encode(params, context)
+        found = planner.energy.conditional(params, memory, first, first)
+        return planner.specification.method_settings.target_return, np.asarray(found)
+
+    (usual, as_trained), (_, same), (asked, other) = map(energies, (None, 1.0, -3.0))
+    assert (usual, asked) == (1.0, -3.0)
+    np.testing.assert_array_equal(as_trained, same)
+    finite = np.isfinite(other)  # the end action is not chosen
+    assert np.abs(as_trained[finite] - other[finite]).max() > 1e-3
+    with pytest.raises(UserError, match="target_return must be a number"):
+        pretrained.load(folder, target_return=float("nan"))
+
+
+@pytest.mark.parametrize("method", ["leap", "random"])
+def test_who_has_not_learned_returns_cannot_be_asked_for_one(tmp_path, method):
+    folder = untrained_run(tmp_path, "--method", method)
+    with pytest.raises(UserError, match=f"this {method} has not learned"):
+        pretrained.load(folder, target_return=0.5)
