@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-MASKINGS = ("one", "each", "random")
+MASKINGS = ("one", "each", "random", "stratified")
 SINGLE = ("one", "each")  # those that mask one action in every copy
 
 
@@ -14,6 +14,8 @@ def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
     - `each`: every position in turn, T copies (what the authors' code does).
     - `random`: n positions with n uniform in 1 .. T, so that the all-masked start of
       planning is an input that training has seen; 1 copy.
+    - `stratified`: the same with n = 1, 2, .. T, T copies: every window is also learned from as
+      planning starts. For encoders that cost much more than a pass over T actions.
     """
     if masking == "each":
         return jnp.eye(horizon, dtype=bool)
@@ -21,6 +23,10 @@ def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
     rank = jax.random.permutation(order_key, horizon)
     if masking == "one":
         return (rank == 0)[None]
+    if masking == "stratified":
+        orders = jax.vmap(jax.random.permutation, in_axes=(0, None))
+        ranks = orders(jax.random.split(order_key, horizon), horizon)  # [T, T]
+        return ranks <= jnp.arange(horizon)[:, None]
     if masking == "random":
         return (rank < jax.random.randint(count_key, (), 1, horizon + 1))[None]
     raise ValueError(f"unknown masking {masking!r}: expected one of {', '.join(MASKINGS)}")

@@ -51,6 +51,17 @@ def test_random_draws_uniform_positions_given_the_count(masks):
     assert fit_p_value(counts, possible / possible.sum()) > 1e-3
 
 
+def test_stratified_masks_every_number_of_positions(masks):
+    stratified = masks["stratified"]
+    assert stratified.shape == (DRAWS, HORIZON, HORIZON) and stratified.dtype == bool
+    np.testing.assert_array_equal(stratified.sum(-1), np.tile(np.arange(HORIZON) + 1, (DRAWS, 1)))
+    one, two = stratified[:, 0], stratified[:, 1]
+    assert fit_p_value(one.sum(0), np.full(HORIZON, 1 / HORIZON)) > 1e-3
+    # The copies are drawn on their own: those of one position lie in those of two by chance.
+    inside = (two & one).any(-1).sum()
+    assert fit_p_value([inside, DRAWS - inside], [2 / HORIZON, 1 - 2 / HORIZON]) > 1e-3
+
+
 @pytest.mark.parametrize("masking", MASKINGS)
 def test_a_single_action_is_always_masked(masking):
     np.testing.assert_array_equal(sample_masks(jax.random.key(3), 1, masking), [[True]])

@@ -37,7 +37,7 @@ PRESETS: Presets = {
 class Settings:
     """The options of LEAP alone."""
 
-    masking: str = "one"  # "one", "each" or "random": see leapjax.schedules
+    masking: str = "one"  # one of leapjax.schedules.MASKINGS
     end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
     returns: bool = False  # condition plans on the return to go, as Decision Transformer does
     target_return: float = 1.0  # of an episode, asked for while acting
