@@ -332,14 +332,13 @@ def _training_settings(specification: Specification) -> dict[str, Any]:
         return found
 
     settings = flat(dataclasses.asdict(specification), "")
+    asked = {"method_settings.target_return"} | {
+        name for name in settings if name.startswith(("planner.", "signature."))
+    }
     return {
         name: value
         for name, value in settings.items()
-        if name == "planner.horizon"
-        or (
-            name != "method_settings.target_return"
-            and name.split(".")[0] not in ("planner", "signature")
-        )
+        if name not in asked or name == "planner.horizon"
     }
 
 

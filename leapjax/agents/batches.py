@@ -1,6 +1,6 @@
 """What agents draw from demonstrations: windows, as they are or as a method needs them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.data.windows import Steps
+from leapjax.domain import Augmentation, Domain
 from leapjax.errors import UserError
 from leapjax.types import TransitionWindow, Window
 
@@ -51,10 +52,7 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
         ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
         each = jax.vmap(window, in_axes=(None, 0))
         drawn = jax.vmap(each, in_axes=(None, 0))(steps, starts[:, None] + ahead)
-        for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
-            alike = jax.vmap(augment, in_axes=(None, 0))
-            drawn = jax.vmap(alike)(jax.random.split(augment_key, count), drawn)
-        return drawn
+        return _augmented(domain, keys, drawn, lambda each: jax.vmap(each, in_axes=(None, 0)))
 
     return batch
 
@@ -92,6 +90,20 @@ def _draw(
     step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
     indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
     drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
-    for augment, augment_key in reversed(list(zip(domain.augmentations, keys, strict=True))):
-        drawn = jax.vmap(augment)(jax.random.split(augment_key, training.batch), drawn)
-    return drawn, indices
+    return _augmented(domain, keys, drawn), indices
+
+
+def _augmented(
+    domain: Domain,
+    keys: Sequence[jax.Array],
+    drawn: Window,
+    of_example: Callable[[Augmentation], Augmentation] = lambda augment: augment,
+) -> Window:
+    """Examples `[B, ...]` as a domain augments them: the last augmentation first, by its key.
+
+    `of_example` makes an augmentation of an example from one of a window.
+    """
+    count = drawn.actions.shape[0]
+    for augment, key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+        drawn = jax.vmap(of_example(augment))(jax.random.split(key, count), drawn)
+    return drawn

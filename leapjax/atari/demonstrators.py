@@ -156,6 +156,7 @@ _LONGEST_HOP = 12  # decisions; most take 7
 _WAIT = 4  # decisions
 _HOPS_AHEAD = 2  # with 3 it saw no more, and put off what was to be done
 _DIED = -40.0  # the value of it, in tiles
+_FAR = 0.08  # what a hop is worth on the way to a tile: less than one tile from corner to corner
 
 
 def _rests(ram: np.ndarray) -> bool:
@@ -223,7 +224,7 @@ class _Qbert:
                     more, then, _ = self._search(emulator, depth - 1)
                     value += 0.95 * more
                 else:
-                    value -= 0.08 * self._distance(emulator.ram())
+                    value -= _FAR * self._distance(emulator.ram())
             emulator.restore(saved)
             if value > most + 1e-6:
                 most, best, after = value, action, then
@@ -280,8 +281,8 @@ def _prospects(ram: np.ndarray) -> float:
 class _Seaquest:
     """Tries in the emulator to go on in each direction, and takes the best.
 
-    Random plans win as much, but whoever learns from them sees what cannot be told from frames:
-    which plan happened to be drawn.
+    Not of random plans: which of them happened to be drawn cannot be told from frames, so nobody
+    learns it.
     """
 
     def __init__(self) -> None:

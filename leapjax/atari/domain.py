@@ -158,9 +158,10 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
         options["target_return"] = game.target
     if method == "leap":
         options |= {"end": False, "returns": True}
-        # To read frames costs more than to look at a plan in T ways.
-        paper = {"masking": "one", "microbatch": 0}
-        options |= paper if preset == "paper" else {"masking": "stratified"}
+        if preset == "paper":
+            options |= {"masking": "one", "microbatch": 0}
+        else:  # to read frames costs more than to look at a plan in T ways
+            options["masking"] = "stratified"
     if preset == "leapjax":
         options["learning_rate"] = 1e-3
     if method in IMITATORS:
