@@ -15,7 +15,12 @@ class Transition(NamedTuple):
     terminated: bool
     truncated: bool
     success: bool  # by the environment's own measure
-    score: float | None = None  # what it adds to an episode's return as reported; None: the reward
+    score: float | None = None  # what counts in the end, where that is not the reward
+
+    @property
+    def counted(self) -> float:
+        """What it adds to an episode's return as reported."""
+        return self.reward if self.score is None else self.score
 
 
 class Adapter(Protocol):

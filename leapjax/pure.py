@@ -33,6 +33,7 @@ class _Episode(NamedTuple):
 
     state: PyTree
     context: Context
+    score: jax.Array  # [] float32: its return as reported
     over: jax.Array  # [] bool
     success: jax.Array  # [] bool
     plans: jax.Array  # [] int32
@@ -80,7 +81,7 @@ def compile_rollout(
             jnp.zeros(context), jnp.int32(0), jnp.float32(0),
         )  # fmt: skip
         no, yes = jnp.bool_(False), jnp.bool_(True)
-        return _Episode(state, blank, no, no, jnp.int32(0), yes)
+        return _Episode(state, blank, jnp.float32(0), no, no, jnp.int32(0), yes)
 
     def act(carry: tuple[_Episode, jax.Array], action: jax.Array) -> tuple[PyTree, None]:
         """One action of a plan, unless the plan or the episode is over."""
@@ -89,7 +90,10 @@ def compile_rollout(
         state, found = environment.step(episode.state, jnp.minimum(action, end - 1))
         now = _advanced(episode.context, action, found)
         over = jnp.asarray(found.terminated | found.truncated) | (now.step >= max_steps)
-        acted = _Episode(state, now, over, found.success & over, episode.plans, episode.valid)
+        acted = episode._replace(
+            state=state, context=now, score=episode.score + found.counted, over=over,
+            success=found.success & over,
+        )  # fmt: skip
         idle = ended | episode.over
         kept = jax.tree.map(lambda a, b: jnp.where(idle, a, b), episode, acted)
         return (kept, ended), None
@@ -117,7 +121,7 @@ def compile_rollout(
             )
         seconds = time.perf_counter() - begun
         return Episodes(
-            level_seeds, played.success, played.context.step, played.context.return_so_far,
+            level_seeds, played.success, played.context.step, played.score,
             int(played.plans.sum()), seconds, seconds,
         )  # fmt: skip
 

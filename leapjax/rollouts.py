@@ -195,8 +195,7 @@ def evaluate(
                 if action >= end:  # or MASK, of a plan that is executed before it is complete
                     break
                 transition = adapters[episode].step(int(action))
-                score = transition.score
-                scores[episode] += transition.reward if score is None else score
+                scores[episode] += transition.counted
                 histories[episode].advance(int(action), transition.observation, transition.reward)
                 too_long = max_steps is not None and histories[episode].step >= max_steps
                 over = transition.terminated or transition.truncated or too_long

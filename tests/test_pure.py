@@ -88,6 +88,20 @@ def test_the_episodes_are_those_of_the_lockstep_rollout(context, executed, most)
     assert len(set(found.lengths)) > 2
 
 
+def test_scores_are_reported_where_they_are_not_the_rewards():
+    def scored(state, action):
+        state, found = step(state, action)
+        return state, found._replace(score=10.0)
+
+    plain, other = (
+        compile_rollout(world, ENERGY, CONFIG, context=1, max_steps=9)(1.0, range(8))
+        for world in (WALK, WALK._replace(step=scored))
+    )
+    np.testing.assert_array_equal(other.lengths, plain.lengths)  # planners saw the rewards
+    np.testing.assert_allclose(other.returns, 10 * other.lengths)
+    assert (plain.returns != other.returns).any()
+
+
 def test_a_plan_that_ends_at_once_gives_up():
     lazy = leap.from_total(
         lambda params, context: context, lambda p, c, a: (a != END).sum(), END + 1
