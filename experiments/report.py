@@ -98,6 +98,9 @@ MINIMISED = {
     ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
 }
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
+MEASURED = (  # files of rows beside those of experiments
+    "planning", "training", "quality", "landscape", "atari-data", "atari-energy", "atari-cost",
+)  # fmt: skip
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
 ANALYSES = {
     program.ANALYSIS.name: program.ANALYSIS
@@ -140,7 +143,7 @@ def documents(root: Path) -> dict[Path, str]:
     }
     for name in ("atari", *ANALYSES):
         rows[name] = rows_of(root, name)
-    for name in ("planning", "training", "quality", "landscape", "atari-data", "atari-energy"):
+    for name in MEASURED:
         rows[name] = read_json(root / "results" / f"{name}.json")
     sections: dict[str, tuple[Callable[[Any], str], str]] = {
         "results": (success, "babyai"),
@@ -157,6 +160,8 @@ def documents(root: Path) -> dict[Path, str]:
         "atari": (functools.partial(atari, data=rows["atari-data"]), "atari"),
         "atari-data": (atari_data, "atari-data"),
         "atari-energy": (atari_energy, "atari-energy"),
+        "atari-decisions": (decisions, "atari-cost"),
+        "atari-training": (training, "atari-cost"),
         "quality": (quality, "quality"),
         "landscape": (landscape, "landscape"),
         **{name: (functools.partial(analysed, each), name) for name, each in ANALYSES.items()},
@@ -618,19 +623,34 @@ def quality(rows: Sequence[Row]) -> str:
     return _table(" | ".join(["search", *titles]), lines)
 
 
+def decisions(rows: Sequence[Row]) -> str:
+    """What decisions are made of in games that are played together, in milliseconds."""
+    lines = []
+    for row in rows:
+        if "playing_seconds" not in row:
+            continue
+        spent = [row[f"{part}_seconds"] for part in ("planning", "encoding", "playing")]
+        rate = row["batch"] / (row["planning_seconds"] + row["playing_seconds"])
+        cells = [f"{1e3 * seconds:.1f}" for seconds in spent]
+        lines.append([f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}"])
+    header = "preset | games | planner | of it encoder | emulator | decisions/s"
+    return _table(header, lines)
+
+
 def training(rows: Sequence[Row]) -> str:
     """Every measurement of training."""
     lines = [
         [
             row["level"],
-            f"`{row['preset']}`",
+            f"`{row['preset']}`" + (f", `--run {row['run']}`" if row.get("run", 1) > 1 else ""),
             f"{1e3 / row['steps_per_second']:.0f}",
             f"{row['flops_per_step'] / 1e9:.1f}",
             f"{row['gflops']:.0f}",
             f"{row['fraction_of_peak']:.0%}",
-            f"{row['training_seconds']:.0f} s for {row['steps']:,} steps",
+            f"{row['training_seconds']:,.0f} s for {row['steps']:,} steps",
         ]
         for row in rows
+        if "steps_per_second" in row
     ]
     header = "level | preset | ms/step | GFLOP/step | GFLOP/s | of the peak | a run"
     return _table(header, lines)

@@ -7,7 +7,7 @@ pytest.importorskip("ale_py")  # an extra
 
 from ale_py.vector_env import AtariVectorEnv
 
-from leapjax.atari.demonstrators import NOISES, PlayedGame, play
+from leapjax.atari.demonstrators import NOISES, PlayedGame, look, make_demonstrator, play
 from leapjax.atari.emulator import Emulator
 from leapjax.atari.games import GAMES
 
@@ -120,6 +120,25 @@ def test_qbert_colours_tiles():
     assert (game.actions > 1).all()
 
 
-def test_seaquest_hits():
-    assert played("Seaquest", most_steps=150).score >= 100
-    assert play_at_random("Seaquest", 150) < 100
+def test_seaquest_shoots_fetches_divers_and_never_waits():
+    game = played("Seaquest", seed=1, most_steps=1500)
+    assert game.score >= 1500
+    assert play_at_random("Seaquest", 1500) < 500
+    assert len(game.actions) == 1500  # it is alive
+    assert 0 not in game.actions
+
+
+def test_seaquest_sees_what_is_on_the_screen():
+    emulator, demonstrator = Emulator(GAMES["Seaquest"]), make_demonstrator(GAMES["Seaquest"])
+    emulator.reset(0)
+    seen = 0
+    for _ in range(40):
+        for _ in range(15):
+            emulator.step(demonstrator(emulator, np.random.default_rng(0)))
+        enemies, divers = look(emulator.ram())[-2:]
+        for across, lane, _ in enemies + divers:
+            rows, columns = slice(56 - 10 * lane, 62 - 10 * lane), across * 84 // 160
+            there = emulator.frame()[rows, max(columns - 2, 0) : columns + 9]
+            assert there.max() > 40  # the water is 32
+        seen += len(enemies) + len(divers)
+    assert seen > 20

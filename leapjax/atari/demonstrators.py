@@ -1,7 +1,7 @@
 """Players that are built in, so that data can be made without a download.
 
-They know what the emulator's memory means. A paddle follows a rule; Qbert searches a tree of hops
-in the emulator, Seaquest's tries what comes of each direction.
+They know what the emulator's memory means. Paddles and the submarine follow rules; Qbert searches
+a tree of hops in the emulator.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ def make_demonstrator(game: Game) -> Demonstrator:
         "Breakout": lambda: _Paddle(_BREAKOUT),
         "Qbert": _Qbert,
         "Pong": lambda: _Paddle(_PONG),
-        "Seaquest": _Seaquest,
+        "Seaquest": lambda: _seaquest,
     }
     return makers[game.name]()
 
@@ -253,61 +253,120 @@ class _Qbert:
         )
 
 
-# The actions that fire, and move in some direction or, last, in none: of those that are equally
-# good the first one is done, and to do nothing must not be learned from where nothing can be done.
-_SHOTS = (13, 10, 11, 12, 14, 15, 16, 17, 1)
-_HOLD = 2  # decisions that what is chosen is done for
-_HORIZON = 12  # decisions that it is tried for; 16 score no more, 8 less
-_FADES = 0.97  # what a hit is worth, one decision later
-_HOME = (76, 60)  # in memory, across and down: where the submarine goes when nothing is near
-_AWAY = 0.2  # hits that it costs to be on one of the edges
+# By where they go, right and down: the actions that fire, too.
+_SHOTS = {
+    (0, 0): 1, (0, -1): 10, (1, 0): 11, (-1, 0): 12, (0, 1): 13, (1, -1): 14, (-1, -1): 15,
+    (1, 1): 16, (-1, 1): 17,
+}  # fmt: skip
+_SCREEN = 160  # as many columns
+_LANES = (103, 79, 55, 31)  # how deep the submarine is in each; all others keep to one
+_SURFACE = 13
+_UP = ((20, _SURFACE), (32, _LANES[3]), (44, _LANES[2]))  # with less air than that: how deep to be
+_HOME = 1  # the lane to be in when there is no diver to be seen
+_TURNS = (56, 96)  # where to turn round when there is nothing to go for
+_REACH = range(21, 135)  # where the submarine can be
+_BOAT = 6  # divers
+_TANK = 60  # air, nearly all there can be
+_CLOSE = 24  # how near not to go to an enemy
+_PASSED = 16  # how far behind the submarine an enemy does no harm
 
 
-def _dies(ram: np.ndarray) -> bool:
-    """Whether the submarine is breaking up; the number of lives says so 24 decisions later."""
-    return bool(ram[105] > 0)
+class Swimmer(NamedTuple):
+    """One of those that cross the screen."""
+
+    across: int
+    lane: int
+    way: int  # 1: to the right, -1: to the left
 
 
-def _prospects(ram: np.ndarray) -> float:
-    """What the end of a trial promises, in hits: divers, the way up in time, and the middle."""
-    oxygen, divers, across, down = (int(ram[at]) for at in (102, 62, 70, 97))
-    # To come up without a diver is death, too.
-    suffocating = max(0, 24 - oxygen) / 24 if divers else 0
-    up = max(suffocating, 0.3 * (divers >= 6)) * (down - 13) / 10
-    away = abs(across - _HOME[0]) / 70 + abs(down - _HOME[1]) / 50
-    return divers - up - _AWAY * away
+class Scene(NamedTuple):
+    """What is to be seen of Seaquest."""
+
+    across: int  # where the submarine is
+    depth: int
+    facing: int  # 1: right, -1: left
+    air: int
+    aboard: int  # divers
+    enemies: list[Swimmer]  # their missiles among them
+    divers: list[Swimmer]
 
 
-class _Seaquest:
-    """Tries in the emulator to go on in each direction, and takes the best.
+def look(ram: np.ndarray) -> Scene:
+    """The meaning of Seaquest's memory, `[128]`."""
+    enemies: list[Swimmer] = []
+    divers: list[Swimmer] = []
+    for lane in range(len(_LANES)):
+        kind, row, first, other = (int(ram[at + lane]) for at in (89, 36, 30, 71))
+        way = -1 if kind & 8 else 1
+        for bit, place in ((4, 0), (2, 16), (1, 32)):  # up to three in a row
+            across = (first + place) % 256
+            if row & bit and across < _SCREEN:
+                enemies.append(Swimmer(across, lane, way))
+        if 0 < other < _SCREEN:
+            shot = 4 <= kind % 8 <= 6  # a lane of submarines
+            (enemies if shot else divers).append(Swimmer(other, lane, way))
+    across, depth, air, aboard = (int(ram[at]) for at in (70, 97, 102, 62))
+    return Scene(across, depth, -1 if ram[86] & 8 else 1, air, aboard, enemies, divers)
 
-    Not of random plans: which of them happened to be drawn cannot be told from frames, so nobody
-    learns it.
+
+def _seaquest(emulator: Emulator, random: np.random.Generator) -> int:
+    """Goes to and fro in a lane, and fires all the time.
+
+    It goes for divers until it has six, comes up with them, and rises as its air runs out. It never
+    stays where it is: whoever learns from one that waits does nothing else (docs/tried.md).
     """
+    del random
+    scene = look(emulator.ram())
+    if scene.depth == _SURFACE and scene.air < _TANK:  # it cannot leave before
+        return _SHOTS[0, 1]
+    goal = _depth(scene)
+    down = int(np.sign(goal - scene.depth)) if abs(goal - scene.depth) > 2 else 0
+    if down and _blocked(scene, down):
+        down = 0
+    elif goal == _SURFACE:
+        return _SHOTS[0, -1]
+    return _SHOTS[_right(scene, goal), down]
 
-    def __init__(self) -> None:
-        self._action = _SHOTS[0]
-        self._decisions = 0
 
-    def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
-        del random
-        if self._decisions % _HOLD == 0:
-            self._action = self._choose(emulator)
-        self._decisions += 1
-        return self._action
+def _depth(scene: Scene) -> int:
+    """Where to be, down. To come up without a diver is death."""
+    if scene.aboard == _BOAT:
+        return _SURFACE
+    for least, depth in _UP:
+        if scene.aboard and scene.air < least:
+            return depth
+    near = {
+        abs(_LANES[diver.lane] - scene.depth) + abs(diver.across - scene.across) / 2: diver.lane
+        for diver in scene.divers
+        if diver.across in _REACH
+    }
+    return _LANES[near[min(near)] if near else _HOME]
 
-    def _choose(self, emulator: Emulator) -> int:
-        saved, values = emulator.save(), {}
-        for action in _SHOTS:
-            values[action] = self._value(emulator, action)
-            emulator.restore(saved)
-        return max(values, key=values.__getitem__)
 
-    def _value(self, emulator: Emulator, action: int) -> float:
-        """The reward of doing one thing all the time, and what that leads to, in hits."""
-        total = 0.0
-        for step in range(_HORIZON):
-            total += emulator.advance(action) / 20 * _FADES**step
-            if _dies(emulator.ram()):
-                return total - 100 + step
-        return total + _prospects(emulator.ram())
+def _blocked(scene: Scene, down: int) -> bool:
+    """Whether an enemy is on the way up or down."""
+    return any(
+        6 < (_LANES[enemy.lane] - scene.depth) * down < 30
+        and abs(enemy.across + 4 * enemy.way - scene.across - 4) < _CLOSE
+        for enemy in scene.enemies
+    )
+
+
+def _right(scene: Scene, goal: int) -> int:
+    """Where to go along the lane: at the next enemy, to a diver of the goal, or to and fro."""
+    ahead = [
+        enemy.across - scene.across
+        for enemy in scene.enemies
+        if abs(_LANES[enemy.lane] - scene.depth) < 12
+        and (scene.across - enemy.across) * enemy.way > -_PASSED
+    ]
+    if ahead:
+        gap = min(ahead, key=abs)
+        side = 1 if gap > 0 else -1
+        return 0 if side == scene.facing and abs(gap) < _CLOSE else side
+    for diver in scene.divers:
+        away = diver.across - scene.across
+        if _LANES[diver.lane] == goal and diver.across in _REACH and abs(away) > 2:
+            return int(np.sign(away))
+    low, high = _TURNS
+    return -1 if scene.across > high else 1 if scene.across < low else scene.facing

@@ -81,7 +81,7 @@ GAMES: dict[str, Game] = {
             _paper(108.9, 106.1, 111.9, 18.0, 0.5, 85.2), 100.7,
         ),
         Game(
-            "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 600.0, 100.0,
+            "Seaquest", "seaquest", _JOYSTICK, 68.4, 42054.7, 150.0, 100.0,
             Mirror(1, (8, 67), (4, 84), _SIDES),
             _paper(1.3, 2.5, 1.7, 0.4, 0.7, 2.1), 0.5,
         ),
