@@ -415,19 +415,19 @@ def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
 def test_with_causal_attention_no_action_sees_a_later_one(architecture):
     """And with full attention every action sees every other."""
 
-    def scores(attention, actions):
+    nothing = jnp.zeros(HORIZON, jnp.int32)
+    context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(1))
+    everywhere = np.ones((HORIZON, HORIZON), bool)
+    for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
         config = ModelConfig(architecture, 2, 2, 16, attention=attention)
         encoder = mixed.DOMAIN.encoders[architecture](config, 1)
         module = build(config, Sizes(4, 1, HORIZON, 9), encoder)
-        context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(1))
-        params = module.init(jax.random.key(0), context, actions, method=everything)
-        return module.apply(params, context, actions, method=everything)
-
-    everywhere = np.ones((HORIZON, HORIZON), bool)
-    for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
-        before = scores(attention, jnp.zeros(HORIZON, jnp.int32))
+        apply = functools.partial(module.apply, method=everything)
+        init = jax.jit(functools.partial(module.init, method=everything))
+        scores = jax.jit(functools.partial(apply, init(jax.random.key(0), context, nothing)))
+        before = scores(context, nothing)
         for changed in range(HORIZON):
-            after = scores(attention, jnp.zeros(HORIZON, jnp.int32).at[changed].set(1))
+            after = scores(context, nothing.at[changed].set(1))
             seen = sees[:, changed].copy()
             # Ours is read where the action is (it is masked there), the paper's before it.
             seen[changed] &= architecture == "leapjax" or attention == "full"

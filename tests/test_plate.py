@@ -53,7 +53,7 @@ def test_an_action_depends_on_those_before_it_alone(architecture, past):
     agent, params, batch = untrained(architecture, past)
     context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, past)
     everywhere = jnp.arange(HORIZON)
-    memory = agent.energy.encode(params, context)
+    memory = jax.jit(agent.energy.encode)(params, context)
     energies = jax.jit(agent.energy.conditional)
     plan = jnp.zeros(HORIZON, jnp.int32)
     before = np.asarray(energies(params, memory, plan, everywhere))

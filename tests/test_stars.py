@@ -198,5 +198,5 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys):
     assert stars.main([*arguments, "--play", "Star5x2"]) == 2
     assert "with a --checkpoint, and there is none" in capsys.readouterr().err
     # One action at a time: one row, and nothing to animate.
-    assert stars.main([*arguments, "--method", "bc", "--no-pictures"]) == 0
+    assert stars.main([*arguments, "--method", "bc", "--steps", "0", "--no-pictures"]) == 0
     assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1
