@@ -135,10 +135,11 @@ def test_seaquest_sees_what_is_on_the_screen():
     for _ in range(40):
         for _ in range(15):
             emulator.step(demonstrator(emulator, np.random.default_rng(0)))
-        enemies, divers = look(emulator.ram())[-2:]
-        for across, lane, _ in enemies + divers:
+        scene = look(emulator.ram())
+        found = scene.enemies + scene.divers
+        for across, lane, _ in found:
             rows, columns = slice(56 - 10 * lane, 62 - 10 * lane), across * 84 // 160
             there = emulator.frame()[rows, max(columns - 2, 0) : columns + 9]
             assert there.max() > 40  # the water is 32
-        seen += len(enemies) + len(divers)
+        seen += len(found)
     assert seen > 20

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from leapjax.atari.emulator import MOST_NOOPS, Emulator
+from leapjax.atari.emulator import MOST_NOOPS, SCREEN, Emulator
 from leapjax.atari.games import MAX_STEPS, Game
 
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
@@ -258,7 +258,6 @@ _SHOTS = {
     (0, 0): 1, (0, -1): 10, (1, 0): 11, (-1, 0): 12, (0, 1): 13, (1, -1): 14, (-1, -1): 15,
     (1, 1): 16, (-1, 1): 17,
 }  # fmt: skip
-_SCREEN = 160  # as many columns
 _LANES = (103, 79, 55, 31)  # how deep the submarine is in each; all others keep to one
 _SURFACE = 13
 _UP = ((20, _SURFACE), (32, _LANES[3]), (44, _LANES[2]))  # with less air than that: how deep to be
@@ -300,9 +299,9 @@ def look(ram: np.ndarray) -> Scene:
         way = -1 if kind & 8 else 1
         for bit, place in ((4, 0), (2, 16), (1, 32)):  # up to three in a row
             across = (first + place) % 256
-            if row & bit and across < _SCREEN:
+            if row & bit and across < SCREEN[1]:
                 enemies.append(Swimmer(across, lane, way))
-        if 0 < other < _SCREEN:
+        if 0 < other < SCREEN[1]:
             shot = 4 <= kind % 8 <= 6  # a lane of submarines
             (enemies if shot else divers).append(Swimmer(other, lane, way))
     across, depth, air, aboard = (int(ram[at]) for at in (70, 97, 102, 62))
@@ -335,12 +334,13 @@ def _depth(scene: Scene) -> int:
     for least, depth in _UP:
         if scene.aboard and scene.air < least:
             return depth
-    near = {
-        abs(_LANES[diver.lane] - scene.depth) + abs(diver.across - scene.across) / 2: diver.lane
-        for diver in scene.divers
-        if diver.across in _REACH
-    }
-    return _LANES[near[min(near)] if near else _HOME]
+
+    def away(diver: Swimmer) -> float:
+        return abs(_LANES[diver.lane] - scene.depth) + abs(diver.across - scene.across) / 2
+
+    # From the top: of two that are as far away, to the upper one.
+    near = [diver for diver in reversed(scene.divers) if diver.across in _REACH]
+    return _LANES[min(near, key=away).lane if near else _HOME]
 
 
 def _blocked(scene: Scene, down: int) -> bool:

@@ -12,7 +12,7 @@ from ale_py import roms
 from leapjax.atari.games import FRAME_SKIP, HEIGHT, MAX_FRAMES, WIDTH, Game
 
 MOST_NOOPS = 30  # actions that do nothing, with which a game may start
-_SCREEN = (210, 160)
+SCREEN = (210, 160)  # rows and columns
 
 
 class Saved(NamedTuple):
@@ -29,11 +29,11 @@ def _taps() -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Indices and weights, both `[3, 84]`; weights sum to 1.
     """
-    edges = np.arange(WIDTH + 1) * (_SCREEN[1] / WIDTH)
-    columns = np.arange(WIDTH) * _SCREEN[1] // WIDTH + np.arange(3)[:, None]
+    edges = np.arange(WIDTH + 1) * (SCREEN[1] / WIDTH)
+    columns = np.arange(WIDTH) * SCREEN[1] // WIDTH + np.arange(3)[:, None]
     covered = np.minimum(edges[1:], columns + 1) - np.maximum(edges[:-1], columns)
-    weights = np.maximum(covered, 0) * (WIDTH / _SCREEN[1])
-    return np.minimum(columns, _SCREEN[1] - 1), weights.astype(np.float32)
+    weights = np.maximum(covered, 0) * (WIDTH / SCREEN[1])
+    return np.minimum(columns, SCREEN[1] - 1), weights.astype(np.float32)
 
 
 _COLUMNS, _WEIGHTS = _taps()
