@@ -629,11 +629,12 @@ def decisions(rows: Sequence[Row]) -> str:
     for row in rows:
         if "playing_seconds" not in row:
             continue
-        spent = [row[f"{part}_seconds"] for part in ("planning", "encoding", "playing")]
+        parts = ("planning", "encoding", "anew", "playing")
+        spent = [row[f"{part}_seconds"] for part in parts]
         rate = row["batch"] / (row["planning_seconds"] + row["playing_seconds"])
         cells = [f"{1e3 * seconds:.1f}" for seconds in spent]
         lines.append([f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}"])
-    header = "preset | games | planner | of it encoder | emulator | decisions/s"
+    header = "preset | games | planner | of it encoder | past encoded anew | emulator | decisions/s"
     return _table(header, lines)
 
 

@@ -147,6 +147,12 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
         UserError: says what has which shape.
     """
     blank = blank_context(domain, length)
+    if context.encoded is not None and context.encoded.shape[0] != length:
+        raise UserError(
+            f"a context in which {context.encoded.shape[0]} past states are encoded, but this "
+            f"network was made for {length}"
+        )
+    context = context._replace(encoded=None)
     structures = [str(jax.tree.structure(tree)) for tree in (context, blank)]
     if structures[0] != structures[1]:
         raise UserError(

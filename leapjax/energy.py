@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Energy, Params, PyTree, mask_token
+from leapjax.types import Energy, Params, PyTree, mask_token, nothing_encoded
 
 EncodeFn = Callable[[Params, PyTree], PyTree]
 LogitsFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
@@ -286,12 +286,23 @@ def constrain(
         mine = jnp.maximum(penalty(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
 
-    return energy._replace(encode=encode, conditional=conditional, total=total, violation=violation)
+    return energy._replace(
+        encode=encode, conditional=conditional, total=total, violation=violation,
+        encoded=lambda memory: energy.encoded(memory[0]),
+    )  # fmt: skip
 
 
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
-    """Puts `function(context)` in front of an energy: what this energy may see."""
-    return energy._replace(encode=lambda params, context: energy.encode(params, function(context)))
+    """Puts `function(context)` in front of an energy: what this energy may see.
+
+    All of a context is seen anew for each plan: what was made of a state may change with what the
+    function shows of it.
+    """
+
+    def encode(params: Params, context: PyTree) -> PyTree:
+        return energy.encode(params, function(context))
+
+    return energy._replace(encode=encode, encoded=nothing_encoded)
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:

@@ -1,6 +1,6 @@
 """Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import gymnasium as gym
 
@@ -37,6 +37,15 @@ class Adapter(Protocol):
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
+        ...
+
+
+@runtime_checkable
+class Eager(Protocol):
+    """An `Adapter` whose environment works on its own, so that many can work at once."""
+
+    def begin(self, action: int) -> None:
+        """Begins to take an action; the next `step`, with the same one, waits for what it gives."""
         ...
 
 

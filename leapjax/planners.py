@@ -416,4 +416,11 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
     }
     if type(config) not in planners:
         raise TypeError(f"no planner takes a {type(config).__name__}")
-    return functools.partial(planners[type(config)], energy, config=config)
+    planner = planners[type(config)]
+
+    def plan(params: Params, key: jax.Array, context: PyTree) -> Plan:
+        memory = energy.encode(params, context)
+        known = energy._replace(encode=lambda params, context: memory)
+        return planner(known, params, key, context, config)._replace(encoded=energy.encoded(memory))
+
+    return plan

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
-from leapjax.environments import Adapter
-from leapjax.types import Context, Params, PyTree, pad_token
+from leapjax.environments import Adapter, Eager
+from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token
 
 
 class Episodes(NamedTuple):
@@ -48,15 +48,26 @@ class History:
         self._past: list[PyTree] = []
         self._actions: list[int] = []
         self._rewards: list[float] = []
+        self._encoded: Array | None = None
         self._blank = jax.tree.map(np.zeros_like, self.current)
         self._pad = pad_token(num_actions)
 
-    def advance(self, action: int, observation: PyTree, reward: float) -> None:
-        """Records one step."""
+    def advance(
+        self, action: int, observation: PyTree, reward: float, encoded: Array | None = None
+    ) -> None:
+        """Records one step.
+
+        Args:
+            action: that was taken.
+            observation: what it led to.
+            reward: what it gave.
+            encoded: `[K + 1, D]` of the plan that was made before it, if there was one.
+        """
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
             self._rewards = [*self._rewards, reward][-self._length :]
+        self._encoded = None if encoded is None else encoded[1:]
         before, self.current = self.current, _copy(observation)
         if jax.tree.map(np.shape, before) != jax.tree.map(np.shape, self.current):
             raise ValueError(
@@ -81,6 +92,7 @@ class History:
             rewards=np.array([0.0] * missing + self._rewards, np.float32),
             step=np.array(self.step, np.int32),
             return_so_far=np.array(self.return_so_far, np.float32),
+            encoded=self._encoded,
         )
 
 
@@ -121,6 +133,14 @@ def check_actions(of: str, planned: int, possible: int) -> None:
 def _copy(observation: PyTree) -> PyTree:
     """Environments may write the next observation into the arrays of the last."""
     return jax.tree.map(np.array, observation)
+
+
+def kept(plans: Plan, executed: int | None) -> Array | None:
+    """What is known of states when the next plans are made, `[B, K + 1, D]`.
+
+    Of those that were seen while a plan of several actions was executed nothing is.
+    """
+    return plans.encoded if executed == 1 or plans.actions.shape[1] == 1 else None
 
 
 def stack_contexts(histories: Sequence[History]) -> Context:
@@ -188,6 +208,11 @@ def evaluate(
         actions = np.asarray(chosen)[:, :executed]  # [B, executed]
         planning_seconds += time.perf_counter() - before
         planned += len(active)
+        encoded = kept(plans, executed)
+        for row, episode in enumerate(active):
+            adapter = adapters[episode]
+            if isinstance(adapter, Eager) and actions[row, 0] < end:
+                adapter.begin(int(actions[row, 0]))
         survivors = []
         for row, episode in enumerate(active):
             over = actions[row, 0] >= end
@@ -196,7 +221,10 @@ def evaluate(
                     break
                 transition = adapters[episode].step(int(action))
                 scores[episode] += transition.counted
-                histories[episode].advance(int(action), transition.observation, transition.reward)
+                histories[episode].advance(
+                    int(action), transition.observation, transition.reward,
+                    None if encoded is None else encoded[row],
+                )  # fmt: skip
                 too_long = max_steps is not None and histories[episode].step >= max_steps
                 over = transition.terminated or transition.truncated or too_long
                 if over:

@@ -25,6 +25,8 @@ class Context(NamedTuple):
     rewards: Array  # [K] float32: what each of them gave; 0 before the start
     step: Array  # [] int32: environment steps since the episode began
     return_so_far: Array  # [] float32: the sum of all rewards since then
+    encoded: Array | None = None  # [K, D] what a network has made of each past state, where that is
+    # kept from one decision to the next; None: it has to read them all
 
 
 class Demonstration(NamedTuple):
@@ -64,6 +66,12 @@ class Plan(NamedTuple):
     valid: jax.Array  # [] bool: no energy met on the way was NaN
     energy: jax.Array | None = None  # [] float32, only if asked for: it costs T passes
     trace_energies: jax.Array | None = None  # [N] float32, only if asked for: N * T passes
+    encoded: jax.Array | None = None  # [K + 1, D] see `Energy.encoded`
+
+
+def nothing_encoded(memory: PyTree) -> None:
+    """What an energy can tell of states if it reads each context as a whole."""
+    del memory
 
 
 def _no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -89,6 +97,9 @@ class Energy(NamedTuple):
     accepts_mask: bool = True  # False: planning starts from uniform actions, not from MASK
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = _no_violation
     # (params, memory, actions [T]) -> []: 0 where every constraint holds, else positive
+    encoded: Callable[[PyTree], jax.Array | None] = nothing_encoded
+    # (memory) -> [K + 1, D]: what `encode` made of each state, for the `encoded` of later contexts;
+    # None: there is nothing that could be kept
 
 
 def mask_token(num_actions: int) -> int:

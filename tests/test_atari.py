@@ -14,6 +14,7 @@ from leapjax.atari.adapter import AtariAdapter
 from leapjax.atari.emulator import Emulator
 from leapjax.atari.games import GAMES, find_game
 from leapjax.data import windows
+from leapjax.environments import Eager
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.pretrained import Origin
@@ -370,3 +371,17 @@ def test_the_table_has_normalised_scores():
     assert f"| Breakout | our score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
+
+
+def test_a_step_that_was_begun_is_waited_for():
+    adapter, other = AtariAdapter(BREAKOUT, 0.0, 27_000), AtariAdapter(BREAKOUT, 0.0, 27_000)
+    assert isinstance(adapter, Eager)
+    adapter.reset(3), other.reset(3)
+    for index in range(30):
+        adapter.begin(index % 4)
+        begun, stepped = adapter.step(index % 4), other.step(index % 4)
+        np.testing.assert_array_equal(begun.observation, stepped.observation)
+        assert begun[1:] == stepped[1:]
+    adapter.begin(1)
+    with pytest.raises(ValueError, match="action 1 was begun, not 2"):
+        adapter.step(2)

@@ -278,6 +278,32 @@ def test_finished_episodes_leave_the_batch():
     assert reported == [(number, number) for number in over]
 
 
+class EagerCorridor(Corridor):
+    """A corridor that can be told beforehand where to go."""
+
+    calls: ClassVar[list[tuple[str, int]]] = []
+
+    def begin(self, action: int) -> None:
+        self.calls.append(("begin", action))
+
+    def step(self, action: int) -> Transition:
+        self.calls.append(("step", action))
+        return super().step(action)
+
+
+def test_first_steps_begin_before_any_is_waited_for():
+    EagerCorridor.calls.clear()
+    eager = leap.evaluate(EagerCorridor, [4, 5, 6], walker(), jnp.int32(2), context=0)
+    plain = leap.evaluate(Corridor, [4, 5, 6], walker(), jnp.int32(2), context=0)
+    for field in ("successes", "lengths", "returns", "plans"):
+        np.testing.assert_array_equal(getattr(eager, field), getattr(plain, field), field)
+    calls = EagerCorridor.calls
+    assert calls[:3] == [("begin", RIGHT)] * 3 and calls[3][0] == "step"
+    # The first action of each plan begins; the second is taken as ever.
+    assert [kind for kind, _ in calls].count("begin") == eager.plans
+    assert [kind for kind, _ in calls].count("step") == eager.lengths.sum() > eager.plans
+
+
 def test_an_episode_is_a_success_only_where_the_environment_says_so():
     def always_left(params, context):
         return jnp.full(HORIZON, LEFT)

@@ -305,7 +305,7 @@ def play(
 
     def episodes(config: PlannerConfig) -> Episodes:
         planner = asked(way, models, config)
-        run.warm_up(planner, domain, options.episodes)
+        run.warm_up(planner, domain, options.episodes, way.executed)
         adapters.clear()
         return rollouts.evaluate(
             make_adapter, options.played, planner.plan, planner.params,

@@ -39,13 +39,17 @@ def watched(
         plans = plan(keys, rollouts.stack_contexts([history]))
         yield plans
         actions = np.asarray(plans.actions[0])[:executed]
+        encoded = rollouts.kept(plans, executed)
         if actions[0] >= adapter.num_actions - 1:  # the end action: it has given up
             return
         for action in actions:
             if action >= adapter.num_actions - 1:
                 break
             transition = adapter.step(int(action))
-            history.advance(int(action), transition.observation, transition.reward)
+            history.advance(
+                int(action), transition.observation, transition.reward,
+                None if encoded is None else encoded[0],
+            )  # fmt: skip
             yield int(action), transition
             if transition.terminated or transition.truncated:
                 return

@@ -112,7 +112,7 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
         shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
         params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), shapes)
         blank = Pretrained(run.specification, agent.energy, params, plan)
-        warm_up(blank, domain, config.episodes)
+        warm_up(blank, domain, config.episodes, config.executed)
 
     pool = concurrent.futures.ThreadPoolExecutor(2)
     compiled, warm = pool.submit(training_programs), pool.submit(warm_planner)
@@ -360,7 +360,7 @@ def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
     bounds = [len(episode_seeds) * n // count for n in range(count + 1)]
     mine = episode_seeds[bounds[index] : bounds[index + 1]]
     begun = time.perf_counter()
-    warm_up(planner, run.domain, len(mine))
+    warm_up(planner, run.domain, len(mine), run.config.executed)
     run.seconds["compile"] += time.perf_counter() - begun
     with Meter(run.console, "evaluation", len(mine)) as meter:
 
@@ -391,12 +391,22 @@ def player(planner: Pretrained, run: Run) -> Callable[..., Episodes]:
     return play
 
 
-def warm_up(planner: Pretrained, domain: Domain, batch: int) -> None:
-    """Compiles every chunk size that a batch of that many and fewer plans can need."""
+def warm_up(planner: Pretrained, domain: Domain, batch: int, executed: int | None) -> None:
+    """Compiles every chunk size that a batch of that many and fewer plans can need.
+
+    Args:
+        planner: that will plan.
+        domain: of its contexts.
+        batch: episodes that are played together, at most.
+        executed: actions of each plan; None for all.
+    """
     context = blank_context(domain, planner.specification.context)
     for size in planner.plan.sizes_up_to(batch):
         contexts = jax.tree.map(lambda x, n=size: np.stack([x] * n), context)
-        jax.block_until_ready(planner(jax.random.split(jax.random.key(0), size), contexts))
+        keys = jax.random.split(jax.random.key(0), size)
+        encoded = rollouts.kept(planner(keys, contexts), executed)
+        if encoded is not None:  # as it is after the first plan
+            planner(keys, contexts._replace(encoded=encoded[:, 1:]))
 
 
 def draw(planner: Pretrained, run: Run, episode_seeds: range | None, metrics: Metrics) -> None:

@@ -79,6 +79,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return allowed(result)
 
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
+    energy = learning.keeping(energy, setup, lambda memory: memory.states)
 
     def window_loss(
         params: Params,

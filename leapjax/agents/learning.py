@@ -346,11 +346,25 @@ def acting_energy(
         say: (params, context) -> what its network says.
         scores: of what it says, `[P, A - 1]` logits or Q-values, at the current state last.
     """
-    return single_action(
+    energy = single_action(
         context_encoder(say, setup),
         lambda params, said: scores(said)[-1],
         setup.domain.num_actions,
     )
+    return keeping(energy, setup, lambda said: said["tokens"])
+
+
+def keeping(energy: Energy, setup: Setup, encoded: Callable[[PyTree], jax.Array]) -> Energy:
+    """An energy that keeps what it made of states, where there is a token for each of them.
+
+    Args:
+        energy: of the method.
+        setup: what the method is made from.
+        encoded: (memory) -> `[K + 1, D]` the tokens of the encoder.
+    """
+    if setup.model.architecture == "paper" and setup.context:
+        return energy._replace(encoded=encoded)
+    return energy
 
 
 def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:

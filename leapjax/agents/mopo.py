@@ -23,7 +23,7 @@ from leapjax.agents import iql, learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.errors import check_at_least
-from leapjax.models.policy import PolicyModel
+from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
@@ -84,9 +84,10 @@ class Networks(nn.Module):
         """Of the last P states, `[P, D]`, of variance 1 each: errors in them have a scale."""
         return self.norm(self.trunk(context)["features"])
 
-    def act(self, context: Context) -> dict[str, jax.Array]:
+    def act(self, context: Context) -> Said:
         """The policy's logits, `[P, A - 1]`."""
-        return {"logits": self.logits(self.features(context))}
+        said = self.trunk(context)
+        return {"logits": self.logits(self.norm(said["features"])), "tokens": said["tokens"]}
 
     def transition(
         self, context: Context, deterministic: bool = True

@@ -26,6 +26,7 @@ class AtariAdapter:
         )  # fmt: skip
         self.frame = np.zeros((HEIGHT, WIDTH), np.uint8)
         self.score = 0.0
+        self._begun: int | None = None  # the action that the game is busy with
 
     def reset(self, seed: int) -> np.ndarray:
         """Starts the game of a seed: the frame `[84, 84]` uint8."""
@@ -33,9 +34,19 @@ class AtariAdapter:
         self.frame, self.score = np.array(observations[0, -1]), 0.0
         return self.frame
 
+    def begin(self, action: int) -> None:
+        """Begins to take an action, in a thread of the game's own."""
+        self._env.send(np.array([action]))
+        self._begun = action
+
     def step(self, action: int) -> Transition:
         """Takes one action, for four frames of the game."""
-        observations, rewards, terminated, truncated, _ = self._env.step(np.array([action]))
+        if self._begun is None:
+            self.begin(action)
+        if self._begun != action:
+            raise ValueError(f"action {self._begun} was begun, not {action}")
+        self._begun = None
+        observations, rewards, terminated, truncated, _ = self._env.recv()
         self.frame, self.score = np.array(observations[0, -1]), self.score + float(rewards[0])
         over = bool(terminated[0] or truncated[0])
         return Transition(

@@ -68,7 +68,8 @@ class Features(nn.Module):
 class StateTokens(nn.Module):
     """A token for each state of a context: `[K + 1, D]`, as Decision Transformer has it.
 
-    The first three of them see black frames before the context.
+    The first three of them see black frames before the context, so that they are encoded anew at
+    each decision where others are known; the other architecture knows none.
     """
 
     width: int
@@ -77,10 +78,18 @@ class StateTokens(nn.Module):
 
     @nn.compact
     def __call__(self, context: Context) -> jax.Array:  # noqa: D102
-        frames = seen(context)
-        read = Features(LAYERS, self.features, self.dtype, name="features")
-        features = read(stacked(frames, frames.shape[0]).astype(self.dtype) / 255)
-        return jnp.tanh(dense(self.width, dtype=self.dtype, name="state")(features))
+        frames, known = seen(context), context.encoded
+        cut = min(STACK - 1, len(frames) - 1)
+        states = stacked(frames, len(frames))
+        if known is not None:
+            states = jnp.concatenate([states[:cut], states[-1:]])
+        features = Features(LAYERS, self.features, self.dtype, name="features")(
+            states.astype(self.dtype) / 255
+        )
+        tokens = jnp.tanh(dense(self.width, dtype=self.dtype, name="state")(features))
+        if known is None:
+            return tokens
+        return jnp.concatenate([tokens[:-1], known[cut:], tokens[-1:]])
 
 
 class CurrentTokens(nn.Module):

@@ -211,6 +211,10 @@ class StateTokens(nn.Module):
     def __call__(self, context: Context) -> jax.Array:
         """`[K + 1, D]`: the past states and the current one."""
         instruction = self.instruction(context.observation.instruction).whole
+        if context.encoded is not None:
+            return jnp.append(
+                context.encoded, self.state(context.observation, instruction)[None], axis=0
+            )
         states = jax.tree.map(
             lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
         )

@@ -67,17 +67,19 @@ class StateTokens(nn.Module):
     @nn.compact
     def __call__(self, context: Context) -> jax.Array:
         """Tokens of the K past states and the current one."""
-        states = jax.tree.map(
-            lambda past, now: jnp.concatenate([past, now[None]]),
-            context.past, jax.tree.map(jnp.asarray, context.observation),
-        )  # fmt: skip
-        leaves = jax.tree.leaves(states)  # each [K + 1, ...]
+        current = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], context.observation)
+        known = () if context.encoded is None else (context.encoded,)
+        states = current
+        if not known:
+            states = jax.tree.map(lambda *both: jnp.concatenate(both), context.past, current)
+        leaves = jax.tree.leaves(states)  # each [K + 1, ...], or [1, ...]
         read = [
             getattr(self, f"_{part.kind}")(leaf, part, str(index))
             for index, (part, leaf) in enumerate(zip(self.parts, leaves, strict=True))
         ]
         tokens = nn.gelu(sum(read, jnp.zeros((len(leaves[0]), self.width))))
         tokens = self._dense(nn.gelu(self._dense(tokens, "mixed")), "token")
+        tokens = jnp.concatenate([*known, tokens])
         if not self.num_actions:
             return tokens
         count = tokens.shape[0]

@@ -9,7 +9,7 @@ from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
 
-Said = dict[str, jax.Array]  # by head: [P, count]
+Said = dict[str, jax.Array]  # by head: [P, count]; as `tokens`, those of the encoder
 
 
 class PolicyModel(nn.Module):
@@ -76,7 +76,8 @@ class PolicyModel(nn.Module):
         goals = None if returns is None else jnp.tanh(self.goal(returns[:, None]))  # [K + 1, D]
         read = self._sequence if self.config.architecture == "paper" else self._question
         h = read(tokens, context, deterministic, goals)
-        return {name: said(h) for (name, _), said in zip(self.heads, self.said, strict=True)}
+        found = {name: said(h) for (name, _), said in zip(self.heads, self.said, strict=True)}
+        return {**found, "tokens": tokens}
 
     def _sequence(
         self, states: jax.Array, context: Context, deterministic: bool, goals: jax.Array | None

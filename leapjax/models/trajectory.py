@@ -7,13 +7,14 @@ module `context -> tokens`, is a field of the model.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from leapjax.errors import check_at_least
-from leapjax.models.transformer import Transformer, causal_mask, dense, embed
+from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
 
 ARCHITECTURES = ("paper", "leapjax")
@@ -73,6 +74,14 @@ def attention_mask(config: ModelConfig, tokens: int, prefix: int = 0) -> jax.Arr
     return causal_mask(tokens, prefix) if config.attention == "causal" else None
 
 
+class Memory(NamedTuple):
+    """What all plans from one context share, to the paper's network."""
+
+    prefix: list[KeysValues] | None  # of the context's tokens, per layer, where none sees a plan
+    tokens: jax.Array  # embeddings of all other tokens
+    states: jax.Array  # [K + 1, D] what each state of the context looks like
+
+
 class PaperModel(nn.Module):
     """The network of the paper's appendix: state and action tokens, interleaved.
 
@@ -115,7 +124,7 @@ class PaperModel(nn.Module):
         deterministic: bool = True,
         returns: jax.Array | None = None,
         states: jax.Array | None = None,
-    ) -> PyTree:
+    ) -> Memory:
         """What every pass shares: the context's keys and values, per layer, and embeddings.
 
         Those are of the plan's tokens, `[2 T, D]`, or 3 for each step where it is conditioned. With
@@ -143,22 +152,22 @@ class PaperModel(nn.Module):
         time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
         tokens = tokens + self.position(jnp.arange(tokens.shape[0])) + time
         if self.config.attention != "causal" or self.sizes.context == 0:
-            return None, tokens
+            return Memory(None, tokens, states)
         known, planned = jnp.split(tokens, [self.each * self.sizes.context])
         known = self.drop(known, deterministic=deterministic)
         mask = causal_mask(known.shape[0])
-        return self.transformer.prefix(known, mask, deterministic), planned
+        return Memory(self.transformer.prefix(known, mask, deterministic), planned, states)
 
     def logits(
         self,
-        memory: PyTree,
+        memory: Memory,
         actions: jax.Array,
         positions: jax.Array,
         deterministic: bool = True,
     ) -> jax.Array:
         """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
         check_plan(actions, self.sizes.horizon)
-        prefix, tokens = memory
+        prefix, tokens, _ = memory
         before = tokens.shape[0] - self.each * self.sizes.horizon  # tokens of the context
         asked = before + self.each * jnp.arange(self.sizes.horizon) + self.each - 2
         x = tokens.at[asked + 1].add(jnp.tanh(self.action(actions)))
