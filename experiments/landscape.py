@@ -100,7 +100,7 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
     measure = energies_of(this, count)
     with contextlib.ExitStack() as stack:
         played = seeds.validation_seeds(0, count)
-        planner, metrics = experiment.train(this, played, stack, measure)
+        planner, metrics = experiment.train(this, played, stack, measure, plays=False)
     last = measure(planner.energy, planner.params)
     watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in metrics]
     return {

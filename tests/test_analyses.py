@@ -12,7 +12,7 @@ from leapjax.planners import GibbsConfig
 
 TOY = {  # nothing is learned: gradients take long to compile
     "demos": 6, "steps": 0, "batch": 4, "width": 16, "heads": 2, "layers": 1, "channels": 4,
-    "rounds": 1, "fields": 2, "sweeps": 2, "horizon": 3, "iterations": 2,
+    "rounds": 1, "fields": 0, "sweeps": 2, "horizon": 3, "iterations": 2,
 }  # fmt: skip
 ALL = (properties, stochastic, suboptimal, ablation)
 SHORT = ["--episodes", "2"]

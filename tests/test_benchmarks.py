@@ -24,7 +24,7 @@ SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network fo
 def tiny_preset(*names):
     """The settings of a preset, with a network and batches that take no time."""
     small = {"width": 16, "heads": 2, "layers": 1, "batch": 4}
-    simple = {"channels": 4, "rounds": 1, "sweeps": 2, "augment": False, "clutter": 0.0}
+    simple = {"channels": 4, "rounds": 1, "fields": 0, "augment": False, "clutter": 0.0}
     return with_options(preset(*names), {**small, **simple})
 
 
@@ -110,7 +110,7 @@ def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkey
     assert atari.main([*arguments, "--json", str(rows)]) == 0
     (row,) = json.loads(rows.read_text())
     assert (row["level"], row["batch"]) == ("Breakout", 2)
-    for part in ("planning", "encoding", "playing"):
+    for part in ("planning", "encoding", "anew", "playing"):
         assert row[f"{part}_seconds"] > 0
     # The convolutions alone: 20 * 20, 9 * 9 and 7 * 7 places, of 2, 4 and 4 features.
     products = 400 * 64 * 2 + 81 * 32 * 4 + 49 * 36 * 4

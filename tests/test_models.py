@@ -449,7 +449,7 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
         return module.logits(module.encode(context, returns=returns), actions, positions)
 
     def over_all(module, actions):
-        prefix, tokens = module.encode(context, returns=returns)
+        prefix, tokens, _ = module.encode(context, returns=returns)
         assert prefix is None and len(tokens) == 3 * (past + HORIZON)
         asked = 3 * (past + np.arange(HORIZON)) + 1
         x = tokens.at[asked + 1].add(jnp.tanh(module.action(actions)))

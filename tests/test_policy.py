@@ -52,7 +52,9 @@ def test_each_head_speaks_of_each_state(architecture, states):
     apply, params = model(architecture)
     said = apply(params, context(jax.random.key(3)))
     shapes = {name: values.shape for name, values in said.items()}
-    assert shapes == {"logits": (states, ACTIONS - 1), "value": (states, 1)}
+    assert shapes == {
+        "logits": (states, ACTIONS - 1), "value": (states, 1), "tokens": (PAST + 1, 16),
+    }  # fmt: skip
     assert all(np.isfinite(values).all() for values in said.values())
 
 

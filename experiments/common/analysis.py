@@ -273,7 +273,7 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     work.console.print(f"training {folder}", highlight=False, markup=False)
     this = experiment.make_run(training, config, seed, work.console, work.interruption)
     with contextlib.ExitStack() as stack:
-        return experiment.train(this, work.options.played, stack)[0]
+        return experiment.train(this, work.options.played, stack, plays=False)[0]
 
 
 def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -165,7 +166,11 @@ def run_one(
 
 
 def train(
-    this: Run, played: range, stack: contextlib.ExitStack, watch: run.Watch | None = None
+    this: Run,
+    played: range,
+    stack: contextlib.ExitStack,
+    watch: run.Watch | None = None,
+    plays: bool = True,
 ) -> tuple[Pretrained, run.Metrics]:
     """What one run learns, from demonstrations on.
 
@@ -174,15 +179,17 @@ def train(
         played: level seeds that it may not learn from.
         stack: keeps other processes out of its folder, until it is closed.
         watch: see `run.fit`.
+        plays: see `run.compile_ahead`.
     """
-    mesh, wait = run.training_mesh(this.config), None
+    mesh = run.training_mesh(this.config)
+    begun = functools.cache(lambda: run.compile_ahead(this, mesh, plays))
     if run.must_collect(this):
-        wait = run.compile_ahead(this, mesh)  # programs compile meanwhile
+        begun()  # programs compile meanwhile
         run.collect(this)
     data = run.load(this)
     seeds.check_disjoint([d.seed for d in data], played)
     processes.first_does(lambda: stack.enter_context(files.only_process_in(this.folder)))
-    return run.fit(this, data, mesh, wait, watch)
+    return run.fit(this, data, mesh, lambda: begun()(), watch)
 
 
 def make_row(

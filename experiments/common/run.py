@@ -96,8 +96,14 @@ class Programs(NamedTuple):
     plan: CompiledPlanner
 
 
-def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
-    """Begins to compile, in the background; what is returned waits for the end of it."""
+def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Programs]:
+    """Begins to compile, in the background; what is returned waits for the end of it.
+
+    Args:
+        run: to compile for.
+        mesh: to train on.
+        plays: whether the planner will be needed; if not, it compiles at its first use.
+    """
     config, domain = run.config, run.domain
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
@@ -115,13 +121,15 @@ def compile_ahead(run: Run, mesh: Mesh) -> Callable[[], Programs]:
         warm_up(blank, domain, config.episodes, config.executed)
 
     pool = concurrent.futures.ThreadPoolExecutor(2)
-    compiled, warm = pool.submit(training_programs), pool.submit(warm_planner)
+    compiled = pool.submit(training_programs)
+    warm = pool.submit(warm_planner) if plays else None
     pool.shutdown(wait=False)
 
     def wait() -> Programs:
         begun = time.perf_counter()
         begin, step = compiled.result()
-        warm.result()
+        if warm is not None:
+            warm.result()
         run.seconds["compile"] += time.perf_counter() - begun
         return Programs(agent, begin, step, plan)
 
@@ -188,7 +196,7 @@ def fit(
     run: Run,
     data: Sequence[Demonstration],
     mesh: Mesh,
-    wait: Callable[[], Programs] | None = None,
+    programs: Callable[[], Programs],
     watch: Watch | None = None,
 ) -> tuple[Pretrained, Metrics]:
     """Trains, or continues; what was learned and how it went.
@@ -197,14 +205,14 @@ def fit(
         run: to do.
         data: to train on.
         mesh: to train on.
-        wait: from `compile_ahead`, where that was called already.
+        programs: makes them, or waits for them.
         watch: measures more of what is being learned, whenever its progress is reported.
     """
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
     check_data(folder, windows.fingerprint(examples))
     processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
-    agent, begin, step, plan = (wait or compile_ahead(run, mesh))()
+    agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
     compiling = time.perf_counter()
