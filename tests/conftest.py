@@ -1,5 +1,6 @@
 """What several tests share."""
 
+import gc
 import os
 import shutil
 from pathlib import Path
@@ -22,6 +23,9 @@ from leapjax.babyai import demonstrations, levels
 from leapjax.types import Demonstration
 from tests import OURS
 from tests.programs import TOY_RUN
+
+# Tracing makes very many objects, of which few are garbage; JAX tidies up at each collection, too.
+gc.set_threshold(100_000, 20, 20)
 
 # The longest files first, so that two workers end at the same time. (Those of processes and of
 # interruption want the same run: the second should not wait for the first to make it.)
