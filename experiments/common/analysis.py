@@ -28,7 +28,7 @@ from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
-from leapjax.planners import GibbsConfig, PlannerConfig
+from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, ShootingConfig
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
 from leapjax.types import Energy
@@ -280,7 +280,9 @@ def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pret
     """The models of a case as one planner, which minimises what a way says."""
     energy = way.minimise([model.energy for model in models])
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
-    plan = compile_planner(energy, search, run.CHUNK_SIZES)
+    # What weighs many plans of a context at once has a full batch with few contexts.
+    weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
+    plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
     return Pretrained(models[0].specification, energy, params, plan)
 
 

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from experiments.common.results import Row
 from leapjax import files, scores
@@ -50,6 +51,7 @@ def success_by_iteration(
     high = [max(0.0, 100 * b[1] - rate) for rate, b in zip(rates, bounds, strict=True)]
     figure, axis = plt.subplots(figsize=(5, 3.5), layout="constrained")
     axis.errorbar(iterations, rates, yerr=(low, high), marker="o", capsize=3)
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.set(xlabel="iterations", ylabel="success (%), 95% interval", title=title)
     axis.set_ylim(0, 101)
     _save(figure, path)
