@@ -62,17 +62,24 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     return {**paper, **ours} if preset == "leapjax" else paper
 
 
+SAMPLED = ("leap", "bc", "dt")  # methods whose energies are those of what was done
+
+
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
     if preset == "paper" and method not in ("leap", "classifier", "plate", "random"):
         return {"context": level.states - 1}  # the past ones
-    if (method, preset) != ("leap", "leapjax"):
-        return {}
     options: dict[str, Any] = {}
-    if level.sequence:  # much must be done in one episode: noise leads out of dead ends
-        options["temperature"] = 1.0
-    if _is_large(level):  # a rate that halves the steps elsewhere is too high here
+    if preset != "leapjax":
+        return options
+    if level.sequence and method in SAMPLED:
+        options["temperature"] = (
+            1.0  # much must be done in one episode: noise leads out of dead ends
+        )
+    if (
+        _is_large(level) and method == "leap"
+    ):  # a rate that halves the steps elsewhere is too high here
         options["learning_rate"] = 1.5e-3
     return options
 
