@@ -98,6 +98,7 @@ MINIMISED = {
     ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
 }
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
+TIMED = ("GoToLocalS8N7", "GoToObjMazeS4R2Close")  # levels that were played with nothing else running
 MEASURED = (  # files of rows beside those of experiments
     "planning", "training", "quality", "landscape", "atari-data", "atari-energy", "atari-cost",
 )  # fmt: skip
@@ -347,17 +348,30 @@ def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]
 def acting(rows: Sequence[Row]) -> str:
     """What acting costs and gives, of every method with preset `leapjax`: of training seed 0."""
 
-    def milliseconds(of: Sequence[Row]) -> float:
+    def plans(of: Sequence[Row]) -> float:
+        return sum(row["plans"] for row in of) / sum(row["episodes"] for row in of)
+
+    def milliseconds(of: Sequence[Row]) -> str:
+        if of[0]["level"] not in TIMED:
+            return "-"
         planning = sum(row["plans"] / row["plans_per_second"] for row in of)
-        return 1e3 * planning / sum(row["mean_length"] * row["episodes"] for row in of)
+        return f"{1e3 * planning / sum(row['mean_length'] * row['episodes'] for row in of):.2f}"
 
     lines = [
-        [level, method, f"{_mean_rate(of):.1f}%", _mean_length(of), f"{milliseconds(of):.2f}"]
+        [
+            level,
+            method,
+            f"{_mean_rate(of):.1f}%",
+            _mean_length(of),
+            f"{plans(of):.1f}",
+            milliseconds(of),
+        ]
         for level, by_preset in rows_by_method(rows).items()
         for method, every in by_preset["leapjax"].items()
         if method != "random" and (of := [row for row in every if row["seed"] == 0])
     ]
-    return _table("level | method | success | steps per episode | ms per action", lines)
+    header = "level | method | success | steps per episode | plans per episode | ms per action"
+    return _table(header, lines)
 
 
 def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:

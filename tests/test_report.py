@@ -92,7 +92,9 @@ def test_what_acting_costs():
     # 500 episodes of 6 steps, a plan for each, 100 plans per second.
     rows = [row(method="bc", rate=1.0) | {"plans": 3000, "plans_per_second": 100}]
     (line,) = report.acting(rows).splitlines()[2:]
-    assert line == "| GoToLocalS8N7 | bc | 100.0% | 6.0 | 10.00 |"
+    assert line == "| GoToLocalS8N7 | bc | 100.0% | 6.0 | 6.0 | 10.00 |"
+    rows = [row("PickUpLoc", method="bc") | {"plans": 3000, "plans_per_second": 100}]
+    assert report.acting(rows).endswith("| 6.0 | 6.0 | - |")  # something else was running
 
 
 def test_settings_are_kept_apart():
