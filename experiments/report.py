@@ -98,7 +98,7 @@ MINIMISED = {
     ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
 }
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
-TIMED = ("GoToLocalS8N7", "GoToObjMazeS4R2Close")  # levels that were played with nothing else running
+TIMED = ("GoToLocalS8N7", "GoToObjMazeS4R2Close")  # levels played with nothing else running
 MEASURED = (  # files of rows beside those of experiments
     "planning", "training", "quality", "landscape", "atari-data", "atari-energy", "atari-cost",
 )  # fmt: skip
@@ -124,7 +124,7 @@ def rewrite() -> None:
         write_text(path, text)
     rows = rows_of(Path(), "babyai")
     plots.iterations_by_level(success_by_iterations(rows), ITERATIONS_FIGURE)
-    plots.methods_by_level(success_by_method(rows), METHODS_FIGURE)
+    plots.methods_by_level(success_by_method(rows), COMPARED, METHODS_FIGURE)
     plots.iterations_by_level(success_by_passes(rows_of(Path(), *PUZZLES)), SEARCHES_FIGURE)
     plots.intervals(aggregates(rows), AGGREGATE_FIGURE)
     plots.landscape(read_json(Path("results/landscape.json")), LANDSCAPE_FIGURE)

@@ -70,8 +70,9 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert found["preset leapjax"][7].startswith("90.0% [")
     assert found["preset paper"][1].startswith("**20.0% [")
     assert found["preset leapjax"][2:7] == ["-"] * 5
-    plots.methods_by_level(report.success_by_method(rows), tmp_path / "methods.png")
-    plots.methods_by_level({}, tmp_path / "empty.png")
+    names, found = report.COMPARED, report.success_by_method(rows)
+    plots.methods_by_level(found, names, tmp_path / "methods.png")
+    plots.methods_by_level({}, names, tmp_path / "empty.png")
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
 
 

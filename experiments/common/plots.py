@@ -89,17 +89,18 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
     _save(figure, path)
 
 
-def methods_by_level(rates: Mapping[str, Mapping[str, Mapping[str, float]]], path: Path) -> None:
+def methods_by_level(
+    rates: Mapping[str, Mapping[str, Mapping[str, float]]], names: Sequence[str], path: Path
+) -> None:
     """Success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
 
     Args:
         rates: in percent by level, whose numbers they are, and method.
+        names: of all methods, in order.
         path: to write.
     """
     figure, axes = _panels(len(rates), columns=3, width=4.5)
     for axis, (level, by_whom) in zip(axes, rates.items(), strict=False):
-        named = [name for by_method in by_whom.values() for name in by_method]
-        names = list(dict.fromkeys(reversed(named)))[::-1]  # as the last of them has it
         width = 0.8 / len(by_whom)
         for index, (whose, by_method) in enumerate(by_whom.items()):
             places = [names.index(name) + width * (index + 0.5) - 0.4 for name in by_method]
