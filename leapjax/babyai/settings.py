@@ -71,16 +71,11 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     if preset == "paper" and method not in ("leap", "classifier", "plate", "random"):
         return {"context": level.states - 1}  # the past ones
     options: dict[str, Any] = {}
-    if preset != "leapjax":
-        return options
-    if level.sequence and method in SAMPLED:
-        options["temperature"] = (
-            1.0  # much must be done in one episode: noise leads out of dead ends
-        )
-    if (
-        _is_large(level) and method == "leap"
-    ):  # a rate that halves the steps elsewhere is too high here
-        options["learning_rate"] = 1.5e-3
+    if preset == "leapjax":
+        if level.sequence and method in SAMPLED:  # much to do: noise leads out of dead ends
+            options["temperature"] = 1.0
+        if _is_large(level) and method == "leap":  # 3e-3 is too high here
+            options["learning_rate"] = 1.5e-3
     return options
 
 
