@@ -62,7 +62,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     return {**paper, **ours} if preset == "leapjax" else paper
 
 
-SAMPLED = ("leap", "bc", "dt")  # methods whose energies are those of what was done
+SAMPLED = ("leap", "bc", "dt", "iql")  # methods whose energies are those of a policy
 
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
