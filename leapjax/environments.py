@@ -26,7 +26,8 @@ class Transition(NamedTuple):
 class Adapter(Protocol):
     """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
 
-    An observation is any pytree of NumPy arrays whose shapes never change.
+    An observation is any pytree of NumPy arrays whose shapes never change. One that works on its
+    own may be `Eager`, too.
     """
 
     num_actions: int  # A, the end action included

@@ -189,6 +189,7 @@ def evaluate(
     begun = time.perf_counter()
     adapters = [make_adapter() for _ in seeds]
     _check_adapters(adapters, plan)
+    eager = {i: adapter for i, adapter in enumerate(adapters) if isinstance(adapter, Eager)}
     end = plan.num_actions - 1
     histories = [
         History(adapter.reset(int(s)), context, end + 1)
@@ -210,9 +211,8 @@ def evaluate(
         planned += len(active)
         encoded = kept(plans, executed)
         for row, episode in enumerate(active):
-            adapter = adapters[episode]
-            if isinstance(adapter, Eager) and actions[row, 0] < end:
-                adapter.begin(int(actions[row, 0]))
+            if episode in eager and actions[row, 0] < end:
+                eager[episode].begin(int(actions[row, 0]))
         survivors = []
         for row, episode in enumerate(active):
             over = actions[row, 0] >= end

@@ -36,6 +36,9 @@ class Settings:
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place
 
 
+SAMPLED = ("leap", "bc", "dt", "iql")  # methods that draw their actions where there is much to do
+
+
 def preset(name: str, preset: str) -> Mapping[str, Any]:
     """What a preset sets for a level, whatever the method: options by name.
 
@@ -60,9 +63,6 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
         "word_heads": 4 if level.sequence else 0,
     }
     return {**paper, **ours} if preset == "leapjax" else paper
-
-
-SAMPLED = ("leap", "bc", "dt", "iql")  # methods whose energies are those of a policy
 
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
