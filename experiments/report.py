@@ -156,6 +156,7 @@ def documents(root: Path) -> dict[Path, str]:
         "iterations": (iterations, "babyai"),
         "methods": (methods, "babyai"),
         "acting": (acting, "babyai"),
+        "price": (price, "babyai"),
         "searches": (searches, "puzzles"),
         "arms": (arms, "puzzles"),
         "atari": (functools.partial(atari, data=rows["atari-data"]), "atari"),
@@ -346,32 +347,41 @@ def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]
 
 
 def acting(rows: Sequence[Row]) -> str:
-    """What acting costs and gives, of every method with preset `leapjax`: of training seed 0."""
+    """Steps of an episode, and plans where they are fewer, with preset `leapjax`, seed 0."""
 
-    def plans(of: Sequence[Row]) -> float:
-        return sum(row["plans"] for row in of) / sum(row["episodes"] for row in of)
+    def cell(row: Row) -> str:
+        steps, plans = row["mean_length"], row["plans"] / row["episodes"]
+        return f"{steps:.1f}" if round(steps - plans, 1) == 0 else f"{steps:.1f} ({plans:.1f})"
 
-    def milliseconds(of: Sequence[Row]) -> str:
-        if of[0]["level"] not in TIMED:
-            return "-"
-        planning = sum(row["plans"] / row["plans_per_second"] for row in of)
-        return f"{1e3 * planning / sum(row['mean_length'] * row['episodes'] for row in of):.2f}"
+    return _by_acting_method(rows, LEVELS, cell)
 
-    lines = [
-        [
-            level,
-            method,
-            f"{_mean_rate(of):.1f}%",
-            _mean_length(of),
-            f"{plans(of):.1f}",
-            milliseconds(of),
-        ]
-        for level, by_preset in rows_by_method(rows).items()
-        for method, every in by_preset["leapjax"].items()
-        if method != "random" and (of := [row for row in every if row["seed"] == 0])
-    ]
-    header = "level | method | success | steps per episode | plans per episode | ms per action"
-    return _table(header, lines)
+
+def price(rows: Sequence[Row]) -> str:
+    """Milliseconds of planning for each action, with preset `leapjax`, seed 0."""
+
+    def cell(row: Row) -> str:
+        planning = row["plans"] / row["plans_per_second"]
+        return f"{1e3 * planning / (row['mean_length'] * row['episodes']):.2f}"
+
+    return _by_acting_method(rows, TIMED, cell)
+
+
+def _by_acting_method(
+    rows: Sequence[Row], levels: Sequence[str], cell: Callable[[Row], str]
+) -> str:
+    """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
+    methods = [name for name in COMPARED if name != "random"]
+    lines = []
+    for level, by_preset in rows_by_method(rows).items():
+        first = {
+            name: cell(row)
+            for name, every in by_preset["leapjax"].items()
+            for row in every
+            if row["seed"] == 0
+        }
+        if level in levels:
+            lines.append([level, *(first.get(name, "-") for name in methods)])
+    return _table("level | " + " | ".join(methods), lines)
 
 
 def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
