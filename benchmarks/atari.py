@@ -103,7 +103,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
         anew = fastest(partial(plan, params, keys, contexts), seconds)
         planning = anew
         if encoded is not None:  # as it is while playing
-            contexts = contexts._replace(encoded=encoded[:, 1:])
+            contexts = contexts._replace(encoded=encoded)
             plan(params, keys, contexts)
             planning = fastest(partial(plan, params, keys, contexts), seconds)
         # On as many devices as the planner.

@@ -61,13 +61,13 @@ class History:
             action: that was taken.
             observation: what it led to.
             reward: what it gave.
-            encoded: `[K + 1, D]` of the plan that was made before it, if there was one.
+            encoded: `[K, D]` what is known of the states before it, if they are (see `kept`).
         """
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
             self._rewards = [*self._rewards, reward][-self._length :]
-        self._encoded = None if encoded is None else encoded[1:]
+        self._encoded = encoded
         before, self.current = self.current, _copy(observation)
         if jax.tree.map(np.shape, before) != jax.tree.map(np.shape, self.current):
             raise ValueError(
@@ -136,11 +136,12 @@ def _copy(observation: PyTree) -> PyTree:
 
 
 def kept(plans: Plan, executed: int | None) -> Array | None:
-    """What is known of states when the next plans are made, `[B, K + 1, D]`.
+    """What is known of past states when the next plans are made, `[B, K, D]`.
 
     Of those that were seen while a plan of several actions was executed nothing is.
     """
-    return plans.encoded if executed == 1 or plans.actions.shape[1] == 1 else None
+    single = executed == 1 or plans.actions.shape[1] == 1
+    return plans.encoded[:, 1:] if single and plans.encoded is not None else None
 
 
 def stack_contexts(histories: Sequence[History]) -> Context:

@@ -414,7 +414,7 @@ def warm_up(planner: Pretrained, domain: Domain, batch: int, executed: int | Non
         keys = jax.random.split(jax.random.key(0), size)
         encoded = rollouts.kept(planner(keys, contexts), executed)
         if encoded is not None:  # as it is after the first plan
-            planner(keys, contexts._replace(encoded=encoded[:, 1:]))
+            planner(keys, contexts._replace(encoded=encoded))
 
 
 def draw(planner: Pretrained, run: Run, episode_seeds: range | None, metrics: Metrics) -> None:
