@@ -18,6 +18,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
+from tests.recorder import Recorder
 
 MODEL = ModelConfig("paper", layers=1, heads=2, width=16, dropout=0.0, attention="causal")
 LEVELS = {"babyai": "GoToLocalS7N5", "atari": "Pong", "gymnasium": "CartPole-v1"}
@@ -30,7 +31,7 @@ def level_of(name: str) -> Domain:
 
 
 def episode(domain: Domain, length: int, steps: int, act: Callable[[History], np.ndarray]):
-    """The history after each step of a random episode; `act` says what is known of states by then."""
+    """The history after each step of a random episode; `act` says what is known of states."""
     adapter, rng = domain.make_adapter(), np.random.default_rng(0)
     history = History(adapter.reset(3), length, domain.num_actions)
     for _ in range(steps):
@@ -114,21 +115,9 @@ def test_nothing_is_kept_where_there_is_nothing_to_gain(architecture, length):
     assert energy.encoded is nothing_encoded
 
 
-class Recorded:
-    """A planner that remembers whether it was told of states, and what it planned."""
-
-    def __init__(self, energy):
-        self.plan = leap.compile_planner(
-            energy, GibbsConfig(2, 2, temperature=1.0), chunk_sizes=(2,)
-        )
-        self.num_actions = self.plan.num_actions
-        self.told, self.plans = [], []
-
-    def __call__(self, params, keys, contexts):
-        found = self.plan(params, keys, contexts)
-        self.told.append(contexts.encoded is not None)
-        self.plans.append(found.actions)
-        return found
+def told(planner: Recorder) -> list[bool]:
+    """Whether a planner was told of past states, for each of its calls."""
+    return [contexts.encoded is not None for contexts in planner.contexts]
 
 
 def test_episodes_are_the_same_whether_states_are_kept_or_not():
@@ -138,17 +127,20 @@ def test_episodes_are_the_same_whether_states_are_kept_or_not():
     play = functools.partial(
         leap.evaluate, domain.make_adapter, [0, 1], params=params, context=3, max_steps=8
     )
-    kept, anew = Recorded(agent.energy), Recorded(agent.energy._replace(encoded=nothing_encoded))
+    kept, anew = (
+        Recorder(leap.compile_planner(energy, GibbsConfig(2, 2, temperature=1.0), (2,)))
+        for energy in (agent.energy, agent.energy._replace(encoded=nothing_encoded))
+    )
     played = [play(plan=plan, executed=1) for plan in (kept, anew)]
-    assert kept.told == [False] + [True] * 7 and anew.told == [False] * 8
+    assert told(kept) == [False] + [True] * 7 and told(anew) == [False] * 8
     for one, other in zip(kept.plans, anew.plans, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len({plan.tobytes() for plan in kept.plans}) > 1
+        np.testing.assert_array_equal(one.actions, other.actions)
+    assert len({plan.actions.tobytes() for plan in kept.plans}) > 1
     assert played[0].lengths.tolist() == played[1].lengths.tolist() == [8, 8]
     # Of what is seen while a plan of several actions is executed nothing is known.
-    before = len(kept.told)
+    before = len(kept.plans)
     play(plan=kept, executed=2)
-    assert len(kept.told) > before + 3 and not any(kept.told[before:])
+    assert len(kept.plans) > before + 3 and not any(told(kept)[before:])
 
 
 def test_views_see_anew_and_constraints_keep():

@@ -11,7 +11,8 @@ import leapjax as leap
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History, join, stack_contexts
-from leapjax.types import Context, Plan
+from leapjax.types import Context
+from tests.recorder import Recorder
 
 LEFT, RIGHT, END = range(3)
 NUM_ACTIONS = 3
@@ -97,25 +98,6 @@ def stroller() -> leap.CompiledPlanner:
 
     energy = leap.from_total(lambda params, context: (), total, NUM_ACTIONS)
     return compiled(energy, temperature=1.0)
-
-
-class Recorder:
-    """A planner that remembers what it was asked and what it answered."""
-
-    def __init__(self, plan: leap.CompiledPlanner) -> None:
-        self.plan = plan
-        self.contexts: list[Context] = []
-        self.plans: list[Plan] = []
-
-    @property
-    def num_actions(self) -> int:
-        return self.plan.num_actions
-
-    def __call__(self, params, keys, contexts) -> Plan:
-        plans = self.plan(params, keys, contexts)
-        self.contexts.append(contexts)
-        self.plans.append(jax.device_get(plans))
-        return plans
 
 
 def start(seed: int) -> int:
