@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -367,7 +367,7 @@ def price(rows: Sequence[Row]) -> str:
 
 
 def _by_acting_method(
-    rows: Sequence[Row], levels: Sequence[str], cell: Callable[[Row], str]
+    rows: Sequence[Row], levels: Collection[str], cell: Callable[[Row], str]
 ) -> str:
     """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
     methods = [name for name in COMPARED if name != "random"]
