@@ -11,6 +11,7 @@ from leapjax.babyai.adapter import END, NUM_ACTIONS
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
+from leapjax.errors import UserError
 from leapjax.models.trajectory import (
     ARCHITECTURES,
     ModelConfig,
@@ -462,6 +463,49 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     # The end is never first.
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found[1, :-1], wanted[1, :-1], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("past", [0, 2])
+@pytest.mark.parametrize("repeat_state", [True, False])
+def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
+    """The current one, as equation 4 has it; or what does not depend on where the agent is."""
+    encoder = encoders.StateTokens(SIDE, 16)
+    sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
+    module = build(ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state)
+    here = random_context(0, past)
+    params = module.init(jax.random.key(0), here, EVERYWHERE, method=everything)
+
+    def states(context):  # positions add nothing to tokens of a network that has learned nothing
+        tokens = module.apply(params, context, method="encode").tokens
+        return np.asarray(tokens[::2][past:])
+
+    def differ(**changes):
+        there = here._replace(observation=here.observation._replace(**changes))
+        return np.abs(states(there) - states(here)).max(axis=1) > 1e-4
+
+    now, *later = states(here)
+    for each in later:
+        np.testing.assert_array_equal(each, later[0])
+    assert (np.abs(later[0] - now).max() > 1e-4) == (not repeat_state)
+    assert differ(pose=(here.observation.pose + 1) % 4).tolist() == [True] + [repeat_state] * 2
+    assert differ(goal=(here.observation.goal + 1) % SIDE).all()
+    assert differ(grid=here.observation.grid[::-1].copy()).all()
+
+
+@pytest.mark.parametrize(("unit", "spread"), [(False, 64**-0.5), (True, 1.0)])
+def test_where_embeddings_start(unit, spread):
+    encoder = encoders.StateTokens(SIDE, 64, unit=unit)
+    params = encoder.init(jax.random.key(0), random_context(0, 0))["params"]
+    tables = [x for path, x in jax.tree.leaves_with_path(params) if path[-1].key == "embedding"]
+    assert len(tables) == 5  # words, coordinates, directions, and the two of what is carried
+    for table in tables:
+        np.testing.assert_allclose(np.std(table), spread, rtol=0.15)
+
+
+def test_only_some_encoders_know_no_pose():
+    encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), 0)
+    with pytest.raises(UserError, match="--no-repeat-state is for architecture 'paper' on BabyAI"):
+        build(ModelConfig("paper"), Sizes(4, 0, HORIZON, 9), encoder, repeat_state=False)
 
 
 def test_unknown_precision_is_refused():

@@ -39,6 +39,7 @@ class Settings:
 
     masking: str = "one"  # one of leapjax.schedules.MASKINGS
     end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
+    repeat_state: bool = True  # at every position (eq. 4); if not, without a pose at later ones
     returns: bool = False  # condition plans on the return to go, as Decision Transformer does
     target_return: float = 1.0  # of an episode, asked for while acting
 
@@ -59,7 +60,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """
     sizes, masking = setup.sizes, setup.settings.masking
     conditioned = setup.settings.returns
-    module = trajectory.build(setup.model, sizes, setup.encoder(), conditioned)
+    module = trajectory.build(
+        setup.model, sizes, setup.encoder(), conditioned, setup.settings.repeat_state
+    )
     to_go = returns.wanted(setup) if conditioned else returns.nothing_wanted
     optimizer = learning.make_optimizer(setup.training)
     mask, pad = mask_token(sizes.num_actions), pad_token(sizes.num_actions)

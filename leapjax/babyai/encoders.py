@@ -58,6 +58,13 @@ class Convolution(nn.Module):
         return product(near[:: self.stride, :: self.stride])
 
 
+def embedding(count: int, width: int, unit: bool, name: str | None = None) -> nn.Embed:
+    """A table of vectors that start from N(0, 1) each number, or, not `unit`, N(0, 1 / width)."""
+    variance = float(width) if unit else 1.0
+    init = nn.initializers.variance_scaling(variance, "fan_in", "normal", out_axis=0)
+    return nn.Embed(count, width, embedding_init=init, name=name)
+
+
 class Instruction(NamedTuple):
     """An encoded instruction."""
 
@@ -71,11 +78,12 @@ class InstructionEncoder(nn.Module):
 
     vocabulary: int
     width: int
+    unit: bool = False  # see `embedding`
 
     @nn.compact
     def __call__(self, instruction: jax.Array) -> Instruction:
         """Of token ids `[L]`, 0 for padding."""
-        words = nn.Embed(self.vocabulary, self.width)(instruction)
+        words = embedding(self.vocabulary, self.width, self.unit)(instruction)
         given = instruction > 0
         recurrence = nn.RNN(nn.GRUCell(self.width), return_carry=True)
         whole, states = recurrence(words, seq_lengths=jnp.sum(given))
@@ -112,19 +120,24 @@ class StateEncoder(nn.Module):
 
     side: int  # S
     width: int
+    unit: bool = False  # see `embedding`
 
     @nn.compact
     def __call__(self, observation: Observation) -> jax.Array:
         """`[width]`. Coordinates are embedded, not scaled, as in the authors' code."""
+
+        def table(count: int, name: str) -> nn.Embed:
+            return embedding(count, self.width, self.unit, name)
+
         # One more row than the side, for the -1 of an unavailable goal.
-        coordinates = nn.Embed(self.side + 1, self.width, name="coordinates")
+        coordinates = table(self.side + 1, "coordinates")
         parts = [
             coordinates(observation.pose[:2]),
-            nn.Embed(DIRECTIONS, self.width, name="direction")(observation.pose[2:]),
+            table(DIRECTIONS, "direction")(observation.pose[2:]),
             coordinates(jnp.where(observation.goal < 0, self.side, observation.goal)),
             # Not in the appendix: levels where objects are moved need it.
-            nn.Embed(OBJECTS, self.width, name="carried")(observation.carried[:1]),
-            nn.Embed(COLOURS, self.width, name="carried_colour")(observation.carried[1:]),
+            table(OBJECTS, "carried")(observation.carried[:1]),
+            table(COLOURS, "carried_colour")(observation.carried[1:]),
         ]
         h = jnp.concatenate(parts).reshape(-1)
         h = jnp.tanh(nn.Dense(2 * self.width)(h))
@@ -173,6 +186,7 @@ class PaperStateEncoder(nn.Module):
     side: int
     width: int
     dtype: Dtype = jnp.float32
+    unit: bool = False  # see `embedding`
 
     @nn.compact
     def __call__(self, observation: Observation, instruction: jax.Array) -> jax.Array:
@@ -191,7 +205,7 @@ class PaperStateEncoder(nn.Module):
             h = HalvingBlock(self.width, self.dtype)(h)
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, instruction)
-        state = StateEncoder(self.side, self.width)(observation)
+        state = StateEncoder(self.side, self.width, self.unit)(observation)
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, state)
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
@@ -203,10 +217,11 @@ class StateTokens(nn.Module):
     side: int
     width: int
     dtype: Dtype = jnp.float32
+    unit: bool = False  # see `embedding`
 
     def setup(self) -> None:  # noqa: D102
-        self.instruction = InstructionEncoder(vocabulary.SIZE, self.width)
-        self.state = PaperStateEncoder(self.side, self.width, self.dtype)
+        self.instruction = InstructionEncoder(vocabulary.SIZE, self.width, self.unit)
+        self.state = PaperStateEncoder(self.side, self.width, self.dtype, self.unit)
 
     def __call__(self, context: Context) -> jax.Array:
         """`[K + 1, D]`: the past states and the current one."""
@@ -219,6 +234,13 @@ class StateTokens(nn.Module):
             lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
         )
         return jax.vmap(self.state, in_axes=(0, None))(states, instruction)
+
+    def ahead(self, context: Context) -> jax.Array:
+        """`[D]`: what later states of a plan are taken for, whose pose nobody knows: (0, 0, 0)."""
+        observation = context.observation
+        instruction = self.instruction(observation.instruction).whole
+        nowhere = jnp.zeros_like(observation.pose)
+        return self.state(observation._replace(pose=nowhere), instruction)
 
 
 def _convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:

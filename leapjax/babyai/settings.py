@@ -10,7 +10,7 @@ from leapjax.errors import check_at_least
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """BabyAI: augmentation of demonstrations, and the `leapjax` architecture's encoder."""
+    """BabyAI: augmentation of demonstrations, and the encoders."""
 
     augment: bool = False  # mirror, recolour, rename, restate at random
     exchange_objects: bool = False  # with augment: key, ball and box are alike
@@ -24,6 +24,7 @@ class Settings:
     sweeps: int = 16  # rounds of value iteration that make them
     word_heads: int = 0  # attention heads from cells to words; 0: none
     radius: int = 3  # how far around the agent its cells are read one by one
+    unit_embeddings: bool = False  # `paper`: those of words and poses start large, from N(0, 1)
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "channels", "sweeps")

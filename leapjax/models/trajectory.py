@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from leapjax.errors import check_at_least
+from leapjax.errors import UserError, check_at_least
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
 
@@ -98,6 +98,7 @@ class PaperModel(nn.Module):
     sizes: Sizes
     states: nn.Module  # the domain's: context -> [K + 1, D], a token for each of its states
     conditioned: bool = False  # on returns to go
+    repeat_state: bool = True  # the current one at all positions (eq. 4); or later `states.ahead`
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
@@ -140,14 +141,16 @@ class PaperModel(nn.Module):
         horizon = self.sizes.horizon
         states = self.see(context) if states is None else states
 
-        def with_plan(known: jax.Array) -> jax.Array:  # every position has the current one
-            return jnp.concatenate([known, jnp.repeat(known[-1:], horizon - 1, axis=0)])
+        def with_plan(known: jax.Array, later: jax.Array) -> jax.Array:
+            return jnp.concatenate([known, jnp.repeat(later[None], horizon - 1, axis=0)])
 
+        ahead = states[-1] if self.repeat_state else self.states.ahead(context)
         actions = jnp.tanh(self.action(context.actions))
         actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
-        steps = [with_plan(states), actions]  # of [K + T, D]
+        steps = [with_plan(states, ahead), actions]  # of [K + T, D]
         if returns is not None:
-            steps.insert(0, with_plan(jnp.tanh(self.goal(returns[:, None]))))
+            wanted = jnp.tanh(self.goal(returns[:, None]))
+            steps.insert(0, with_plan(wanted, wanted[-1]))
         tokens = jnp.stack(steps, axis=1).reshape(-1, self.config.width)
         time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
         tokens = tokens + self.position(jnp.arange(tokens.shape[0])) + time
@@ -264,14 +267,32 @@ Model = PaperModel | LeapModel
 
 
 def build(
-    config: ModelConfig, sizes: Sizes, encoder: nn.Module, conditioned: bool = False
+    config: ModelConfig,
+    sizes: Sizes,
+    encoder: nn.Module,
+    conditioned: bool = False,
+    repeat_state: bool = True,
 ) -> Model:
     """The masked language model that a configuration describes, around a domain's encoder.
 
-    `conditioned` says whether it is, on returns to go.
+    Args:
+        config: of the network.
+        sizes: of what it plans in.
+        encoder: the domain's, for its architecture.
+        conditioned: on returns to go.
+        repeat_state: see `PaperModel`.
+
+    Raises:
+        UserError: the state shall not be repeated, and nothing else can stand in its place.
     """
-    kind = PaperModel if config.architecture == "paper" else LeapModel
-    return kind(config, sizes, encoder, conditioned)
+    if not repeat_state and not hasattr(encoder, "ahead"):
+        raise UserError(
+            "--no-repeat-state is for architecture 'paper' on BabyAI: no other encoder says what "
+            "a state looks like of which the agent's pose is not known"
+        )
+    if config.architecture == "paper":
+        return PaperModel(config, sizes, encoder, conditioned, repeat_state)
+    return LeapModel(config, sizes, encoder, conditioned)
 
 
 def check_plan(actions: jax.Array, horizon: int) -> None:
