@@ -37,7 +37,7 @@ class Settings:
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place
 
 
-SAMPLED = ("leap", "bc", "dt", "iql", "mopo")  # methods that draw their actions where there is much to do
+SAMPLED = ("leap", "bc", "dt", "iql", "mopo")  # they draw actions where there is much to do
 
 
 def preset(name: str, preset: str) -> Mapping[str, Any]:
