@@ -161,7 +161,10 @@ def test_the_target_network_follows_slowly():
 
 @pytest.mark.parametrize(
     ("module", "settings"),
-    [(dt, dt.Settings), (leap, functools.partial(leap.Settings, "random", False, True))],
+    [
+        (dt, dt.Settings),
+        (leap, functools.partial(leap.Settings, masking="random", end=False, returns=True)),
+    ],
     ids=["dt", "leap"],
 )
 def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings):
