@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -353,7 +353,7 @@ def acting(rows: Sequence[Row]) -> str:
         steps, plans = row["mean_length"], row["plans"] / row["episodes"]
         return f"{steps:.1f}" if round(steps - plans, 1) == 0 else f"{steps:.1f} ({plans:.1f})"
 
-    return _by_acting_method(rows, LEVELS, cell)
+    return _by_acting_method(rows, cell)
 
 
 def price(rows: Sequence[Row]) -> str:
@@ -363,12 +363,10 @@ def price(rows: Sequence[Row]) -> str:
         planning = row["plans"] / row["plans_per_second"]
         return f"{1e3 * planning / (row['mean_length'] * row['episodes']):.2f}"
 
-    return _by_acting_method(rows, TIMED, cell)
+    return _by_acting_method([row for row in rows if row["level"] in TIMED], cell)
 
 
-def _by_acting_method(
-    rows: Sequence[Row], levels: Collection[str], cell: Callable[[Row], str]
-) -> str:
+def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
     """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
     methods = [name for name in COMPARED if name != "random"]
     lines = []
@@ -379,8 +377,7 @@ def _by_acting_method(
             for row in every
             if row["seed"] == 0
         }
-        if level in levels:
-            lines.append([level, *(first.get(name, "-") for name in methods)])
+        lines.append([level, *(first.get(name, "-") for name in methods)])
     return _table("level | " + " | ".join(methods), lines)
 
 
