@@ -18,6 +18,7 @@ from leapjax.checkpoints import Checkpoints
 from leapjax.files import only_process_in
 from leapjax.types import TrainState
 from tests.frozen_lake import FROZEN_LAKE
+from tests.parameters import random_parameters
 
 ROOT = Path(__file__).parent.parent
 LONG = os.environ.get("LEAPJAX_TEST_LONG") == "1"  # `make test-long`: minutes to an hour
@@ -53,9 +54,7 @@ def untrained_run(folder, *options):
     specification = config.specify(chosen, chosen.seeds[0], domain)
     pretrained.save_specification(folder, specification)
     agent = pretrained.make_agent(specification, domain)
-    shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
-    rng = np.random.default_rng(0)
-    params = jax.tree.map(lambda x: rng.normal(0, 0.1, x.shape).astype(x.dtype), shapes)
+    params = random_parameters(agent, 0.1)
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(specification))
     saved.save(TrainState(params, (), jnp.int32(0)))
     saved.close()

@@ -55,8 +55,10 @@ def test_its_energy_is_minus_the_logits_and_the_end_is_never_chosen(trained):
     agent, params, _ = trained
     _, given = contexts()
     context = jax.tree.map(lambda leaf: leaf[0], given)
-    memory = agent.energy.encode(params, context)
-    (energies,) = agent.energy.conditional(params, memory, jnp.array([toy.END]), jnp.array([0]))
+    memory = jax.jit(agent.energy.encode)(params, context)
+    (energies,) = jax.jit(agent.energy.conditional)(
+        params, memory, np.array([toy.END]), np.array([0])
+    )
     np.testing.assert_array_equal(energies, [*-memory["logits"][-1], np.inf])
 
 

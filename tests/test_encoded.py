@@ -18,6 +18,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
+from tests.parameters import random_parameters
 from tests.recorder import Recorder
 
 MODEL = ModelConfig("paper", layers=1, heads=2, width=16, dropout=0.0, attention="causal")
@@ -60,7 +61,7 @@ def test_states_look_as_they_did_when_they_were_current(name, length):
         tokens = np.asarray(encode(params, context))
         assert tokens.shape == (length + 1, MODEL.width)
         anew = np.asarray(encode(params, context._replace(encoded=None)))
-        np.testing.assert_allclose(tokens, anew, atol=1e-5)
+        np.testing.assert_allclose(tokens, anew, atol=1e-4)
         moved.append(np.ptp(tokens, axis=0).max())
         return tokens[1:]
 
@@ -76,18 +77,11 @@ def agent_of(method: str, domain: Domain, length: int, model: ModelConfig = MODE
     return kind.make_agent(Setup(domain, length, horizon, model, TrainingConfig(), settings), None)
 
 
-def random_parameters(agent):
-    """Of a network that says something of what it sees."""
-    shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
-    rng = np.random.default_rng(0)
-    return jax.tree.map(lambda x: rng.normal(0, 0.3, x.shape).astype(x.dtype), shapes)
-
-
 @pytest.mark.parametrize(("method", "horizon"), [("leap", 2), ("dt", 1), ("mopo", 1)])
 def test_a_method_keeps_what_its_encoder_made(method, horizon):
     domain = level_of("gymnasium")
     agent = agent_of(method, domain, 3)
-    params, rng = random_parameters(agent), np.random.default_rng(0)
+    params, rng = random_parameters(agent, 0.3), np.random.default_rng(0)
     context = jax.tree.map(
         lambda x: rng.integers(0, 2, x.shape).astype(x.dtype), blank_context(domain, 3)
     )
@@ -123,7 +117,7 @@ def told(planner: Recorder) -> list[bool]:
 def test_episodes_are_the_same_whether_states_are_kept_or_not():
     domain = level_of("gymnasium")
     agent = agent_of("leap", domain, 3)
-    params = random_parameters(agent)
+    params = random_parameters(agent, 0.3)
     play = functools.partial(
         leap.evaluate, domain.make_adapter, [0, 1], params=params, context=3, max_steps=8
     )

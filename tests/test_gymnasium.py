@@ -4,7 +4,6 @@ import warnings
 
 import gymnasium as gym
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -17,6 +16,7 @@ from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.gymnasium.observations import Part, StateTokens, blank_of, parts_of
+from tests.parameters import random_like
 from tests.programs import SMALL
 
 WAY = 5
@@ -103,20 +103,21 @@ def test_spaces_become_blank_observations_and_parts():
 
 def test_a_state_is_a_token_and_its_parts_are_read():
     domain = make("Corridor-v0", Settings())
-    context = jax.tree.map(jnp.asarray, blank_context(domain, 2))
+    context = blank_context(domain, 2)
     for num_actions in (0, 3):
         module = StateTokens(parts_of(Corridor.observation_space), 8, num_actions)
-        params = module.init(jax.random.key(0), context)
-        tokens = module.apply(params, context)
+        params = random_like(jax.eval_shape(module.init, jax.random.key(0), context))
+        encode = jax.jit(module.apply)
+        tokens = encode(params, context)
         assert tokens.shape == (3, 8)
         for field, value in {"here": [0.0, 0.5], "lamp": 2, "picture": 9}.items():
             seen = {**context.observation}
-            seen[field] = jnp.full_like(seen[field], jnp.asarray(value))
-            changed = module.apply(params, context._replace(observation=seen))
+            seen[field] = np.full_like(seen[field], value)
+            changed = encode(params, context._replace(observation=seen))
             np.testing.assert_allclose(changed[:-1], tokens[:-1], atol=1e-6)
             assert np.abs(changed[-1] - tokens[-1]).max() > 1e-3, field
-        acted = module.apply(params, context._replace(actions=jnp.array([0, 1])))
-        assert bool(jnp.any(acted != tokens)) == bool(num_actions)
+        acted = encode(params, context._replace(actions=np.array([0, 1], np.int32)))
+        assert np.any(acted != tokens) == bool(num_actions)
 
 
 def test_success_is_what_the_environment_says_or_the_user():

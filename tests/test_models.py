@@ -362,10 +362,22 @@ def test_steps_before_the_episode_leak_nothing(padded):
 
 
 def turn(context, quarters):
-    context = jax.tree.map(jnp.asarray, context)
-    rotate = functools.partial(symmetries.rotate, quarters=jnp.int32(quarters))
-    past = jax.vmap(rotate)(context.past) if len(context.actions) else context.past
-    return context._replace(observation=rotate(context.observation), past=past)
+    """Every state of a context, seen after so many quarter turns."""
+    rotate = _rotations(len(context.actions))
+    observation, past = rotate(context.observation, context.past, quarters)
+    return context._replace(observation=observation, past=past)
+
+
+@functools.cache
+def _rotations(past):
+    each = jax.vmap(symmetries.rotate, (0, None))
+
+    @quick_jit
+    def rotate(observation, states, quarters):
+        turned = each(states, quarters) if past else states
+        return symmetries.rotate(observation, quarters), turned
+
+    return rotate
 
 
 @EACH_MODEL
@@ -416,19 +428,20 @@ def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
 def test_with_causal_attention_no_action_sees_a_later_one(architecture):
     """And with full attention every action sees every other."""
 
-    nothing = jnp.zeros(HORIZON, jnp.int32)
-    context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(1))
+    nothing = np.zeros(HORIZON, np.int32)
+    context = jax.tree.map(lambda leaf: np.asarray(leaf)[0], mixed.contexts(1))
     everywhere = np.ones((HORIZON, HORIZON), bool)
     for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
         config = ModelConfig(architecture, 2, 2, 16, attention=attention)
         encoder = mixed.DOMAIN.encoders[architecture](config, 1)
         module = build(config, Sizes(4, 1, HORIZON, 9), encoder)
         apply = functools.partial(module.apply, method=everything)
-        init = jax.jit(functools.partial(module.init, method=everything))
-        scores = jax.jit(functools.partial(apply, init(jax.random.key(0), context, nothing)))
+        init = functools.partial(module.init, method=everything)
+        params = random_parameters(jax.eval_shape(init, jax.random.key(0), context, nothing))
+        scores = quick_jit(functools.partial(apply, params))
         before = scores(context, nothing)
         for changed in range(HORIZON):
-            after = scores(context, nothing.at[changed].set(1))
+            after = scores(context, (np.arange(HORIZON) == changed).astype(np.int32))
             seen = sees[:, changed].copy()
             # Ours is read where the action is (it is masked there), the paper's before it.
             seen[changed] &= architecture == "leapjax" or attention == "full"
@@ -442,9 +455,9 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), past)
     configs = [ModelConfig("paper", 2, 2, 16, attention=each) for each in ("causal", "full")]
     module, full = (build(each, Sizes(4, past, HORIZON, 9), encoder, True) for each in configs)
-    context = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], mixed.contexts(past))
-    returns = jnp.arange(past + 1.0)
-    actions, positions = jnp.array([1, mask_token(4), 2]), jnp.array([2, 0])
+    context = jax.tree.map(lambda leaf: np.asarray(leaf)[0], mixed.contexts(past))
+    returns = np.arange(past + 1, dtype=np.float32)
+    actions, positions = np.array([1, mask_token(4), 2]), np.array([2, 0])
 
     def scores(module, actions):
         return module.logits(module.encode(context, returns=returns), actions, positions)
@@ -456,9 +469,10 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
         x = tokens.at[asked + 1].add(jnp.tanh(module.action(actions)))
         return module.head(module.transformer(x, asked[positions], mask=causal_mask(len(x))))
 
-    params = module.init(jax.random.key(0), actions, method=scores)
-    found = module.apply(params, actions, method=scores)
-    wanted = full.apply(params, actions, method=over_all)
+    initialise = functools.partial(module.init, method=scores)
+    params = random_parameters(jax.eval_shape(initialise, jax.random.key(0), actions))
+    found = quick_jit(functools.partial(module.apply, method=scores))(params, actions)
+    wanted = quick_jit(functools.partial(full.apply, method=over_all))(params, actions)
     assert np.ptp(wanted[0]) > 1e-4
     # The end is never first.
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-4, atol=1e-6)
@@ -473,11 +487,13 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
     module = build(ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state)
     here = random_context(0, past)
-    params = module.init(jax.random.key(0), here, EVERYWHERE, method=everything)
+    initialise = functools.partial(module.init, method=everything)
+    params = random_parameters(jax.eval_shape(initialise, jax.random.key(0), here, EVERYWHERE))
+    params["params"]["position"]["embedding"][:] = 0  # tokens differ by what they show alone
+    encode = quick_jit(functools.partial(module.apply, method="encode"))
 
-    def states(context):  # positions add nothing to tokens of a network that has learned nothing
-        tokens = module.apply(params, context, method="encode").tokens
-        return np.asarray(tokens[::2][past:])
+    def states(context):
+        return np.asarray(encode(params, context).tokens)[::2][past:]
 
     def differ(**changes):
         there = here._replace(observation=here.observation._replace(**changes))
@@ -492,14 +508,19 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     assert differ(grid=here.observation.grid[::-1].copy()).all()
 
 
-@pytest.mark.parametrize(("unit", "spread"), [(False, 64**-0.5), (True, 1.0)])
-def test_where_embeddings_start(unit, spread):
-    encoder = encoders.StateTokens(SIDE, 64, unit=unit)
-    params = encoder.init(jax.random.key(0), random_context(0, 0))["params"]
-    tables = [x for path, x in jax.tree.leaves_with_path(params) if path[-1].key == "embedding"]
-    assert len(tables) == 5  # words, coordinates, directions, and the two of what is carried
-    for table in tables:
-        np.testing.assert_allclose(np.std(table), spread, rtol=0.15)
+def test_where_embeddings_of_the_paper_start():
+    encoder = encoders.StateTokens(SIDE, 64)
+
+    @quick_jit
+    def tables(key):
+        params = encoder.init(key, random_context(0, 0))["params"]
+        leaves = jax.tree.leaves_with_path(params)
+        return [leaf for path, leaf in leaves if path[-1].key == "embedding"]
+
+    begun = tables(jax.random.key(0))
+    assert len(begun) == 5  # words, coordinates, directions, and the two of what is carried
+    for table in begun:
+        np.testing.assert_allclose(np.std(table), 1, rtol=0.15)
 
 
 def test_only_some_encoders_know_no_pose():

@@ -14,6 +14,7 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
+from tests.parameters import random_parameters
 
 HORIZON = 4
 EACH_ARCHITECTURE = pytest.mark.parametrize(
@@ -37,10 +38,8 @@ def data():
 def untrained(architecture, past):
     """An agent, parameters that are all random, and windows."""
     agent = plate.make_agent(setup_of(architecture, past))
-    leaves, structure = jax.tree.flatten(agent.init(jax.random.key(0)).params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    noise = [0.5 * jax.random.normal(k, x.shape) for k, x in zip(keys, leaves, strict=True)]
-    return agent, jax.tree.unflatten(structure, noise), agent.batch(jax.random.key(2), data())
+    batch = jax.jit(agent.batch)(jax.random.key(2), data())
+    return agent, random_parameters(agent), jax.tree.map(np.asarray, batch)
 
 
 def network(architecture, past):
@@ -52,19 +51,19 @@ def network(architecture, past):
 def test_an_action_depends_on_those_before_it_alone(architecture, past):
     agent, params, batch = untrained(architecture, past)
     context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, past)
-    everywhere = jnp.arange(HORIZON)
+    everywhere = np.arange(HORIZON)
     memory = jax.jit(agent.energy.encode)(params, context)
     energies = jax.jit(agent.energy.conditional)
-    plan = jnp.zeros(HORIZON, jnp.int32)
-    before = np.asarray(energies(params, memory, plan, everywhere))
+    before = np.asarray(energies(params, memory, np.zeros(HORIZON, np.int32), everywhere))
     for changed in range(HORIZON):
-        after = energies(params, memory, plan.at[changed].set(1), everywhere)
+        plan = np.arange(HORIZON, dtype=np.int32) == changed
+        after = energies(params, memory, plan.astype(np.int32), everywhere)
         with np.errstate(invalid="ignore"):
             differs = np.nanmax(np.abs(np.asarray(after) - before), axis=1) > 1e-4
         assert differs.tolist() == [place > changed for place in range(HORIZON)]
     # One at a time as all together, although fewer states are then predicted.
     for place in range(HORIZON):
-        (alone,) = energies(params, memory, plan, jnp.array([place]))
+        (alone,) = energies(params, memory, np.zeros(HORIZON, np.int32), np.array([place]))
         np.testing.assert_allclose(alone, before[place], rtol=1e-4, atol=1e-4)
     assert np.isposinf(before[0, toy.END])
 

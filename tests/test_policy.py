@@ -11,6 +11,7 @@ import pytest
 from leapjax.models.policy import PolicyModel, past_and_present
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Context, pad_token
+from tests.parameters import random_like
 
 PAST, ACTIONS = 3, 4
 HEADS = (("logits", ACTIONS - 1), ("value", 1))
@@ -25,14 +26,21 @@ class States(nn.Module):
         return nn.Dense(16)(states)
 
 
-def context(key, past=PAST):
-    keys = jax.random.split(key, 3)
+def context(seed, past=PAST):
+    rng = np.random.default_rng(seed)
     return Context(
-        observation=jax.random.normal(keys[0], (2,)),
-        past=jax.random.normal(keys[1], (past, 2)),
-        actions=jax.random.randint(keys[2], (past,), 0, ACTIONS - 1),
-        rewards=jnp.zeros(past), step=jnp.int32(5), return_so_far=jnp.float32(0),
+        observation=rng.normal(size=2).astype(np.float32),
+        past=rng.normal(size=(past, 2)).astype(np.float32),
+        actions=rng.integers(0, ACTIONS - 1, past).astype(np.int32),
+        rewards=np.zeros(past, np.float32), step=np.int32(5), return_so_far=np.float32(0),
     )  # fmt: skip
+
+
+def changed(array, place, value):
+    """A copy that differs in one place."""
+    copy = array.copy()
+    copy[place] = value
+    return copy
 
 
 @functools.cache
@@ -40,17 +48,14 @@ def model(architecture, past=PAST):
     """A network and its parameters, every one of them random."""
     config = ModelConfig(architecture, layers=2, heads=2, width=16)
     module = PolicyModel(config, Sizes(ACTIONS, past, 1, 20), States(), HEADS)
-    params = module.init(jax.random.key(0), context(jax.random.key(1), past))
-    leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(2), len(leaves))
-    noise = [jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-    return jax.jit(module.apply), jax.tree.unflatten(structure, noise)
+    shapes = jax.eval_shape(module.init, jax.random.key(0), context(1, past))
+    return jax.jit(module.apply), random_like(shapes, scale=1.0)
 
 
 @pytest.mark.parametrize(("architecture", "states"), [("paper", PAST + 1), ("leapjax", 1)])
 def test_each_head_speaks_of_each_state(architecture, states):
     apply, params = model(architecture)
-    said = apply(params, context(jax.random.key(3)))
+    said = apply(params, context(3))
     shapes = {name: values.shape for name, values in said.items()}
     assert shapes == {
         "logits": (states, ACTIONS - 1), "value": (states, 1), "tokens": (PAST + 1, 16),
@@ -60,19 +65,19 @@ def test_each_head_speaks_of_each_state(architecture, states):
 
 def test_what_is_said_of_a_state_depends_on_what_came_before_it_alone():
     apply, params = model("paper")
-    given = context(jax.random.key(3))
+    given = context(3)
     before = apply(params, given)["logits"]
     # In the order of the tokens: s_0 a_0 s_1 a_1 s_2 a_2 s_3.
     for place in range(2 * PAST + 1):
         state, is_action = divmod(place, 2)
         if is_action:
-            other = (given.actions[state] + 1) % (ACTIONS - 1)
-            changed = given._replace(actions=given.actions.at[state].set(other))
+            action = (given.actions[state] + 1) % (ACTIONS - 1)
+            other = given._replace(actions=changed(given.actions, state, action))
         elif state < PAST:
-            changed = given._replace(past=given.past.at[state].add(1))
+            other = given._replace(past=changed(given.past, state, given.past[state] + 1))
         else:
-            changed = given._replace(observation=given.observation + 1)
-        differs = np.abs(apply(params, changed)["logits"] - before).max(axis=1) > 1e-5
+            other = given._replace(observation=given.observation + 1)
+        differs = np.abs(apply(params, other)["logits"] - before).max(axis=1) > 1e-5
         first = state + is_action  # an action is seen from the next state on
         assert differs.tolist() == [s >= first for s in range(PAST + 1)], place
 
@@ -80,14 +85,14 @@ def test_what_is_said_of_a_state_depends_on_what_came_before_it_alone():
 @pytest.mark.parametrize("architecture", ["paper", "leapjax"])
 def test_without_a_past_only_the_present_counts(architecture):
     apply, params = model(architecture, past=0)
-    said = apply(params, context(jax.random.key(3), past=0))
+    said = apply(params, context(3, past=0))
     assert said["logits"].shape == (1, ACTIONS - 1)
 
 
 def test_padded_actions_are_tokens_of_their_own():
     apply, params = model("paper")
-    given = context(jax.random.key(3))
-    padded = given._replace(actions=given.actions.at[0].set(pad_token(ACTIONS)))
+    given = context(3)
+    padded = given._replace(actions=changed(given.actions, 0, pad_token(ACTIONS)))
     assert not np.allclose(apply(params, padded)["logits"][-1], apply(params, given)["logits"][-1])
 
 

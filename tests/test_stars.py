@@ -19,6 +19,7 @@ from leapjax.stars import graphs
 from leapjax.stars.domain import Settings, make
 from leapjax.stars.graphs import Star, StarAdapter
 from leapjax.types import pad_token
+from tests.parameters import random_parameters
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -120,15 +121,15 @@ def agent_and_domain(method="leap"):
 
 def test_the_order_of_edges_means_nothing_to_the_network():
     agent, domain = agent_and_domain()
-    params = agent.init(jax.random.key(0)).params
+    params = random_parameters(agent)
     context = blank_context(domain, 0)
     graph, _ = graphs.draw(STAR, 0)
-    blank = jnp.full(STAR.length, domain.num_actions)
+    blank = np.full(STAR.length, domain.num_actions)
 
     @jax.jit
     def energies(graph):
         memory = agent.energy.encode(params, context._replace(observation=graph))
-        return agent.energy.conditional(params, memory, blank, jnp.arange(STAR.length))
+        return agent.energy.conditional(params, memory, blank, np.arange(STAR.length))
 
     found = energies(graph)
     shuffled = graph._replace(edges=graph.edges[::-1])

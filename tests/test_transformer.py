@@ -7,16 +7,11 @@ import pytest
 
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask
 from tests.enumerable import quick_jit
+from tests.parameters import random_like
 
 LAYERS, WIDTH, HEADS = 2, 16, 2
 PREFIX, TOKENS = 4, 5
 MODULE = Transformer(LAYERS, WIDTH, HEADS)
-
-
-def random_like(shapes, seed=0):
-    """Parameters large enough that a wrong mask shows."""
-    rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda s: rng.normal(scale=0.5, size=s.shape).astype(np.float32), shapes)
 
 
 EVERYWHERE = np.arange(TOKENS)

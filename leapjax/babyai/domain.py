@@ -41,7 +41,7 @@ def make(name: str, options: Settings) -> Domain:
                 f"width {model.width} is not a multiple of {encoders.NORM_GROUPS}, the groups of "
                 "channels that the paper's encoder normalises"
             )
-        return encoders.StateTokens(side, model.width, model.dtype, options.unit_embeddings)
+        return encoders.StateTokens(side, model.width, model.dtype)
 
     def context_tokens(model: ModelConfig, context: int) -> nn.Module:
         del context

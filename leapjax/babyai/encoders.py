@@ -13,7 +13,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from flax.typing import Dtype
+from flax.typing import Dtype, Initializer
 
 from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.adapter import NUM_ACTIONS
@@ -29,6 +29,7 @@ DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
 BARRIER = 8.0  # steps that one goes round for each nat
+LARGE = nn.initializers.normal(1.0)  # where the authors' embeddings start: PyTorch's default
 _OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
 
 
@@ -58,13 +59,6 @@ class Convolution(nn.Module):
         return product(near[:: self.stride, :: self.stride])
 
 
-def embedding(count: int, width: int, unit: bool, name: str | None = None) -> nn.Embed:
-    """A table of vectors that start from N(0, 1) each number, or, not `unit`, N(0, 1 / width)."""
-    variance = float(width) if unit else 1.0
-    init = nn.initializers.variance_scaling(variance, "fan_in", "normal", out_axis=0)
-    return nn.Embed(count, width, embedding_init=init, name=name)
-
-
 class Instruction(NamedTuple):
     """An encoded instruction."""
 
@@ -78,12 +72,13 @@ class InstructionEncoder(nn.Module):
 
     vocabulary: int
     width: int
-    unit: bool = False  # see `embedding`
+    embedding_init: Initializer = nn.linear.default_embed_init
 
     @nn.compact
     def __call__(self, instruction: jax.Array) -> Instruction:
         """Of token ids `[L]`, 0 for padding."""
-        words = embedding(self.vocabulary, self.width, self.unit)(instruction)
+        table = nn.Embed(self.vocabulary, self.width, embedding_init=self.embedding_init)
+        words = table(instruction)
         given = instruction > 0
         recurrence = nn.RNN(nn.GRUCell(self.width), return_carry=True)
         whole, states = recurrence(words, seq_lengths=jnp.sum(given))
@@ -120,14 +115,13 @@ class StateEncoder(nn.Module):
 
     side: int  # S
     width: int
-    unit: bool = False  # see `embedding`
 
     @nn.compact
     def __call__(self, observation: Observation) -> jax.Array:
         """`[width]`. Coordinates are embedded, not scaled, as in the authors' code."""
 
         def table(count: int, name: str) -> nn.Embed:
-            return embedding(count, self.width, self.unit, name)
+            return nn.Embed(count, self.width, embedding_init=LARGE, name=name)
 
         # One more row than the side, for the -1 of an unavailable goal.
         coordinates = table(self.side + 1, "coordinates")
@@ -186,7 +180,6 @@ class PaperStateEncoder(nn.Module):
     side: int
     width: int
     dtype: Dtype = jnp.float32
-    unit: bool = False  # see `embedding`
 
     @nn.compact
     def __call__(self, observation: Observation, instruction: jax.Array) -> jax.Array:
@@ -205,7 +198,7 @@ class PaperStateEncoder(nn.Module):
             h = HalvingBlock(self.width, self.dtype)(h)
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, instruction)
-        state = StateEncoder(self.side, self.width, self.unit)(observation)
+        state = StateEncoder(self.side, self.width)(observation)
         for _ in range(2):
             h = FiLMBlock(self.width, self.dtype)(h, state)
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
@@ -217,11 +210,10 @@ class StateTokens(nn.Module):
     side: int
     width: int
     dtype: Dtype = jnp.float32
-    unit: bool = False  # see `embedding`
 
     def setup(self) -> None:  # noqa: D102
-        self.instruction = InstructionEncoder(vocabulary.SIZE, self.width, self.unit)
-        self.state = PaperStateEncoder(self.side, self.width, self.dtype, self.unit)
+        self.instruction = InstructionEncoder(vocabulary.SIZE, self.width, LARGE)
+        self.state = PaperStateEncoder(self.side, self.width, self.dtype)
 
     def __call__(self, context: Context) -> jax.Array:
         """`[K + 1, D]`: the past states and the current one."""

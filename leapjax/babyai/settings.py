@@ -24,7 +24,6 @@ class Settings:
     sweeps: int = 16  # rounds of value iteration that make them
     word_heads: int = 0  # attention heads from cells to words; 0: none
     radius: int = 3  # how far around the agent its cells are read one by one
-    unit_embeddings: bool = False  # `paper`: those of words and poses start large, from N(0, 1)
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "channels", "sweeps")
@@ -69,7 +68,9 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
-    if preset == "paper" and method not in ("leap", "classifier", "plate", "random"):
+    if preset == "paper" and method == "leap":  # the authors' code (docs/experiments.md)
+        return {"end": False, "repeat_state": False}
+    if preset == "paper" and method not in ("classifier", "plate", "random"):
         return {"context": level.states - 1}  # the past ones
     options: dict[str, Any] = {}
     if preset == "leapjax":
