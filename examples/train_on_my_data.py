@@ -42,7 +42,7 @@ model = ModelConfig(width=64, layers=2, dropout=0.0)
 agent = method.make_agent(Setup(domain, 0, 5, model, training, method.Settings("random")))
 key = jax.random.key(0)
 state = train(
-    make_train_step(agent), agent.init(key), data, key, steps,
+    make_train_step(agent), jax.jit(agent.init)(key), data, key, steps,
     lambda step, state, means: print(step, means) if step % 100 == 0 else None,
 )  # fmt: skip
 plan = leap.compile_planner(agent.energy, leap.GibbsConfig(horizon=5, iterations=5))

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-MASKINGS = ("one", "each", "random", "stratified")
+MASKINGS = ("one", "each", "all", "random", "stratified")
 SINGLE = ("one", "each")  # those that mask one action in every copy
 
 
@@ -12,6 +12,8 @@ def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
 
     - `one`: one random position (paper, appendix "Experiment details"); 1 copy.
     - `each`: every position in turn, T copies (what the authors' code does).
+    - `all`: every position, so that the state alone says what to do (the authors' code, in
+      PickUpLoc); 1 copy.
     - `random`: n positions with n uniform in 1 .. T, so that the all-masked start of
       planning is an input that training has seen; 1 copy.
     - `stratified`: the same with n = 1, 2, .. T, T copies: every window is also learned from as
@@ -19,6 +21,8 @@ def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
     """
     if masking == "each":
         return jnp.eye(horizon, dtype=bool)
+    if masking == "all":
+        return jnp.ones((1, horizon), dtype=bool)
     count_key, order_key = jax.random.split(key)
     rank = jax.random.permutation(order_key, horizon)
     if masking == "one":

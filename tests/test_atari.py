@@ -81,7 +81,7 @@ def test_a_state_is_the_same_in_a_longer_context():
     made = domain.make("Breakout", domain.Settings())
     whole = window(12, context=9).context
     encoder = made.encoders["paper"](MODEL, 9)
-    params = random_like(jax.eval_shape(encoder.init, jax.random.key(0), whole))
+    params = random_like(jax.eval_shape(encoder.init, jax.random.key(0), whole), 0.05)
     encode = jax.jit(encoder.apply)
     tokens = encode(params, whole)
     last = encode(params, whole._replace(past=whole.past[4:]))
@@ -114,7 +114,7 @@ def test_encoders_see_what_they_should(architecture):
     made = domain.make("Breakout", domain.Settings())
     context = window(8, context=6).context
     encoder = made.encoders[architecture](MODEL, 6)
-    params = random_like(jax.eval_shape(encoder.init, jax.random.key(0), context))
+    params = random_like(jax.eval_shape(encoder.init, jax.random.key(0), context), 0.05)
     encode = jax.jit(encoder.apply)
     before = encode(params, context)
     assert before.shape == ((7, 16) if architecture == "paper" else (domain.TOKENS, 16))

@@ -34,6 +34,11 @@ def test_each_masks_every_position_in_turn(masks):
     np.testing.assert_array_equal(masks["each"], np.broadcast_to(np.eye(HORIZON), (DRAWS, 4, 4)))
 
 
+def test_all_masks_every_position_at_once(masks):
+    assert masks["all"].shape == (DRAWS, 1, HORIZON)
+    assert masks["all"].all()
+
+
 def test_random_draws_a_uniform_count(masks):
     random = masks["random"]
     assert random.shape == (DRAWS, 1, HORIZON)
@@ -67,7 +72,7 @@ def test_a_single_action_is_always_masked(masking):
     np.testing.assert_array_equal(sample_masks(jax.random.key(3), 1, masking), [[True]])
 
 
-@pytest.mark.parametrize("masking", ["", "One", "all"])
+@pytest.mark.parametrize("masking", ["", "One", "none"])
 def test_unknown_masking_is_refused(masking):
-    with pytest.raises(ValueError, match=r"unknown masking.*one, each, random"):
+    with pytest.raises(ValueError, match=r"unknown masking.*one, each, all, random"):
         sample_masks(jax.random.key(0), HORIZON, masking)
