@@ -148,18 +148,6 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
     assert not (tmp_path / "runs").exists()
 
 
-def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
-    shutil.copytree(workplace / "runs", workplace / "both")
-    assert babyai.main([*TOY_RUN, *SIMPLE, "--method", "classifier", "--runs", "both"]) == 0
-    before, after = results.read(workplace / "both" / "babyai.jsonl")
-    assert (before["method"], after["method"]) == ("leap", "classifier")
-    assert before["hash"] != after["hash"] and after["params"] > 0
-    (folder,) = (workplace / "both").glob("*-classifier-*")
-    assert {"loss", "absolute_error"} < run.read_metrics(folder)[-1].keys()
-    plan = plans(load(folder), 3)
-    assert plan.actions.shape == (3, 5) and plan.actions.max() < 7
-
-
 def test_the_random_method_has_a_row_and_plans_uniformly(workplace):
     assert babyai.main([*RANDOM, "--runs", "random"]) == 0
     (row,) = results.read(workplace / "random" / "babyai.jsonl")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from experiments.common import experiment, results
+from experiments.common import experiment, results, run
 from experiments.common.experiment import Experiment
 from leapjax import domains, methods, rollouts
 from leapjax.data import storage
@@ -76,6 +76,16 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
     for others, message in (("all", "of one method"), ("iql", "method is dt, not iql")):
         assert experiment.main(LAKE, [*arguments[:-1], others, "--checkpoint", str(folder)]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_classifier_trains_and_its_planner_loads(workplace):
+    arguments = [*EVERY, *"--demos 2 --episodes 2 --steps 4 --method classifier".split()]
+    assert experiment.main(LAKE, arguments) == 0
+    (row,) = results.read(workplace / "runs" / "lake.jsonl")
+    assert row["method"] == "classifier" and row["params"] > 0
+    (folder,) = (workplace / "runs").glob("*-classifier-*")
+    assert {"loss", "absolute_error"} < run.read_metrics(folder)[-1].keys()
+    assert leap.load(folder).specification.method == "classifier"
 
 
 def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(workplace, capsys):
