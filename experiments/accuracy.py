@@ -125,7 +125,7 @@ def accuracy(
         def one(start: jax.Array) -> tuple[jax.Array, jax.Array]:
             horizon = specification.planner.horizon
             window = windows.window(steps, start, specification.context, horizon, end)
-            return hits(planner.energy, params, window)
+            return hits(planner.energy, params, window, specification.method_settings.end)
 
         right, asked = jax.lax.map(one, starts, batch_size=TOGETHER)
         return right.sum(axis=0), asked.sum(axis=0)
@@ -134,10 +134,18 @@ def accuracy(
     return right, asked
 
 
-def hits(energy: Energy, params: Params, window: Window) -> tuple[jax.Array, jax.Array]:
+def hits(
+    energy: Energy, params: Params, window: Window, end: bool = True
+) -> tuple[jax.Array, jax.Array]:
     """Whether each action is the likeliest, given those before it and MASK after it.
 
     After the end action there is nothing to predict but more of it: those do not count.
+
+    Args:
+        energy: of a model that was trained to fill in what is masked.
+        params: of it.
+        window: of a demonstration.
+        end: the end action is predicted, too.
 
     Returns:
         `[T]` bool: it is, and it counts; `[T]` bool: it counts.
@@ -145,7 +153,7 @@ def hits(energy: Energy, params: Params, window: Window) -> tuple[jax.Array, jax
     memory = energy.encode(params, window.context)
     places = jnp.arange(window.actions.shape[0])
     ended = window.actions == energy.num_actions - 1
-    counts = jnp.cumsum(ended) - ended == 0  # up to the first end action
+    counts = jnp.cumsum(ended) - (ended if end else 0) == 0  # up to the first end action
 
     def hit(place: jax.Array) -> jax.Array:
         tokens = jnp.where(places < place, window.actions, mask_token(energy.num_actions))

@@ -35,7 +35,7 @@ from leapjax.domain import Domain
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import History, stack_contexts
-from leapjax.types import Context, Energy, Params
+from leapjax.types import Context, Energy, Params, pad_token
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
 EXPERIMENT = Experiment("landscape", "babyai")
@@ -125,6 +125,7 @@ def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, f
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
     begins = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
     end, horizon = domain.num_actions - 1, specification.planner.horizon
+    ends = specification.method_settings.end  # or there is PAD after it
 
     def corrupted(key: jax.Array, actions: jax.Array, share: float) -> jax.Array:
         where_key, action_key = jax.random.split(key)
@@ -137,7 +138,9 @@ def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, f
         def one(place: jax.Array, begin: jax.Array) -> jax.Array:
             window = windows.window(steps, begin, specification.context, horizon, end)
             actions = corrupted(jax.random.key(place), window.actions, share)
-            return energy.total(params, energy.encode(params, window.context), actions)
+            beyond = (window.actions == end) & (not ends)
+            memory = energy.encode(params, window.context)
+            return energy_of_actions(energy, params, memory, actions, beyond)
 
         return jax.vmap(one)(jnp.arange(len(begins)), begins).mean()
 
@@ -145,6 +148,22 @@ def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, f
         return {f"random_{n}": float(mean(energy, params, n / 100)) for n in CORRUPTED}
 
     return measure
+
+
+def energy_of_actions(
+    energy: Energy, params: Params, memory: Any, actions: jax.Array, beyond: jax.Array
+) -> jax.Array:
+    """The energy `[]` of the actions of a plan `[T]` that are not `beyond [T]` its end.
+
+    There is PAD, as in training: it is seen, and what is not predicted does not count.
+    """
+    tokens = jnp.where(beyond, pad_token(energy.num_actions), actions)
+
+    def term(position: jax.Array) -> jax.Array:
+        return energy.conditional(params, memory, tokens, position[None])[0, actions[position]]
+
+    terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
+    return jnp.where(beyond, 0, terms).sum()
 
 
 def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, list[Any]]:

@@ -55,6 +55,10 @@ def test_what_comes_after_the_end_does_not_count(actions):
     # The end is expected after 2 only.
     follows = actions[2] == 2
     np.testing.assert_array_equal(right, [True, True, follows, follows, False])
+    # Where plans do not end, it is not asked for.
+    right, counts = accuracy.hits(counting_model(), None, window(actions), end=False)
+    np.testing.assert_array_equal(counts, [True, True, True, False, False])
+    np.testing.assert_array_equal(right, [True, True, follows, False, False])
 
 
 def collect(count, seed):
@@ -75,7 +79,10 @@ def test_counts_are_those_of_every_step():
         )
 
     data = [told([0, 1]), told([0, 1, 2]), told([0] * 7)]
-    specification = SimpleNamespace(context=0, planner=SimpleNamespace(horizon=HORIZON))
+    specification = SimpleNamespace(
+        context=0, planner=SimpleNamespace(horizon=HORIZON),
+        method_settings=SimpleNamespace(end=True),
+    )  # fmt: skip
     planner = SimpleNamespace(specification=specification, energy=counting_model(), params=None)
     expected = np.zeros((2, HORIZON), int)
     for demonstration in data:
