@@ -69,7 +69,8 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
     if preset == "paper" and method == "leap":  # the authors' code (docs/experiments.md)
-        return {"end": False, "repeat_state": False}
+        alone = {"masking": "all"} if level.name == "PickUpLoc" else {}  # no actions are seen
+        return {"end": False, "repeat_state": False, **alone}
     if preset == "paper" and method not in ("classifier", "plate", "random"):
         return {"context": level.states - 1}  # the past ones
     options: dict[str, Any] = {}
