@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import tyro
@@ -165,22 +164,21 @@ def random_contexts(domain: Domain, length: int, batch: int) -> Any:
 
     Or with random frames.
     """
-    blank = blank_context(domain, length)
-    contexts = jax.tree.map(lambda x: jnp.repeat(x[None], batch, axis=0), blank)
-    key = jax.random.key(2)
+    blank, rng = blank_context(domain, length), np.random.default_rng(2)
+    contexts = jax.tree.map(lambda x: np.repeat(x[None], batch, axis=0), blank)
     if isinstance(blank.observation, np.ndarray):
         frames = [
-            jax.random.randint(key, leaf.shape, 0, 256).astype(jnp.uint8)
+            rng.integers(0, 256, leaf.shape).astype(np.uint8)
             for leaf in (contexts.observation, contexts.past)
         ]
-        return contexts._replace(observation=frames[0], past=frames[1])
-    grid = jax.random.randint(key, contexts.observation.grid.shape, 0, 4).astype(jnp.uint8)
-    pose = jax.random.randint(key, (batch, 3), 1, 4)
-    words = jnp.ones_like(contexts.observation.instruction)
+        return jax.device_put(contexts._replace(observation=frames[0], past=frames[1]))
+    pose = rng.integers(1, 4, (batch, 3)).astype(np.int32)
     observation = contexts.observation._replace(
-        grid=grid, pose=pose, goal=pose[:, 1:], instruction=words
-    )
-    return contexts._replace(observation=observation)
+        grid=rng.integers(0, 4, contexts.observation.grid.shape).astype(np.uint8),
+        pose=pose, goal=pose[:, 1:],
+        instruction=np.ones_like(contexts.observation.instruction),
+    )  # fmt: skip
+    return jax.device_put(contexts._replace(observation=observation))
 
 
 def table(rows: Sequence[Row]) -> Table:
