@@ -101,6 +101,16 @@ def test_a_level_may_change_the_preset_of_a_method():
     assert preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
 
 
+def test_preset_paper_masks_and_ends_as_the_authors_code_does():
+    learned = {level: preset("babyai", level, "leap", "paper").method_settings
+               for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
+    assert [each.masking for each in learned.values()] == ["each", "each", "all"]
+    assert not any(each.end or each.repeat_state for each in learned.values())
+    assert preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
+    # Elsewhere there is no pose to leave out, and a plan may end.
+    assert preset("stars", "Star3x5", "leap", "paper").method_settings.repeat_state
+
+
 def test_all_levels_are_those_of_the_paper():
     found = config.parse("babyai", ["--level", "all", "--demos", "9"])
     assert [each.level for each in found] == list(BABYAI.levels)
