@@ -1,8 +1,8 @@
 """Masked language models over trajectories (paper, section 3.1): `encode`, then `logits`.
 
-Both models score actions from the same `Context`. Every position of the plan carries the
-current state (paper, equation 4), so the memory is computed once per plan and only action
-tokens change from pass to pass. What a state looks like is the domain's: its encoder, a
+Both models score actions from the same `Context`. No position of the plan carries a later
+state than the current one (paper, equation 4), so the memory is computed once per plan and only
+action tokens change from pass to pass. What a state looks like is the domain's: its encoder, a
 module `context -> tokens`, is a field of the model.
 """
 
