@@ -1,7 +1,8 @@
 """What a trained model knows of demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
 
 How often the action that the model finds most likely is the demonstrator's, at each position of
-the plan, given all actions before it: on demonstrations that it has learned from, and on others
+the plan, given all actions before it, which a model that was trained with `--masking all` has
+never seen: on demonstrations that it has learned from, and on others
 of the same demonstrator. A gap between the two says that the network recognises demonstrations
 where it should understand the level; a fall along the plan says that its end is not to be trusted.
 """
@@ -134,9 +135,7 @@ def accuracy(
     return right, asked
 
 
-def hits(
-    energy: Energy, params: Params, window: Window, end: bool = True
-) -> tuple[jax.Array, jax.Array]:
+def hits(energy: Energy, params: Params, window: Window, end: bool) -> tuple[jax.Array, jax.Array]:
     """Whether each action is the likeliest, given those before it and MASK after it.
 
     After the end action there is nothing to predict but more of it: those do not count.

@@ -32,10 +32,11 @@ from leapjax import files
 from leapjax.batching import compile_planner
 from leapjax.data import seeds, windows
 from leapjax.domain import Domain
+from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import History, stack_contexts
-from leapjax.types import Context, Energy, Params, pad_token
+from leapjax.types import Context, Energy, Params
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
 EXPERIMENT = Experiment("landscape", "babyai")
@@ -118,19 +119,28 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
 def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, float]]:
     """A function that takes the mean energy of demonstrations, corrupted more and more.
 
-    They are of another training seed, each from its beginning.
+    They are of another training seed, each from its beginning, and as long as a plan: to some
+    models the end of an episode is no action.
+
+    Raises:
+        UserError: none is.
     """
     domain, specification = this.domain, this.specification
     data = accuracy.others(domain, specification.origin, count)
+    data = [each for each in data if len(each.actions) >= specification.planner.horizon]
+    if not data:
+        raise UserError(
+            f"--trajectories {count}: none of these demonstrations has as many actions as a plan, "
+            f"{specification.planner.horizon}: give more"
+        )
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
     begins = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
     end, horizon = domain.num_actions - 1, specification.planner.horizon
-    ends = specification.method_settings.end  # or there is PAD after it
 
     def corrupted(key: jax.Array, actions: jax.Array, share: float) -> jax.Array:
         where_key, action_key = jax.random.split(key)
         wrong = jax.random.uniform(where_key, actions.shape) < share
-        # Never the end action, which would be possible in few places and absurd in others.
+        # Never the end action: no demonstration ends here.
         return jnp.where(wrong, jax.random.randint(action_key, actions.shape, 0, end), actions)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -138,9 +148,7 @@ def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, f
         def one(place: jax.Array, begin: jax.Array) -> jax.Array:
             window = windows.window(steps, begin, specification.context, horizon, end)
             actions = corrupted(jax.random.key(place), window.actions, share)
-            beyond = (window.actions == end) & (not ends)
-            memory = energy.encode(params, window.context)
-            return energy_of_actions(energy, params, memory, actions, beyond)
+            return energy.total(params, energy.encode(params, window.context), actions)
 
         return jax.vmap(one)(jnp.arange(len(begins)), begins).mean()
 
@@ -148,22 +156,6 @@ def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, f
         return {f"random_{n}": float(mean(energy, params, n / 100)) for n in CORRUPTED}
 
     return measure
-
-
-def energy_of_actions(
-    energy: Energy, params: Params, memory: Any, actions: jax.Array, beyond: jax.Array
-) -> jax.Array:
-    """The energy `[]` of the actions of a plan `[T]` that are not `beyond [T]` its end.
-
-    There is PAD, as in training: it is seen, and what is not predicted does not count.
-    """
-    tokens = jnp.where(beyond, pad_token(energy.num_actions), actions)
-
-    def term(position: jax.Array) -> jax.Array:
-        return energy.conditional(params, memory, tokens, position[None])[0, actions[position]]
-
-    terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
-    return jnp.where(beyond, 0, terms).sum()
 
 
 def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, list[Any]]:

@@ -43,14 +43,14 @@ def counting_model():
 
 
 def test_actions_are_predicted_from_those_before_and_none_after():
-    right, counts = accuracy.hits(counting_model(), None, window([0, 1, 2, 0, 1]))
+    right, counts = accuracy.hits(counting_model(), None, window([0, 1, 2, 0, 1]), end=True)
     np.testing.assert_array_equal(right, [True, True, True, False, True])
     assert counts.all()
 
 
 @pytest.mark.parametrize("actions", [[0, 1, 2, END, END], [0, 1, 1, END, END]])
 def test_what_comes_after_the_end_does_not_count(actions):
-    right, counts = accuracy.hits(counting_model(), None, window(actions))
+    right, counts = accuracy.hits(counting_model(), None, window(actions), end=True)
     np.testing.assert_array_equal(counts, [True, True, True, True, False])
     # The end is expected after 2 only.
     follows = actions[2] == 2

@@ -1,18 +1,13 @@
 """The programs of the paper's analyses, end to end at toy size, and what they refuse."""
 
-import functools
 import json
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
 from experiments.common import analysis, results
 from experiments.common.analysis import Analysis, Options, Way
 from leapjax.babyai.levels import find_level
-from leapjax.energy import pseudo_likelihood
 from leapjax.planners import GibbsConfig
 
 TOY = {  # nothing is learned: gradients take long to compile
@@ -152,40 +147,22 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
 
     preset = landscape.configs.preset
     monkeypatch.setattr(landscape.configs, "preset", toy)
-    arguments = ["--presets", "leapjax", "--trajectories", "4"]
+    arguments = ["--presets", "leapjax", "--trajectories", "8"]
     assert landscape.main(arguments) == 0
     (found,) = json.loads((place / "runs" / "landscape.json").read_text())
     assert [entry["step"] for entry in found["training"]] == [20, 40]
     last = found["training"][-1]
     assert last["random_0"] > 0 and last["random_100"] > 0
-    assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 4
+    assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
     assert landscape.main([*arguments, "--trajectories", "0"]) == 2
 
 
-@pytest.mark.parametrize("real", [3, 1])
-def test_what_is_beyond_the_end_is_seen_and_does_not_count(real):
-    """One position at a time: what a model says depends on every token around it."""
-    weights = np.random.default_rng(0).normal(size=(3, 6, 4))  # of position, token and action
-    energy = pseudo_likelihood(
-        lambda params, context: None,
-        lambda params, memory, tokens, positions: jnp.asarray(weights)[
-            jnp.arange(3), tokens
-        ].sum(axis=0)[None] * (1.0 + positions[:, None]),
-        4,
-    )  # fmt: skip
-    actions, beyond = np.array([2, 0, 1]), np.arange(3) >= real
-    expected = 0.0
-    for place in range(real):
-        tokens = np.where(beyond, 5, actions)
-        tokens[place] = 4
-        logits = weights[np.arange(3), tokens].sum(axis=0) * (1 + place)
-        expected -= logits[actions[place]] - np.log(np.exp(logits).sum())
-    score = jax.jit(functools.partial(landscape.energy_of_actions, energy, None, None))
-    found = score(actions, beyond)
-    assert float(found) == pytest.approx(expected, rel=1e-5)
-    if real == 3:
-        assert float(energy.total(None, None, actions)) == pytest.approx(expected, rel=1e-5)
+def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):
+    monkeypatch.setattr(landscape.accuracy, "others", lambda *arguments: [])
+    assert landscape.main(["--presets", "leapjax", "--trajectories", "3"]) == 2
+    error = capsys.readouterr().err
+    assert "--trajectories 3: none of these" in error and len(error.strip().splitlines()) == 1
 
 
 def test_planners_of_the_ablation_have_the_papers_budgets():

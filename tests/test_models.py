@@ -23,6 +23,7 @@ from leapjax.models.transformer import causal_mask
 from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
 from tests.enumerable import all_plans, quick_jit
+from tests.parameters import scaled_like
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
 SIDE = 7
@@ -83,20 +84,7 @@ def model(architecture, past):
         random_context(0, past),
         np.zeros(HORIZON, np.int32),
     )
-    return random_parameters(shapes), evaluate
-
-
-def random_parameters(shapes, seed=0):
-    """No zeros and nothing tiny, as initialisation has: what leaks must show."""
-    rng = np.random.default_rng(seed)
-
-    def leaf(path, shape):
-        kind = path[-1].key
-        scale = shape.shape[-2] ** -0.5 if kind == "kernel" else 0.5
-        value = rng.normal(scale=scale, size=shape.shape)
-        return (value + (kind == "scale")).astype(np.float32)
-
-    return jax.tree_util.tree_map_with_path(leaf, shapes)
+    return scaled_like(shapes), evaluate
 
 
 def random_observation(rng, goal=True):
@@ -437,7 +425,7 @@ def test_with_causal_attention_no_action_sees_a_later_one(architecture):
         module = build(config, Sizes(4, 1, HORIZON, 9), encoder)
         apply = functools.partial(module.apply, method=everything)
         init = functools.partial(module.init, method=everything)
-        params = random_parameters(jax.eval_shape(init, jax.random.key(0), context, nothing))
+        params = scaled_like(jax.eval_shape(init, jax.random.key(0), context, nothing))
         scores = quick_jit(functools.partial(apply, params))
         before = scores(context, nothing)
         for changed in range(HORIZON):
@@ -470,7 +458,7 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
         return module.head(module.transformer(x, asked[positions], mask=causal_mask(len(x))))
 
     initialise = functools.partial(module.init, method=scores)
-    params = random_parameters(jax.eval_shape(initialise, jax.random.key(0), actions))
+    params = scaled_like(jax.eval_shape(initialise, jax.random.key(0), actions))
     found = quick_jit(functools.partial(module.apply, method=scores))(params, actions)
     wanted = quick_jit(functools.partial(full.apply, method=over_all))(params, actions)
     assert np.ptp(wanted[0]) > 1e-4
@@ -488,7 +476,7 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     module = build(ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state)
     here = random_context(0, past)
     initialise = functools.partial(module.init, method=everything)
-    params = random_parameters(jax.eval_shape(initialise, jax.random.key(0), here, EVERYWHERE))
+    params = scaled_like(jax.eval_shape(initialise, jax.random.key(0), here, EVERYWHERE))
     params["params"]["position"]["embedding"][:] = 0  # tokens differ by what they show alone
     encode = quick_jit(functools.partial(module.apply, method="encode"))
 

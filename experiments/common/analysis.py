@@ -85,7 +85,7 @@ class Options:
     methods: tuple[str, ...] = ()
     """Methods; none: all that a case has."""
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's appendix. Of what is trained."""
+    """"leapjax": ours; "paper": the paper's. Of what is trained."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds."""
     episodes: int = 200

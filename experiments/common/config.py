@@ -45,7 +45,7 @@ class Config(Generic[M, D, P]):
     method: str = "leap"
     """How to learn and to act: a line of the table in leapjax/methods.py, or "all" of them."""
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's appendix. Sets the defaults of all the rest."""
+    """"leapjax": ours; "paper": the paper's. Sets the defaults of all the rest."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds; each draws its own demonstrations."""
     demos: int = 500

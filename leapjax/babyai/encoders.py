@@ -29,7 +29,9 @@ DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
 BARRIER = 8.0  # steps that one goes round for each nat
-LARGE = nn.initializers.normal(1.0)  # where the authors' embeddings start: PyTorch's default
+# Where embeddings start: as PyTorch's, which are the authors'; and as Flax's.
+LARGE = nn.initializers.normal(1.0)
+SMALL = nn.initializers.variance_scaling(1.0, "fan_in", "normal", out_axis=0)
 _OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
 
 
@@ -72,7 +74,7 @@ class InstructionEncoder(nn.Module):
 
     vocabulary: int
     width: int
-    embedding_init: Initializer = nn.linear.default_embed_init
+    embedding_init: Initializer = SMALL
 
     @nn.compact
     def __call__(self, instruction: jax.Array) -> Instruction:

@@ -68,17 +68,28 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
-    if preset == "paper" and method == "leap":  # the authors' code (docs/experiments.md)
-        alone = {"masking": "all"} if level.name == "PickUpLoc" else {}  # no actions are seen
-        return {"end": False, "repeat_state": False, **alone}
-    if preset == "paper" and method not in ("classifier", "plate", "random"):
-        return {"context": level.states - 1}  # the past ones
+    return _tuned_as_the_authors(level, method) if preset == "paper" else _tuned(level, method)
+
+
+def _tuned_as_the_authors(level: Level, method: str) -> Mapping[str, Any]:
+    """What is in their code where the text has something else (docs/experiments.md)."""
+    if method == "leap":
+        options: dict[str, Any] = {"end": False, "repeat_state": False}
+        if level.name == "PickUpLoc":  # learned from the state alone: one copy of each window
+            options |= {"masking": "all", "microbatch": 0}
+        return options
+    if method in ("classifier", "plate", "random"):
+        return {}
+    return {"context": level.states - 1}  # the past ones
+
+
+def _tuned(level: Level, method: str) -> Mapping[str, Any]:
+    """What validation levels say (docs/tried.md)."""
     options: dict[str, Any] = {}
-    if preset == "leapjax":
-        if level.sequence and method in SAMPLED:  # much to do: noise leads out of dead ends
-            options["temperature"] = 1.0
-        if _is_large(level) and method == "leap":  # 3e-3 is too high here
-            options["learning_rate"] = 1.5e-3
+    if level.sequence and method in SAMPLED:  # much to do: noise leads out of dead ends
+        options["temperature"] = 1.0
+    if _is_large(level) and method == "leap":  # 3e-3 is too high here
+        options["learning_rate"] = 1.5e-3
     return options
 
 

@@ -288,7 +288,7 @@ def build(
     if not repeat_state and not hasattr(encoder, "ahead"):
         raise UserError(
             "--no-repeat-state is for architecture 'paper' on BabyAI: no other encoder says what "
-            "a state looks like of which the agent's pose is not known (--repeat-state)"
+            "a state looks like of which the agent's pose is not known; elsewhere --repeat-state"
         )
     if config.architecture == "paper":
         return PaperModel(config, sizes, encoder, conditioned, repeat_state)
