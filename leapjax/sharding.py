@@ -155,6 +155,17 @@ def quick(mesh: Mesh) -> dict[str, Any] | None:
     return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
+def alone(mesh: Mesh) -> dict[str, Any] | None:
+    """Options for a program on the devices of a mesh: where each is a core, it stays on its own.
+
+    Matrix products that ask other cores for help wait for them; if those wait at an exchange
+    between devices, which needs this one, for ever.
+    """
+    cores = os.cpu_count() or 1
+    on_cores = mesh.devices.flat[0].platform == "cpu" and mesh.size > 1 and mesh.size >= cores
+    return {"xla_cpu_multi_thread_eigen": False} if on_cores else None
+
+
 def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     """Jits `(static, params, *batches) -> batch` so that each device does its own rows."""
 
@@ -165,8 +176,4 @@ def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any
         )  # fmt: skip
         return rows(params, *batches)
 
-    # Where every core is a device, matrix products that ask other cores for help only wait.
-    cores = os.cpu_count() or 1
-    alone = mesh.size > 1 and mesh.devices.flat[0].platform == "cpu" and mesh.size >= cores
-    options = {"xla_cpu_multi_thread_eigen": False} if alone else None
-    return jax.jit(program, static_argnums=0, compiler_options=options)
+    return jax.jit(program, static_argnums=0, compiler_options=alone(mesh))

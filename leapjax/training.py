@@ -71,7 +71,11 @@ def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
         return agent.update(state, batch, key)
 
     whole = None if mesh is None else NamedSharding(mesh, sharding.REPLICATED)
-    return TrainStep(jax.jit(draw, out_shardings=whole), jax.jit(update, donate_argnums=0))
+    options = None if mesh is None else sharding.alone(mesh)
+    return TrainStep(
+        jax.jit(draw, out_shardings=whole),
+        jax.jit(update, donate_argnums=0, compiler_options=options),
+    )
 
 
 def compile_ahead(
