@@ -54,6 +54,13 @@ def test_the_floor_of_every_table(workplace):
     assert (row["method"], row["demos"], row["train_steps"], row["params"]) == ("random", 0, 0, 0)
 
 
+def plans_of(planner, count):
+    """Plans from the first state, each with a key of its own."""
+    history = rollouts.History(np.zeros((), np.int64), planner.specification.context, 5)
+    contexts = rollouts.stack_contexts([history] * count)
+    return planner(leap.plan_keys(0, np.arange(count), np.zeros(count)), contexts)
+
+
 def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
     for name in () if LONG else ("classifier", "bc", "bcq", "mopo", "cql", "qr_dqn", "rem"):
         less = methods.METHODS[name]._replace(everywhere=False)  # the others are no different
@@ -66,10 +73,7 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
     ]
     for method in ("iql", "plate"):  # with a target network, and another planner
         (folder,) = (workplace / "runs").glob(f"*-{method}-*")
-        planner = leap.load(folder)
-        context = rollouts.History(np.zeros((), np.int64), 1, 5).context()
-        contexts = jax.tree.map(lambda leaf: leaf[None], context)
-        plan = planner(leap.plan_keys(0, np.zeros(1), np.zeros(1)), contexts)
+        plan = plans_of(leap.load(folder), 1)
         assert plan.valid.all() and (plan.actions < 5).all()
     # A planner that is trained already is of one method.
     (folder,) = (workplace / "runs").glob("*-dt-*")
@@ -78,14 +82,19 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_the_classifier_trains_and_its_planner_loads(workplace):
+def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
     arguments = [*EVERY, *"--demos 2 --episodes 2 --steps 4 --method classifier".split()]
-    assert experiment.main(LAKE, arguments) == 0
-    (row,) = results.read(workplace / "runs" / "lake.jsonl")
-    assert row["method"] == "classifier" and row["params"] > 0
+    leaps = [*EVERY, *"--demos 2 --episodes 2 --steps 0".split()]
+    assert experiment.main(LAKE, leaps) == experiment.main(LAKE, arguments) == 0
+    before, after = results.read(workplace / "runs" / "lake.jsonl")
+    assert (before["method"], after["method"]) == ("leap", "classifier")
+    assert before["hash"] != after["hash"] and after["params"] > 0
     (folder,) = (workplace / "runs").glob("*-classifier-*")
     assert {"loss", "absolute_error"} < run.read_metrics(folder)[-1].keys()
-    assert leap.load(folder).specification.method == "classifier"
+    planner = leap.load(folder)
+    plan = plans_of(planner, 3)
+    assert plan.actions.shape == (3, planner.specification.planner.horizon)
+    assert plan.actions.max() < 5
 
 
 def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(workplace, capsys):
