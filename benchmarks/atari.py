@@ -95,7 +95,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
     rows: list[Row] = []
     for batch in batches:
         plan = compile_planner(energy, config.planner, (batch,))
-        contexts = random_contexts(domain, config.context, batch)
+        contexts = jax.device_put(random_contexts(domain, config.context, batch))
         keys = jax.random.split(jax.random.key(1), batch)
         begun = time.perf_counter()
         encoded = kept(plan(params, keys, contexts), config.executed)

@@ -94,7 +94,7 @@ def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> 
     compiled: set[int] = set()
     for batch in batches:
         keys = jax.random.split(jax.random.key(1), batch)
-        contexts = random_contexts(domain, level.context, batch)
+        contexts = jax.device_put(random_contexts(domain, level.context, batch))
         begun = time.perf_counter()
         jax.block_until_ready(planner(params, keys, contexts))
         first = time.perf_counter() - begun
@@ -147,7 +147,7 @@ def plan_many(name: str, level: Level, count: int) -> str:
     """Plans for very many contexts at once, and says what it took."""
     energy, params, domain = make_energy(name, level)
     planner = compile_planner(energy, GibbsConfig(level.horizon, level.iterations))
-    contexts = jax.tree.map(np.asarray, random_contexts(domain, level.context, count))
+    contexts = random_contexts(domain, level.context, count)
     keys = plan_keys(0, np.arange(count), np.zeros(count, int))
     begun = time.perf_counter()
     planner(params, keys, contexts)
@@ -162,7 +162,7 @@ def plan_many(name: str, level: Level, count: int) -> str:
 def random_contexts(domain: Domain, length: int, batch: int) -> Any:
     """`[B]` contexts of the right shapes with random grids and poses, and one instruction.
 
-    Or with random frames.
+    Or with random frames. As NumPy arrays.
     """
     blank, rng = blank_context(domain, length), np.random.default_rng(2)
     contexts = jax.tree.map(lambda x: np.repeat(x[None], batch, axis=0), blank)
@@ -171,14 +171,14 @@ def random_contexts(domain: Domain, length: int, batch: int) -> Any:
             rng.integers(0, 256, leaf.shape).astype(np.uint8)
             for leaf in (contexts.observation, contexts.past)
         ]
-        return jax.device_put(contexts._replace(observation=frames[0], past=frames[1]))
+        return contexts._replace(observation=frames[0], past=frames[1])
     pose = rng.integers(1, 4, (batch, 3)).astype(np.int32)
     observation = contexts.observation._replace(
         grid=rng.integers(0, 4, contexts.observation.grid.shape).astype(np.uint8),
         pose=pose, goal=pose[:, 1:],
         instruction=np.ones_like(contexts.observation.instruction),
     )  # fmt: skip
-    return jax.device_put(contexts._replace(observation=observation))
+    return contexts._replace(observation=observation)
 
 
 def table(rows: Sequence[Row]) -> Table:

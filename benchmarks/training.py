@@ -197,8 +197,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
 
 def random_steps(domain: Domain) -> Steps:
     """Demonstrations of the right shapes, of nothing in particular."""
-    contexts = random_contexts(domain, 0, LENGTH + 1)
-    states = jax.tree.map(np.asarray, contexts.observation)
+    states = random_contexts(domain, 0, LENGTH + 1).observation
     choose = np.random.default_rng(0)
     played = [
         Demonstration(

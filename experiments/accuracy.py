@@ -1,10 +1,10 @@
 """What a trained model knows of demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
 
 How often the action that the model finds most likely is the demonstrator's, at each position of
-the plan, given all actions before it, which a model that was trained with `--masking all` has
-never seen: on demonstrations that it has learned from, and on others
+the plan, given all actions before it: on demonstrations that it has learned from, and on others
 of the same demonstrator. A gap between the two says that the network recognises demonstrations
 where it should understand the level; a fall along the plan says that its end is not to be trusted.
+(Not of a model that was trained with `--masking all`: it has seen no actions before others.)
 """
 
 import dataclasses

@@ -158,8 +158,8 @@ def quick(mesh: Mesh) -> dict[str, Any] | None:
 def alone(mesh: Mesh) -> dict[str, Any] | None:
     """Options for a program on the devices of a mesh: where each is a core, it stays on its own.
 
-    Matrix products that ask other cores for help wait for them; if those wait at an exchange
-    between devices, which needs this one, for ever.
+    A matrix product that asks other cores for help only waits for them; and for ever, where they
+    wait for this one at an exchange between devices.
     """
     cores = os.cpu_count() or 1
     on_cores = mesh.devices.flat[0].platform == "cpu" and mesh.size > 1 and mesh.size >= cores

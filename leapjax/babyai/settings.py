@@ -68,11 +68,11 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own preset: options by name."""
     level = find_level(name)
-    return _tuned_as_the_authors(level, method) if preset == "paper" else _tuned(level, method)
+    return _tuned_paper(level, method) if preset == "paper" else _tuned_leapjax(level, method)
 
 
-def _tuned_as_the_authors(level: Level, method: str) -> Mapping[str, Any]:
-    """What is in their code where the text has something else (docs/experiments.md)."""
+def _tuned_paper(level: Level, method: str) -> Mapping[str, Any]:
+    """LEAP is as in the authors' code (docs/experiments.md); contexts are the appendix's."""
     if method == "leap":
         options: dict[str, Any] = {"end": False, "repeat_state": False}
         if level.name == "PickUpLoc":  # learned from the state alone: one copy of each window
@@ -83,7 +83,7 @@ def _tuned_as_the_authors(level: Level, method: str) -> Mapping[str, Any]:
     return {"context": level.states - 1}  # the past ones
 
 
-def _tuned(level: Level, method: str) -> Mapping[str, Any]:
+def _tuned_leapjax(level: Level, method: str) -> Mapping[str, Any]:
     """What validation levels say (docs/tried.md)."""
     options: dict[str, Any] = {}
     if level.sequence and method in SAMPLED:  # much to do: noise leads out of dead ends
