@@ -293,12 +293,33 @@ def _scan_order(key: jax.Array, config: GibbsConfig, later: int) -> jax.Array:
     return jnp.argsort(scores, axis=-1)[:, : config.resampled]
 
 
+def _choices(energy: Energy, params: Params, memory: PyTree, horizon: int) -> jax.Array:
+    """Logits `[T, A]` of a uniform action at every position: 0, and -inf where it cannot be.
+
+    That is where its energy is infinite before anything is chosen, as an end action's is at the
+    first position of a plan: nothing that is chosen later changes that. An energy that accepts no
+    MASK cannot be asked.
+    """
+    if not energy.accepts_mask:
+        return jnp.zeros((horizon, energy.num_actions))
+    blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
+    energies = energy.conditional(params, memory, blank, jnp.arange(horizon))
+    return jnp.where(jnp.isposinf(energies), -jnp.inf, 0.0)
+
+
+def _random_plans(key: jax.Array, choices: jax.Array, count: int) -> jax.Array:
+    """`count` plans `[C, T]` of uniform actions, see `_choices`."""
+    plans = jax.random.categorical(key, choices, shape=(count, choices.shape[0]))
+    return plans.astype(jnp.int32)
+
+
 def random_shooting(
     energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
 ) -> Plan:
-    """The uniform random plan of least energy (paper, appendix, ablation)."""
+    """The random plan of least energy (paper, appendix, ablation), of those that can be."""
     memory = energy.encode(params, context)
-    plans = jax.random.randint(key, (config.candidates, config.horizon), 0, energy.num_actions)
+    choices = _choices(energy, params, memory, config.horizon)
+    plans = _random_plans(key, choices, config.candidates)
     energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
     best = jnp.argmin(energies)
     plan = Plan(
@@ -320,6 +341,7 @@ def cross_entropy_method(
     """
     memory = energy.encode(params, context)
     count, horizon = config.candidates, config.horizon
+    choices = _choices(energy, params, memory, horizon)
 
     def score(plans: jax.Array) -> jax.Array:
         return jax.vmap(lambda a: energy.total(params, memory, a))(plans)
@@ -332,10 +354,11 @@ def cross_entropy_method(
         place_key, action_key = jax.random.split(round_key)
         children = parents[jnp.arange(count) % config.elites]
         where = jax.random.randint(place_key, (count,), 0, horizon)
-        # A shift by 1 .. A-1 always changes the token.
-        shift = jax.random.randint(action_key, (count,), 1, max(energy.num_actions, 2))
         rows = jnp.arange(count)
-        changed = (children[rows, where] + shift) % energy.num_actions
+        # Another action; as the last resort, where there is no other, the same.
+        lowest = jnp.finfo(choices.dtype).min
+        others = choices[where].at[rows, children[rows, where]].set(lowest)
+        changed = jax.random.categorical(action_key, others).astype(jnp.int32)
         children = children.at[rows, where].set(changed)
         if config.keep_elites:
             children = children.at[: config.elites].set(parents)
@@ -343,7 +366,7 @@ def cross_entropy_method(
         return (children, energies), (children[jnp.argmin(energies)], undefined(energies).any())
 
     first_key, loop_key = jax.random.split(key)
-    plans = jax.random.randint(first_key, (count, horizon), 0, energy.num_actions)
+    plans = _random_plans(first_key, choices, count)
     energies = score(plans)
     first, first_invalid = plans[jnp.argmin(energies)], undefined(energies).any()
     keys = jax.random.split(loop_key, config.iterations)[1:]

@@ -554,6 +554,32 @@ def test_a_child_differs_from_its_parent_in_one_token():
     assert fit_p_value(np.bincount(shifts, minlength=ACTIONS), [0, 0.5, 0.5]) > ACCEPTED
 
 
+# What no plan can begin with: as the end action is in a model of plans.
+FORBIDDEN = NO_TILT.copy()
+FORBIDDEN[0, 2] = -np.inf
+
+
+def test_shooting_draws_uniformly_among_plans_that_can_be():
+    plan = plans_of(ENUMERABLE, ShootingConfig(HORIZON, candidates=1), context=FORBIDDEN)
+    can_be = (np.indices(JOINT.shape)[0] != 2) / (2 * ACTIONS ** (HORIZON - 1))
+    assert fit_p_value(plan_counts(plan.actions, ACTIONS), can_be) > ACCEPTED
+
+
+def test_no_child_is_forbidden_and_each_differs_from_its_parent():
+    config = CrossEntropyConfig(HORIZON, 20, candidates=1, elites=1, keep_elites=False)
+    trace = plans_of(ENUMERABLE, config, context=FORBIDDEN, chains=200).trace
+    np.testing.assert_array_equal(np.unique(trace[..., 0]), [0, 1])
+    assert ((trace[:, 1:] != trace[:, :-1]).sum(-1) == 1).all()
+    # Where there is no other action, the same.
+    only = FORBIDDEN.copy()
+    only[0, 0] = -np.inf
+    trace = plans_of(ENUMERABLE, config, context=only, chains=200).trace
+    assert (trace[..., 0] == 1).all()
+    changed = trace[:, 1:] != trace[:, :-1]
+    assert fit_p_value([changed[..., 1].sum(), changed[..., 2].sum()], [0.5, 0.5]) > ACCEPTED
+    assert (changed.sum(-1) == 0).mean() == pytest.approx(1 / HORIZON, abs=0.05)
+
+
 def test_cross_entropy_solves_an_additive_energy():
     config = CrossEntropyConfig(HORIZON, 20, candidates=8, elites=2)
     tilt = np.random.default_rng(6).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
