@@ -50,7 +50,9 @@ class Options:
     run: int = 16
     """Windows in a row whose states preset `paper` encodes once; beside windows drawn alone."""
     json: Path | None = None
-    """Write the rows here."""
+    """Write the rows of playing here."""
+    training_json: Path | None = None
+    """Write the rows of training here."""
     seconds: float = 3.0
     """Time to spend on each measurement, at least."""
 
@@ -76,13 +78,13 @@ def run(options: Options) -> None:
         row for config in configs for row in measure(config, options.batches, options.seconds)
     ]
     console.print(table(playing))
-    trained = []
+    write_rows(options.json, playing)
     if options.training:
         papers = [config for config in configs if config.model.architecture == "paper"]
         in_runs = [with_options(config, {"run": options.run}) for config in papers]
         trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
         console.print(training.table(trained))
-    write_rows(options.json, [*playing, *trained])
+        write_rows(options.training_json, trained)
 
 
 def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[Row]:

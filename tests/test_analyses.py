@@ -7,6 +7,7 @@ import pytest
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
 from experiments.common import analysis, results
 from experiments.common.analysis import Analysis, Options, Way
+from experiments.tables import analyses
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
 
@@ -134,7 +135,7 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "hash": analysis.row_name(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
-    table = report.analysed(of, [row, stale])
+    table = analyses.analysed(of, [row, stale])
     (line,) = (line for line in table.splitlines() if "Gibbs" in line)
     assert "62.5%" in line and "50.0%" in line and "**75.0%" in line and "2.00" in line
     assert report.is_used(row) and not report.is_used(stale)

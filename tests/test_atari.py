@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import atari, atari_energy, report
+from experiments import atari, atari_energy
+from experiments.common.config import configuration_hash, preset
+from experiments.tables.atari import played
 from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
 from leapjax.atari.emulator import Emulator
@@ -366,9 +368,9 @@ def test_the_table_has_normalised_scores():
         "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
         "mean_return": 30.5, "return_error": 2.88,
     }  # fmt: skip
-    names = report._names("atari", "Breakout", "bc", "leapjax", (), 0)
-    rows = [{**row, "method": "bc", "preset": "leapjax", "hash": names[0]}]
-    table = report.atari(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
+    name = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 0)
+    rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
+    table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | our score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table

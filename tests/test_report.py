@@ -6,8 +6,8 @@ from pathlib import Path
 from experiments import report
 from experiments.common import plots
 from experiments.common.config import configuration_hash, preset, with_options
-
-EARLIER = report.EARLIER
+from experiments.tables import babyai, puzzles
+from leapjax.babyai.levels import LEVELS
 
 
 def row(
@@ -40,18 +40,10 @@ def cells(table, level):
 
 
 def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_again():
-    found = cells(report.success(ROWS), "S8N7")
+    found = cells(babyai.success(ROWS), "S8N7")
     assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
     assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
     assert found[5] == "-"
-
-
-def test_fresh_levels_go_before_those_of_development():
-    earlier = [row(seed=seed, rate=0.5, **EARLIER) for seed in (0, 1, 2)]
-    cell = cells(report.success(earlier), "S8N7")[4]
-    assert cell.startswith("50.0% [") and cell.endswith(", 3 seeds \\*")
-    cell = cells(report.success([*earlier, row()]), "S8N7")[4]
-    assert cell.startswith("90.0% [") and cell.endswith(", 1 seed")
 
 
 def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
@@ -60,7 +52,7 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
         row(method="bc", name="paper", rate=0.2), row("PickUpLoc"),
         row(method="dt", steps=1, rate=1.0),  # not the preset's
     ]  # fmt: skip
-    lines = report.methods(rows).splitlines()[2:]
+    lines = babyai.methods(rows).splitlines()[2:]
     found = {line[2]: line[3:] for line in ([c.strip() for c in x.split("|")] for x in lines)}
     assert list(found) == ["the paper", "preset paper", "preset leapjax"]  # of one level
     assert found["the paper"][:-1] == [
@@ -70,20 +62,20 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert found["preset leapjax"][7].startswith("90.0% [")
     assert found["preset paper"][1].startswith("**20.0% [")
     assert found["preset leapjax"][2:7] == ["-"] * 5
-    names, found = report.COMPARED, report.success_by_method(rows)
+    names, found = babyai.COMPARED, babyai.success_by_method(rows)
     plots.methods_by_level(found, names, tmp_path / "methods.png")
     plots.methods_by_level({}, names, tmp_path / "empty.png")
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
 
 
 def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
-    everywhere = [row(level, method="bc", rate=0.5) for level in report.LEVELS]
-    found = report.aggregates([*everywhere, row("PickUpLoc")])
+    everywhere = [row(level, method="bc", rate=0.5) for level in LEVELS]
+    found = babyai.aggregates([*everywhere, row("PickUpLoc")])
     assert list(found) == ["LEAP, the paper's numbers", "bc, leapjax"]
     middle, low, high = found["bc, leapjax"]
     assert middle == 50.0 and 40 < low < 50 < high < 60
-    ours = [row(level, rate=0.9) for level in report.LEVELS]
-    (line,) = (x for x in report.success(ours).splitlines() if "interquartile" in x)
+    ours = [row(level, rate=0.9) for level in LEVELS]
+    (line,) = (x for x in babyai.success(ours).splitlines() if "interquartile" in x)
     assert "| 63.6% | - | - | 90.0% [" in line
     plots.intervals(found, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
@@ -93,15 +85,15 @@ def test_what_acting_costs():
     # 500 episodes of 6 steps, a plan for each, 100 plans per second.
     rows = [row(method="bc", rate=1.0) | {"plans": 3000, "plans_per_second": 100}]
     rows += [row() | {"plans": 1000, "plans_per_second": 100}]
-    assert report.acting(rows).splitlines()[2:] == [
+    assert babyai.acting(rows).splitlines()[2:] == [
         "| GoToLocalS8N7 | 6.0 | - | - | - | - | - | 6.0 (2.0) |"
     ]
-    assert report.price(rows).splitlines()[2:] == [
+    assert babyai.price(rows).splitlines()[2:] == [
         "| GoToLocalS8N7 | 10.00 | - | - | - | - | - | 3.33 |"
     ]
     rows = [row("PickUpLoc", method="bc") | {"plans": 3000, "plans_per_second": 100}]
-    assert report.acting(rows).endswith("\n| PickUpLoc | 6.0 | - | - | - | - | - | - |")
-    assert report.price(rows).splitlines()[2:] == []  # something else was running
+    assert babyai.acting(rows).endswith("\n| PickUpLoc | 6.0 | - | - | - | - | - | - |")
+    assert babyai.price(rows).splitlines()[2:] == []  # something else was running
 
 
 def test_settings_are_kept_apart():
@@ -115,9 +107,9 @@ def test_settings_are_kept_apart():
         row(fields=0, rate=0),
         row(played=True, iterations=1, rate=0),
     ]
-    found = cells(report.success([*ROWS, *others]), "S8N7")
+    found = cells(babyai.success([*ROWS, *others]), "S8N7")
     assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
-    found = cells(report.steps([*ROWS, others[4]]), "S8N7")
+    found = cells(babyai.steps([*ROWS, others[4]]), "S8N7")
     assert found[1:] == ["-", "-", "6.0", "4.0"]
 
 
@@ -130,11 +122,11 @@ def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path
         row(name="paper", rate=1.0),  # N = 10
         row("PickUpLoc"),  # of one N alone there is nothing to see
     ]
-    found = report.success_by_iterations(rows)
+    found = babyai.success_by_iterations(rows)
     assert list(found) == ["GoToLocalS8N7"]
     counts = {title: list(by_count) for title, by_count in found["GoToLocalS8N7"].items()}
     assert counts == {"preset `paper`": [1, 2, 5, 10], "preset `leapjax`": [1, 5, 10]}
-    lines = [line.strip("| ").split("|") for line in report.iterations(rows).splitlines()[2:]]
+    lines = [line.strip("| ").split("|") for line in babyai.iterations(rows).splitlines()[2:]]
     rates = [[cell.strip() for cell in line] for line in lines]
     assert rates[0][2:6] == ["10.0%", "20.0%", "50.0%", "100.0%"]
     assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
@@ -166,7 +158,7 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     ]  # fmt: skip
     assert [report.is_used(row) for row in rows] == [True] * 7 + [False]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in
-             report.searches(rows).splitlines()]  # fmt: skip
+             puzzles.searches(rows).splitlines()]  # fmt: skip
     assert lines[0] == [
         "planner", "passes", "Star3x5, learned", "Sudoku4x6, rules", "Sudoku4x6, learned and rules",
     ]  # fmt: skip
@@ -176,11 +168,11 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     assert found["`--method bc`", "T"] == ["40.0%", "-", "-"]
     assert found["all at once", "1"] == ["-", "60.0%", "-"]
     assert found["most certain first, best of 16", "16 T"] == ["-"] * 3
-    header, _, line = report.arms(rows).splitlines()
+    header, _, line = puzzles.arms(rows).splitlines()
     assert header == "| planner, passes | 2 arms | 3 arms | 5 arms | 7 arms | 9 arms |"
     told = [cell.strip().split(" ")[0] for cell in line.split("|")[2:-1]]
     assert told == ["-", "95.0%", "-", "-", "20.0%"]
-    by_passes = report.success_by_passes(rows)
+    by_passes = puzzles.success_by_passes(rows)
     assert list(by_passes) == ["Star3x5, learned"]
     assert by_passes["Star3x5, learned"] == {
         "most certain first": {5: {"successes": 190, "episodes": 200}},

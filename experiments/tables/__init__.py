@@ -1,0 +1,1 @@
+"""What the documents' tables hold, made from rows; `experiments.report` puts them there."""

@@ -1,0 +1,73 @@
+"""The tables of the analyses: every way to plan of every case."""
+
+from collections.abc import Sequence
+
+from experiments import ablation, properties, stochastic, suboptimal
+from experiments.common import analysis
+from experiments.common.analysis import Analysis
+from experiments.common.results import Row
+from experiments.tables.cells import mean_length, mean_rate, milliseconds, rate, table
+
+ANALYSES = {
+    program.ANALYSIS.name: program.ANALYSIS
+    for program in (properties, stochastic, suboptimal, ablation)
+}
+
+
+def uses(row: Row) -> bool:
+    """Whether a row is in a table."""
+    of = ANALYSES[row["experiment"]]
+    return any(
+        analysis.rows_of_way(of, [row], case, way, row["preset"])
+        for case in of.cases
+        for way in case.ways
+    )
+
+
+def analysed(of: Analysis, rows: Sequence[Row]) -> str:
+    """Every way to plan of every case, beside the paper's number; the best of a case in bold."""
+    watched = any(row["violations"] is not None for row in rows)
+    lines = []
+    for case in of.cases:
+        found = [
+            (way, preset, mine)
+            for way in case.ways
+            for preset in ("paper", "leapjax")
+            if (mine := analysis.rows_of_way(of, rows, case, way, preset))
+        ]
+        best = max((mean_rate(mine) for _, _, mine in found), default=None)
+        for way, preset, mine in found:
+            success = f"**{rate(mine)}**" if mean_rate(mine) == best else rate(mine)
+            first = [row["first_pass_successes"] for row in mine]
+            episodes = sum(row["episodes"] for row in mine)
+            cells = [
+                case.name,
+                way.name if way.name.startswith(way.method) else f"{way.method}: {way.name}",
+                f"`{preset}`",
+                "-" if way.paper is None else f"{way.paper:.1f}%",
+                "-" if None in first else f"{100 * sum(first) / episodes:.1f}%",
+                success,
+                mean_length(mine),
+            ]
+            if of.timed:
+                cells.append(f"{milliseconds(mine):.2f}")
+            if watched:
+                counts = [row["violations"] for row in mine]
+                cells.append("-" if None in counts else f"{sum(counts) / episodes:.2f}")
+            lines.append(cells)
+    header = "case | planner | preset | paper | N = 1 | success | steps"
+    header += " | ms per plan" if of.timed else ""
+    return table(f"{header} | violations" if watched else header, lines)
+
+
+def landscape(found: Sequence[Row]) -> str:
+    """Energies of good and bad plans at the end of training, and of plans being refined."""
+    shares = [name for each in found[:1] for name in each["training"][-1] if name != "step"]
+    lines = []
+    for each in found:
+        last, planned = each["training"][-1], each["planning"]["mean"]
+        energies = [f"{last[share]:.2f}" for share in shares]
+        passes = [f"{planned[0]:.2f}", f"{planned[-1]:.2f}"]
+        lines.append([each["level"], f"`{each['preset']}`", *energies, *passes])
+    titles = [f"{share.removeprefix('random_')}% random" for share in shares]
+    return table(" | ".join(["level", "preset", *titles, "plans, N = 1", "last"]), lines)

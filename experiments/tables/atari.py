@@ -1,0 +1,119 @@
+"""The Atari tables: scores, the data, energies against rewards, the price of a decision."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.common.results import Row
+from experiments.tables.cells import table
+from experiments.tables.settings import Setting
+from leapjax import scores
+from leapjax.atari.games import GAMES
+
+COLUMNS = {
+    "LEAP": Setting("LEAP", "leapjax"),
+    "LEAP without return": Setting("LEAP", "leapjax", options={"returns": False}),
+    "BC": Setting("BC", "leapjax", "bc"),
+    "DT": Setting("DT", "leapjax", "dt"),
+    "CQL": Setting("CQL", "leapjax", "cql"),
+    "QR-DQN": Setting("QR-DQN", "leapjax", "qr_dqn"),
+    "REM": Setting("REM", "leapjax", "rem"),
+    "random": Setting("random", "leapjax", "random"),
+}
+
+
+def uses(row: Row) -> bool:
+    """Whether a row is in a table."""
+    return any(setting.has(row) for setting in COLUMNS.values())
+
+
+def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
+    """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
+
+    With the standard error, over seeds where there are several and over games where there is one;
+    and the mean score of the games that were learned from.
+    """
+    columns = [*COLUMNS, "the data"]
+    lines = []
+    for name, game in GAMES.items():
+        of = {
+            title: [row for row in rows if row["level"] == name and setting.has(row)]
+            for title, setting in COLUMNS.items()
+        }
+        theirs = {"LEAP without return": game.paper_without_return} | {
+            title: game.paper[setting.method]
+            for title, setting in COLUMNS.items()
+            if setting.method in game.paper and not setting.options
+        }
+        scale = game.human - game.random
+        cells = {title: _mean_score(found) for title, found in of.items() if found}
+        normal = {
+            title: f"{game.normalised(mean):.1f} ± {100 * error / scale:.1f}"
+            for title, (mean, error) in cells.items()
+        }
+        raw = {title: f"{mean:.1f} ± {error:.1f}" for title, (mean, error) in cells.items()}
+        papers = {title: f"{score:.1f}" for title, score in theirs.items()}
+        if cells and name in data:
+            reached = float(np.mean([each["score"] for each in data[name]]))
+            normal |= {"the data": f"{game.normalised(reached):.1f}"}
+            raw |= {"the data": f"{reached:.1f}"}
+        for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
+            if by_title:
+                lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
+    return table("game | | " + " | ".join(columns), lines)
+
+
+def _mean_score(rows: Sequence[Row]) -> tuple[float, float]:
+    """The mean score of rows, one for each seed, and its standard error."""
+    means = np.array([row["mean_return"] for row in rows])
+    error = scores.standard_error(means) if len(rows) > 1 else rows[0]["return_error"]
+    return float(means.mean()), error or 0.0
+
+
+def data(found: Mapping[str, Any]) -> str:
+    """What the demonstrators reached, whose games are learned from."""
+    lines = []
+    for name in GAMES:
+        games = found.get(name, [])
+        if not games:
+            continue
+        reached = np.array([game["score"] for game in games])
+        by_noise = {
+            noise: np.mean([game["score"] for game in games if game["noise"] == noise])
+            for noise in sorted({game["noise"] for game in games})
+        }
+        lines.append(
+            [
+                name,
+                str(len(games)),
+                str(sum(game["transitions"] for game in games)),
+                f"{reached.mean():.1f}",
+                f"{reached.min():g} .. {reached.max():g}",
+                ", ".join(f"{mean:.1f} ({noise:.0%})" for noise, mean in by_noise.items()),
+            ]
+        )
+    return table("game | games | transitions | mean score | range | by random actions", lines)
+
+
+def energy(found: Mapping[str, Any]) -> str:
+    """How energies of trajectories and their rewards are correlated."""
+    lines = [
+        [name, str(len(of["energies"])), f"{of['correlation']:.2f}", f"{of['p_value']:.1g}"]
+        for name in GAMES
+        if (of := found.get(name))
+    ]
+    return table("game | trajectories | rank correlation of energy and reward | p", lines)
+
+
+def decisions(rows: Sequence[Row]) -> str:
+    """What decisions are made of in games that are played together, in milliseconds."""
+    lines = []
+    for row in rows:
+        parts = ("planning", "encoding", "anew", "playing")
+        spent = [row[f"{part}_seconds"] for part in parts]
+        rate = row["batch"] / (row["planning_seconds"] + row["playing_seconds"])
+        cells = [f"{1e3 * seconds:.1f}" for seconds in spent]
+        lines.append([f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}"])
+    header = "preset | games | planner | of it encoder | past encoded anew | emulator | decisions/s"
+    return table(header, lines)

@@ -1,0 +1,216 @@
+"""The BabyAI tables: every setting of LEAP, and every method."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from experiments.common.results import Row
+from experiments.tables.cells import mean_length, mean_rate, rate, table
+from experiments.tables.settings import Setting, of_setting
+from leapjax import scores
+from leapjax.babyai.levels import LEVELS, paper_success
+
+OURS = Setting("preset `leapjax`", "leapjax")
+PAPER = Setting("preset `paper`", "paper")
+SETTINGS = (
+    Setting("random", "leapjax", "random"),
+    PAPER,
+    OURS,
+    # Chosen on validation levels: docs/tried.md.
+    Setting("`leapjax`, `--executed 3`", "leapjax", options={"executed": 3}),
+)
+TITLES = " | ".join(setting.title for setting in SETTINGS)
+WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fields": 0})
+# The methods of the paper's table, beside the floor, with both presets.
+COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
+BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
+BY_METHOD = {
+    preset: {method: Setting(method, preset, method) for method in COMPARED}
+    for preset in ("paper", "leapjax")
+}
+ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
+ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
+TIMED = ("GoToLocalS8N7", "GoToObjMazeS4R2Close")  # levels played with nothing else running
+
+
+def uses(row: Row) -> bool:
+    """Whether a row is in a table."""
+    if row["level"] not in LEVELS:
+        return False
+    settings = (*SETTINGS, *(s for each in BY_METHOD.values() for s in each.values()))
+    return any(setting.has(row) for setting in settings) or any(
+        setting.has(row, iterations=n) for setting in ITERATED for n in ITERATIONS
+    )
+
+
+def success(rows: Sequence[Row]) -> str:
+    """Success rates per level: the paper's, and those of every setting; their middle.
+
+    A cell is the mean over seeds, its 95% interval, and the number of seeds.
+    """
+    papers = [paper_success(level)["leap"] for level in LEVELS]
+    lines = [
+        [level, f"{paper:.1f}%", *cells]
+        for level, paper, cells in zip(LEVELS, papers, _by_setting(rows, rate), strict=True)
+    ]
+    paper = scores.interquartile_mean(np.array(papers))
+    found = [middle(rows, setting) for setting in SETTINGS]
+    cells = [
+        "-" if each is None else f"{each[0]:.1f}% [{each[1]:.1f}, {each[2]:.1f}]" for each in found
+    ]
+    lines.append(["interquartile mean", f"{paper:.1f}%", *cells])
+    return table(f"level | paper | {TITLES}", lines)
+
+
+def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+    """The interquartile means of the paper's LEAP, and of what has rows on every level."""
+    paper = float(
+        scores.interquartile_mean(np.array([paper_success(level)["leap"] for level in LEVELS]))
+    )
+    methods = [
+        dataclasses.replace(setting, title=f"{method}, {preset}")
+        for preset, by_method in BY_METHOD.items()
+        for method, setting in by_method.items()
+        if method not in ("random", "leap")
+    ]
+    found = {setting.title: middle(rows, setting) for setting in (*SETTINGS, *methods)}
+    known = {title: each for title, each in found.items() if each is not None}
+    return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
+
+
+def middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
+    """The interquartile mean of a setting over all levels, and its interval, in percent."""
+    levels = [
+        of_setting([row for row in rows if row["level"] == level], setting) for level in LEVELS
+    ]
+    if not all(levels):
+        return None
+    counts = [([r["successes"] for r in of], [r["episodes"] for r in of]) for of in levels]
+    mean, (low, high) = scores.aggregate(counts)
+    return 100 * mean, 100 * low, 100 * high
+
+
+def steps(rows: Sequence[Row]) -> str:
+    """Steps per episode, failed episodes included, of every setting."""
+    found = zip(LEVELS, _by_setting(rows, mean_length), strict=True)
+    return table(f"level | {TITLES}", [[level, *cells] for level, cells in found])
+
+
+def _by_setting(rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> list[list[str]]:
+    """For each level what `cell` makes of its rows, setting by setting."""
+    by_level = {level: [row for row in rows if row["level"] == level] for level in LEVELS}
+    return [
+        [cell(of_setting(by_level[level], setting)) for setting in SETTINGS] for level in LEVELS
+    ]
+
+
+def iterations(rows: Sequence[Row]) -> str:
+    """Success rates against the number of iterations, of training seed 0."""
+
+    def cell(row: Row | None) -> str:
+        return f"{100 * row['successes'] / row['episodes']:.1f}%" if row else ""
+
+    lines = [
+        [level, title, *(cell(by_count.get(n)) for n in ITERATIONS)]
+        for level, by_title in success_by_iterations(rows).items()
+        for title, by_count in by_title.items()
+    ]
+    return table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
+
+
+def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+    """Rows of training seed 0 by level, title of the setting, and N."""
+    found: dict[str, dict[str, dict[int, Row]]] = {}
+    for level in LEVELS:
+        mine = [row for row in rows if row["level"] == level and row["seed"] == 0]
+        for setting in ITERATED:
+            counts = {n: of_setting(mine, setting, iterations=n) for n in ITERATIONS}
+            by_count = {n: played[0] for n, played in counts.items() if played}
+            if len(by_count) > 1:  # one alone says nothing of iterating
+                found.setdefault(level, {})[setting.title] = by_count
+    return found
+
+
+def methods(rows: Sequence[Row]) -> str:
+    """Success rates of every method: the paper's, and those of both presets; the best in bold."""
+    lines = []
+    for level, by_preset in rows_by_method(rows).items():
+        theirs = paper_success(level)
+        cells = {name: f"{rate:.1f}%" for name, rate in theirs.items()}
+        lines.append([level, "the paper", *_compared(theirs, cells)])
+        for preset, by_method in by_preset.items():
+            ours = {name: mean_rate(of) for name, of in by_method.items() if of}
+            cells = {name: rate(by_method[name]) for name in ours}
+            lines.append([level, f"preset {preset}", *_compared(ours, cells)])
+    return table("level | | " + " | ".join(COMPARED), lines)
+
+
+def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
+    """The cell of every method, those of the best rate in bold."""
+    best = max(rates.values(), default=None)
+    bold = {name: f"**{cell}**" for name, cell in cells.items() if rates[name] == best}
+    return [{**cells, **bold}.get(name, "-") for name in COMPARED]
+
+
+def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
+    """Rows by level, preset and method, of levels where there are some of a baseline."""
+    found = {}
+    for level in LEVELS:
+        mine = [row for row in rows if row["level"] == level]
+        by_preset = {
+            preset: {method: of_setting(mine, setting) for method, setting in settings.items()}
+            for preset, settings in BY_METHOD.items()
+        }
+        if any(by_method[name] for by_method in by_preset.values() for name in BASELINES):
+            found[level] = by_preset
+    return found
+
+
+def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Success in percent by level, whose numbers they are, and method."""
+    return {
+        level: {
+            "the paper": paper_success(level),
+            **{
+                f"preset {preset}": {name: mean_rate(of) for name, of in by_method.items() if of}
+                for preset, by_method in by_preset.items()
+            },
+        }
+        for level, by_preset in rows_by_method(rows).items()
+    }
+
+
+def acting(rows: Sequence[Row]) -> str:
+    """Steps of an episode, and plans where they are fewer, with preset `leapjax`, seed 0."""
+
+    def cell(row: Row) -> str:
+        steps, plans = row["mean_length"], row["plans"] / row["episodes"]
+        return f"{steps:.1f}" if round(steps - plans, 1) == 0 else f"{steps:.1f} ({plans:.1f})"
+
+    return _by_acting_method(rows, cell)
+
+
+def price(rows: Sequence[Row]) -> str:
+    """Milliseconds of planning for each action, with preset `leapjax`, seed 0."""
+
+    def cell(row: Row) -> str:
+        planning = row["plans"] / row["plans_per_second"]
+        return f"{1e3 * planning / (row['mean_length'] * row['episodes']):.2f}"
+
+    return _by_acting_method([row for row in rows if row["level"] in TIMED], cell)
+
+
+def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
+    """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
+    methods = [name for name in COMPARED if name != "random"]
+    lines = []
+    for level, by_preset in rows_by_method(rows).items():
+        first = {
+            name: cell(row)
+            for name, every in by_preset["leapjax"].items()
+            for row in every
+            if row["seed"] == 0
+        }
+        lines.append([level, *(first.get(name, "-") for name in methods)])
+    return table("level | " + " | ".join(methods), lines)

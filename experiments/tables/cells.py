@@ -1,0 +1,44 @@
+"""What tables are made of: rates with their intervals, means, Markdown."""
+
+from collections.abc import Sequence
+
+from experiments.common.results import Row
+from leapjax import scores
+
+
+def rate(rows: Sequence[Row]) -> str:
+    """Mean success of some rows, one for each seed, with its interval and how many there are."""
+    if not rows:
+        return "-"
+    successes = [row["successes"] for row in rows]
+    episodes = [row["episodes"] for row in rows]
+    low, high = scores.interval_over_seeds(successes, episodes)
+    said = f"{mean_rate(rows):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+    if rows[0]["method"] == "rules":  # nothing was trained
+        return said
+    return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
+
+
+def mean_rate(rows: Sequence[Row]) -> float:
+    """Mean success of some rows, in percent."""
+    return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
+
+
+def mean_length(rows: Sequence[Row]) -> str:
+    """Mean length of the episodes of some rows."""
+    episodes = sum(row["episodes"] for row in rows)
+    total = sum(row["mean_length"] * row["episodes"] for row in rows)
+    return f"{total / episodes:.1f}" if rows else "-"
+
+
+def milliseconds(rows: Sequence[Row]) -> float:
+    """What a plan costs, hundreds at once."""
+    plans = sum(row["plans"] for row in rows)
+    return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
+
+
+def table(header: str, lines: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; the titles of its columns are separated by bars."""
+    columns = header.count("|") + 1
+    rows = [f"| {header} |", "| " + " | ".join(["---"] * columns) + " |"]
+    return "\n".join([*rows, *(f"| {' | '.join(cells)} |" for cells in lines)])
