@@ -30,7 +30,7 @@ BY_METHOD = {
     for preset in ("paper", "leapjax")
 }
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
-ITERATIONS = (1, 2, 5, 10, 15, 30, 50)  # T and the paper's N of every level, and fewer
+ITERATIONS = (1, 2, 5, 10, 15, 30)  # T and N of every level, and fewer
 TIMED = ("GoToLocalS8N7", "GoToObjMazeS4R2Close")  # levels played with nothing else running
 
 
