@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from experiments.common.results import Row
-from experiments.tables.cells import mean_length, mean_rate, rate, table
+from experiments.tables.cells import mean_length, mean_rate, rate, table, with_interval
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
 from leapjax.babyai.levels import LEVELS, paper_success
@@ -54,29 +54,30 @@ def success(rows: Sequence[Row]) -> str:
         [level, f"{paper:.1f}%", *cells]
         for level, paper, cells in zip(LEVELS, papers, _by_setting(rows, rate), strict=True)
     ]
-    paper = scores.interquartile_mean(np.array(papers))
     found = [middle(rows, setting) for setting in SETTINGS]
-    cells = [
-        "-" if each is None else f"{each[0]:.1f}% [{each[1]:.1f}, {each[2]:.1f}]" for each in found
-    ]
-    lines.append(["interquartile mean", f"{paper:.1f}%", *cells])
+    cells = ["-" if each is None else with_interval(*each) for each in found]
+    lines.append(["interquartile mean", f"{middle_of_paper():.1f}%", *cells])
     return table(f"level | paper | {TITLES}", lines)
 
 
 def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     """The interquartile means of the paper's LEAP, and of what has rows on every level."""
-    paper = float(
-        scores.interquartile_mean(np.array([paper_success(level)["leap"] for level in LEVELS]))
-    )
+    paper = middle_of_paper()
     methods = [
-        dataclasses.replace(setting, title=f"{method}, {preset}")
+        dataclasses.replace(by_method[method], title=f"{method}, {preset}")
         for preset, by_method in BY_METHOD.items()
-        for method, setting in by_method.items()
-        if method not in ("random", "leap")
+        for method in BASELINES
     ]
     found = {setting.title: middle(rows, setting) for setting in (*SETTINGS, *methods)}
     known = {title: each for title, each in found.items() if each is not None}
     return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
+
+
+def middle_of_paper() -> float:
+    """The interquartile mean of the paper's LEAP, in percent."""
+    return float(
+        scores.interquartile_mean(np.array([paper_success(level)["leap"] for level in LEVELS]))
+    )
 
 
 def middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
@@ -109,7 +110,7 @@ def iterations(rows: Sequence[Row]) -> str:
     """Success rates against the number of iterations, of training seed 0."""
 
     def cell(row: Row | None) -> str:
-        return f"{100 * row['successes'] / row['episodes']:.1f}%" if row else ""
+        return f"{mean_rate([row]):.1f}%" if row else ""
 
     lines = [
         [level, title, *(cell(by_count.get(n)) for n in ITERATIONS)]
@@ -137,7 +138,7 @@ def methods(rows: Sequence[Row]) -> str:
     lines = []
     for level, by_preset in rows_by_method(rows).items():
         theirs = paper_success(level)
-        cells = {name: f"{rate:.1f}%" for name, rate in theirs.items()}
+        cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
         lines.append([level, "the paper", *_compared(theirs, cells)])
         for preset, by_method in by_preset.items():
             ours = {name: mean_rate(of) for name, of in by_method.items() if of}

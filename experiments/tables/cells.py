@@ -13,10 +13,15 @@ def rate(rows: Sequence[Row]) -> str:
     successes = [row["successes"] for row in rows]
     episodes = [row["episodes"] for row in rows]
     low, high = scores.interval_over_seeds(successes, episodes)
-    said = f"{mean_rate(rows):.1f}% [{100 * low:.1f}, {100 * high:.1f}]"
+    said = with_interval(mean_rate(rows), 100 * low, 100 * high)
     if rows[0]["method"] == "rules":  # nothing was trained
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
+
+
+def with_interval(mean: float, low: float, high: float) -> str:
+    """A mean and its interval, in percent."""
+    return f"{mean:.1f}% [{low:.1f}, {high:.1f}]"
 
 
 def mean_rate(rows: Sequence[Row]) -> float:
