@@ -2,6 +2,7 @@
 
 import heapq
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -162,3 +163,16 @@ def test_cells_attend_to_the_words_that_are_given():
     alone = attend(params, cells[1:2, 2:3], encoded)
     np.testing.assert_allclose(alone[0, 0], said[1, 2], atol=1e-6)
     assert np.unique(np.asarray(said).reshape(12, -1).round(4), axis=0).shape[0] == 12
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (5, 7, 2)])
+def test_halving_is_max_pooling(shape):
+    """Its gradient too, where the largest is one cell."""
+    image = jax.random.normal(jax.random.key(0), shape)
+
+    def loss(pool):
+        return jax.value_and_grad(lambda x: (pool(x) ** 2).sum())(image)
+
+    usual = loss(lambda x: nn.max_pool(x, (2, 2), (2, 2)))
+    for ours, theirs in zip(loss(encoders.halved), usual, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.errors import UserError, check_at_least
+from leapjax.models.dropout import Dropout
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
 
@@ -112,7 +113,7 @@ class PaperModel(nn.Module):
         if self.conditioned:
             self.goal = dense(c.width, scale=1.0)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = nn.Dropout(c.dropout)
+        self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def see(self, context: Context) -> jax.Array:
@@ -200,7 +201,7 @@ class LeapModel(nn.Module):
             self.goal = dense(c.width, scale=1.0)
         self.position = embed(sizes.horizon, c.width)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = nn.Dropout(c.dropout)
+        self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode(

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
+from leapjax.models.dropout import Dropout
 from leapjax.models.linear import linear
 
 WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
@@ -81,7 +82,7 @@ class Block(nn.Module):
         self.norm_perceptron = nn.LayerNorm(dtype=self.dtype)
         self.expand = dense(4 * self.width, dtype=self.dtype)
         self.contract = dense(self.width, dtype=self.dtype)
-        self.drop = nn.Dropout(self.dropout)
+        self.drop = Dropout(self.dropout)
 
     def keys_values(self, x: jax.Array) -> KeysValues:
         """What others attend to in tokens `[tokens, D]`."""
