@@ -176,3 +176,31 @@ def test_halving_is_max_pooling(shape):
     usual = loss(lambda x: nn.max_pool(x, (2, 2), (2, 2)))
     for ours, theirs in zip(loss(encoders.halved), usual, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 16), (3, 5, 24), (1, 1, 8)])
+def test_groups_are_normalised_as_by_flax(shape):
+    """Its gradients too, by the image, the scale and the bias."""
+    keys = jax.random.split(jax.random.key(0), 4)
+    image = 3 * jax.random.normal(keys[0], shape) + 2
+    weights = jax.random.normal(keys[1], shape)
+    params = {"params": {"scale": jax.random.normal(keys[2], shape[2:]), "bias": weights[0, 0]}}
+
+    def loss(module):
+        def of(params, image):
+            normalised = module.apply(params, image)
+            return (normalised * weights).sum(), normalised
+
+        return jax.value_and_grad(of, argnums=(0, 1), has_aux=True)(params, image)
+
+    ours, usual = loss(encoders.GroupNorm()), loss(nn.GroupNorm(encoders.NORM_GROUPS))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, usual)
+
+
+def test_normalisation_has_the_parameters_of_flax():
+    """So that what was trained with either is read by the other; and its precision."""
+    image = jnp.ones((2, 2, 8), jnp.bfloat16)
+    ours, usual = encoders.GroupNorm(jnp.bfloat16), nn.GroupNorm(8, dtype=jnp.bfloat16)
+    shapes = [jax.eval_shape(module.init, jax.random.key(0), image) for module in (ours, usual)]
+    assert jax.tree.all(jax.tree.map(lambda a, b: a == b, *shapes))
+    assert ours.apply(usual.init(jax.random.key(0), image), image).dtype == jnp.bfloat16

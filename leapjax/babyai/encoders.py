@@ -161,9 +161,9 @@ class FiLMBlock(nn.Module):
     def __call__(self, image: jax.Array, condition: jax.Array) -> jax.Array:
         """`[X, Y, C]` and `[D]` to `[X, Y, width]`."""
         h = Convolution(self.width, dtype=self.dtype)(image)
-        h = Convolution(self.width, dtype=self.dtype)(nn.relu(channel_norm(self.dtype)(h)))
+        h = Convolution(self.width, dtype=self.dtype)(nn.relu(GroupNorm(self.dtype)(h)))
         scale, shift = nn.Dense(self.width)(condition), nn.Dense(self.width)(condition)
-        return nn.relu(channel_norm(self.dtype)(h * scale + shift))
+        return nn.relu(GroupNorm(self.dtype)(h * scale + shift))
 
 
 class HalvingBlock(nn.Module):
@@ -176,14 +176,38 @@ class HalvingBlock(nn.Module):
     def __call__(self, image: jax.Array) -> jax.Array:
         """`[X, Y, C]` to `[ceil(X / 2), ceil(Y / 2), width]`."""
         h = Convolution(self.width, stride=2, dtype=self.dtype)(image)
-        h = Convolution(self.width, dtype=self.dtype)(nn.relu(channel_norm(self.dtype)(h)))
+        h = Convolution(self.width, dtype=self.dtype)(nn.relu(GroupNorm(self.dtype)(h)))
         aside = Convolution(self.width, 1, (0, 0), 2, self.dtype)(image)
-        return nn.relu(channel_norm(self.dtype)(h) + aside)
+        return nn.relu(GroupNorm(self.dtype)(h) + aside)
 
 
-def channel_norm(dtype: Dtype) -> nn.GroupNorm:
-    """Normalisation that needs no batch, where the authors' code has batch norm."""
-    return nn.GroupNorm(num_groups=NORM_GROUPS, dtype=dtype)
+class GroupNorm(nn.Module):
+    """Normalisation that needs no batch (Wu and He, 2018); the authors' code has batch norm.
+
+    As `nn.GroupNorm`, whose gradient takes as long as a convolution here: this one sums over
+    cells first, so that no large array is ever split into groups. As there, the first axis is
+    taken for a batch: each column of a map is normalised by itself (docs/deviations.md).
+    """
+
+    dtype: Dtype = jnp.float32  # of the result; statistics are float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        """Of `[X, Y, C]`: groups of channels, `NORM_GROUPS` of them, to mean 0 and variance 1."""
+        channels = image.shape[-1]
+        scale = self.param("scale", nn.initializers.ones, (channels,))
+        bias = self.param("bias", nn.initializers.zeros, (channels,))
+        exact = image.astype(jnp.float32)
+
+        def mean(each: jax.Array) -> jax.Array:
+            """`[X, 1, C]`: of a column and a group, for each of its channels."""
+            groups = each.mean(axis=1, keepdims=True).reshape(len(image), 1, NORM_GROUPS, -1)
+            return jnp.repeat(groups.mean(axis=-1), channels // NORM_GROUPS, axis=-1)
+
+        centre = mean(exact)
+        variance = jnp.maximum(mean(exact**2) - centre**2, 0)
+        factor = scale * jax.lax.rsqrt(variance + 1e-6)
+        return (image * factor + (bias - centre * factor)).astype(self.dtype)
 
 
 class PaperStateEncoder(nn.Module):
@@ -199,7 +223,7 @@ class PaperStateEncoder(nn.Module):
 
         def layer(h: jax.Array, side: int) -> jax.Array:
             h = Convolution(self.width, side, dtype=self.dtype)(h)
-            return nn.relu(channel_norm(self.dtype)(h))
+            return nn.relu(GroupNorm(self.dtype)(h))
 
         h = layer(observation.grid.astype(jnp.float32), 2)
         h = halved(h)
@@ -227,24 +251,30 @@ class StateTokens(nn.Module):
         self.instruction = InstructionEncoder(vocabulary.SIZE, self.width, LARGE)
         self.state = PaperStateEncoder(self.side, self.width, self.dtype)
 
-    def __call__(self, context: Context) -> jax.Array:
-        """`[K + 1, D]`: the past states and the current one."""
+    def __call__(self, context: Context, ahead: bool = False) -> jax.Array:
+        """`[K + 1, D]`: the past states and the current one; last, if asked for, that of `ahead`.
+
+        All in one batch, which takes less than one after the other.
+        """
         instruction = self.instruction(context.observation.instruction).whole
-        if context.encoded is not None:
-            return jnp.append(
-                context.encoded, self.state(context.observation, instruction)[None], axis=0
-            )
-        states = jax.tree.map(
-            lambda x, y: jnp.concatenate([x, y[None]]), context.past, context.observation
-        )
-        return jax.vmap(self.state, in_axes=(0, None))(states, instruction)
+        states = [context.observation, _nowhere(context.observation)][: 1 + ahead]
+        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        if context.encoded is None:
+            states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), context.past, states)
+        tokens = jax.vmap(self.state, in_axes=(0, None))(states, instruction)
+        if context.encoded is None:
+            return tokens
+        return jnp.concatenate([context.encoded, tokens])
 
     def ahead(self, context: Context) -> jax.Array:
         """`[D]`: what later states of a plan are taken for, whose pose nobody knows: (0, 0, 0)."""
-        observation = context.observation
-        instruction = self.instruction(observation.instruction).whole
-        nowhere = jnp.zeros_like(observation.pose)
-        return self.state(observation._replace(pose=nowhere), instruction)
+        instruction = self.instruction(context.observation.instruction).whole
+        return self.state(_nowhere(context.observation), instruction)
+
+
+def _nowhere(observation: Observation) -> Observation:
+    """Of an agent whose pose is not known."""
+    return observation._replace(pose=jnp.zeros_like(observation.pose))
 
 
 def _convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:

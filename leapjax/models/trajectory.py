@@ -140,12 +140,18 @@ class PaperModel(nn.Module):
             states: what `see` has made of the context, if it has.
         """
         horizon = self.sizes.horizon
-        states = self.see(context) if states is None else states
+        if self.repeat_state:
+            states = self.see(context) if states is None else states
+            ahead = states[-1]
+        elif states is None:
+            seen = self.states(context, ahead=True)
+            states, ahead = seen[:-1], seen[-1]
+        else:
+            ahead = self.states.ahead(context)
 
         def with_plan(known: jax.Array, later: jax.Array) -> jax.Array:
             return jnp.concatenate([known, jnp.repeat(later[None], horizon - 1, axis=0)])
 
-        ahead = states[-1] if self.repeat_state else self.states.ahead(context)
         actions = jnp.tanh(self.action(context.actions))
         actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
         steps = [with_plan(states, ahead), actions]  # of [K + T, D]
