@@ -58,8 +58,12 @@ def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/environments.py", "types")
     may_import("leapjax/data/windows.py", "types")
     may_import("leapjax/models/linear.py")
-    may_import("leapjax/models/transformer.py", "models.linear")
-    may_import("leapjax/models/trajectory.py", "types", "errors", "models.transformer")
+    may_import("leapjax/models/dropout.py")
+    may_import("leapjax/models/transformer.py", "models.dropout", "models.linear")
+    may_import(
+        "leapjax/models/trajectory.py",
+        *("types", "errors", "models.dropout", "models.transformer"),
+    )
     may_import(
         "leapjax/domain.py",
         *("types", "errors", "environments", "models.trajectory"),
