@@ -29,6 +29,7 @@ from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
 from leapjax.environments import Eager
+from leapjax.errors import UserError
 from leapjax.rollouts import kept
 
 GAMES_PLAYED = (1, 16, 64)  # together
@@ -65,7 +66,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: Options) -> None:
-    """Measures every game and preset."""
+    """Measures every game and preset.
+
+    Raises:
+        UserError: rows are asked for of what is not measured.
+    """
+    if options.training_json and not options.training:
+        raise UserError("--training-json with --no-training: there are no rows to write; drop one")
     runtime.use_every_core()  # and no compilation cache: compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [

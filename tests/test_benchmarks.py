@@ -117,6 +117,12 @@ def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkey
     assert row["encoding_flops"] > 2 * 2 * products
 
 
+def test_the_benchmark_of_games_refuses_to_write_what_it_does_not_measure(tmp_path, capsys):
+    rows = tmp_path / "rows.json"
+    assert atari.main(["--no-training", "--training-json", str(rows)]) == 2
+    assert "--no-training" in capsys.readouterr().err and not rows.exists()
+
+
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):
     assert training.main(["--levels", "Nowhere"]) == 2
     assert "Nowhere" in capsys.readouterr().err
