@@ -13,6 +13,7 @@ from leapjax import schedules, sharding, training
 from leapjax.agents import leap, learning
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.babyai import encoders
 from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
@@ -320,7 +321,7 @@ def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
     found = set()
 
     def note(call, args, kwargs, context):
-        if isinstance(context.module, nn.Embed | nn.LayerNorm | nn.GroupNorm):
+        if isinstance(context.module, nn.Embed | nn.LayerNorm | encoders.GroupNorm):
             found.add(context.module.path)
         return call(*args, **kwargs)
 
