@@ -11,6 +11,10 @@ from leapjax import sharding
 from leapjax.types import Agent, PyTree, TrainState
 
 BATCH_STREAM, UPDATE_STREAM = 0, 1
+# Steps that may wait for their turn: enough to keep a device busy. On several CPU devices JAX
+# 0.10 stops for ever where more than 32 programs wait: the thread that would run the other
+# half of an exchange then waits for room to queue one more.
+AHEAD = 8
 
 
 class NonFiniteLoss(RuntimeError):
@@ -127,8 +131,7 @@ def train(
         key: of the run.
         steps: in all, the steps that `state` has seen included.
         report: called with (step, state, mean metrics) every `report_every` steps and at
-            the end; only there does the loop wait for the device. If it returns True, this
-            step was the last.
+            the end. If it returns True, this step was the last.
         report_every: steps.
 
     Raises:
@@ -141,6 +144,8 @@ def train(
         state, metrics = train_step(state, data, key)
         done += 1
         pending.append(metrics)
+        if len(pending) > AHEAD:
+            jax.block_until_ready(pending[-1 - AHEAD])
         if done % report_every == 0 or done == steps:
             values = sharding.to_host(pending)
             for offset, value in enumerate(values):

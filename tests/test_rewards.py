@@ -37,7 +37,7 @@ def trained(name, architecture="leapjax", past=0):
 def _trained(name, architecture, past):
     """An agent after a moment of training on walks that go wrong more often than right."""
     model = ModelConfig(architecture, layers=1, heads=1, width=32, dropout=0.0)
-    steps = 2 * STEPS if name == "mopo" else STEPS  # a model of the world comes first
+    steps = 3 * STEPS if name == "mopo" else STEPS  # a model of the world comes first
     learn = TrainingConfig(
         steps, batch=128, warmup=10, learning_rate=3e-3, weight_decay=0.0, windows="step"
     )

@@ -285,6 +285,29 @@ def test_reports_hold_the_means_since_the_last():
     assert run([1, 2], 3, begin=2) == []
 
 
+def test_only_so_many_steps_wait_for_their_turn():
+    """Of more JAX may stop for ever, where several CPU devices exchange what they compute."""
+    running, most = set(), 0
+
+    class Loss(float):
+        def block_until_ready(self):
+            running.discard(id(self))
+            return self
+
+    losses = [Loss(number) for number in range(100)]
+
+    def step(state, data, key):
+        nonlocal most
+        loss = losses[int(state.step)]
+        running.add(id(loss))
+        most = max(most, len(running))
+        return state._replace(step=state.step + 1), {"loss": loss}
+
+    training.train(step, TrainState({}, (), np.int32(0)), None, None, 100, ignore, 100)
+    assert most == training.AHEAD + 1
+    assert 2 * most < 32  # programs: a step is two
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(("step", "reported"), [(1, 0), (5, 0), (6, 1), (8, 1), (12, 2)])
 def test_a_loss_that_is_not_finite_names_its_step(bad, step, reported):
