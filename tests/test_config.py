@@ -106,8 +106,9 @@ def test_preset_paper_masks_and_ends_as_the_authors_code_does():
                for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
     assert [each.masking for each in learned.values()] == ["each", "each", "all"]
     assert not any(each.end or each.repeat_state for each in learned.values())
-    search = preset("babyai", "GoToObjMazeS7", "leap", "paper").planner
-    assert (search.horizon, search.iterations) == (10, 30)
+    for level in ("GoToObjMazeS7", "GoToObjMazeS7Slip", "GoToObjMazeS7Mistakes"):
+        search = preset("babyai", level, "leap", "paper").planner
+        assert (search.horizon, search.iterations) == (10, 30)
     assert preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
     # In star graphs there is no pose to leave out, and a plan may end.
     stars = preset("stars", "Star3x5", "leap", "paper").method_settings
