@@ -7,6 +7,7 @@ import pytest
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
 from experiments.common import analysis, results
 from experiments.common.analysis import Analysis, Options, Way
+from experiments.common.run import write_metrics
 from experiments.tables import analyses
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
@@ -60,6 +61,15 @@ def test_two_models_are_composed(place):
     assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
     (row,) = rows(place, "properties")
     assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
+    assert row["train_seconds"] == 0  # for no step
+
+
+def test_what_training_took_is_that_of_all_its_parts(tmp_path):
+    assert analysis.training_seconds(tmp_path) == 0
+    write_metrics(
+        tmp_path, [{"step": 1, "seconds": 2.0, "loss": 1}, {"step": 2, "seconds": 5.5, "loss": 1}]
+    )
+    assert analysis.training_seconds(tmp_path) == 5.5
 
 
 def test_every_case_can_be_made():

@@ -219,12 +219,14 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     rows = found if options.record and not options.force else {}
     missing = [name for name in ways if name not in rows]
     models = models_of(work, case, method, seed) if missing else []
+    seconds = sum(training_seconds(run_folder(each, seed)) for each in settings)
     for name in missing:
         said, episodes = play(case, ways[name], models, seed, options, work.interruption)
         row = {
             "experiment": analysis.name,
             "hash": name,
             "trained": [configuration_hash(each, seed) for each in settings],
+            "train_seconds": round(seconds, 3),
             "versions": work.versions,
             **said,
         }
@@ -263,10 +265,25 @@ def models_of(work: Work, case: Case, method: str, seed: int) -> list[Pretrained
     return [trained(work, config, seed) for config in wanted]
 
 
+def training_of(config: AnyConfig) -> Experiment:
+    """The program whose runs are used, or made."""
+    return Experiment(config.domain, config.domain)
+
+
+def run_folder(config: AnyConfig, seed: int) -> Path:
+    """Where a model is, or will be."""
+    return experiment.run_folder(training_of(config), config, seed)
+
+
+def training_seconds(folder: Path) -> float:
+    """How long the training of a run has taken, stops and continuations included."""
+    metrics = run.read_metrics(folder)
+    return metrics[-1]["seconds"] if metrics else 0.0
+
+
 def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
-    training = Experiment(config.domain, config.domain)  # whose runs are used, or made
-    folder = experiment.run_folder(training, config, seed)
+    training, folder = training_of(config), run_folder(config, seed)
     steps = [entry["step"] for entry in run.read_metrics(folder)]
     if steps and steps[-1] >= config.training.steps:
         return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
@@ -342,7 +359,6 @@ def play(
         "executed": way.executed or search.horizon,
         "demos_seconds": 0.0,
         "compile_seconds": 0.0,
-        "train_seconds": 0.0,
         "eval_seconds": round(found.seconds, 3),
         "plans": found.plans,
         "plans_per_second": found.plans / found.planning_seconds,
