@@ -35,7 +35,8 @@ Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of t
 SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
 # Of methods that have no reason for others.
 NETWORK_PRESETS: Presets = {
-    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode"},
+    # A few windows at a time stay in a core's cache.
+    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode", "microbatch": 8},
     "leapjax": {
         "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
     },
