@@ -56,7 +56,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         assert isinstance(found, jax.Array)
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
-    update = learning.make_update(window_loss, optimizer, mesh)
+    update = learning.make_update(
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
+    )
     init = learning.make_init(setup, module, _encode_and_judge, optimizer)
     return Agent(init, window_batches(setup), update, energy)
 
