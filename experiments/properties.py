@@ -87,9 +87,13 @@ def left_to_right(trained: GibbsConfig) -> GibbsConfig:
     return dataclasses.replace(trained, fill="sequential", iterations=trained.horizon, resampled=1)
 
 
-def noisily(trained: GibbsConfig) -> GibbsConfig:
+def noisily(trained: GibbsConfig, temperature: float = 2.0) -> GibbsConfig:
     """Where models disagree the likeliest plan leads nowhere: noise leads out of it."""
-    return dataclasses.replace(trained, temperature=2.0)
+    return dataclasses.replace(trained, temperature=temperature)
+
+
+# Of what is left where the likeliest action is removed, the likeliest leads to and fro.
+wandering = functools.partial(noisily, temperature=5.0)
 
 
 def twice(trained: GibbsConfig) -> GibbsConfig:
@@ -124,8 +128,8 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
         [
             Way("next action", minimise=unseen(immediate_lava), executed=1, paper=leap),
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
-            Way("dt", "dt", masked(immediate_lava), paper=dt),
-            Way("iql", "iql", masked(immediate_lava), paper=iql),
+            Way("dt", "dt", masked(immediate_lava), wandering, paper=dt),
+            Way("iql", "iql", masked(immediate_lava), wandering, paper=iql),
         ],
         Watched,
     )
@@ -139,8 +143,8 @@ def _constraints(name: str, model: Model, level: str) -> Case:
         level,
         [
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
-            Way("dt", "dt", both),
-            Way("iql", "iql", both),
+            Way("dt", "dt", both, wandering),
+            Way("iql", "iql", both, wandering),
         ],
         WatchedTurns,
     )
