@@ -78,7 +78,7 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[En
     return lambda energies: constrain(view(energies[0], without_lava), penalty, partial=True)
 
 
-# Of methods of single actions: those that violate anything at once are removed.
+# What judges the next action alone: those that violate anything at once are removed.
 masked = functools.partial(unseen, weight=math.inf)
 
 
@@ -121,15 +121,16 @@ def only_pick_up(energies: Sequence[Energy]) -> Energy:
 
 def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
     leap, dt, iql = paper
+    at_once = masked(immediate_lava)
     return Case(
         f"adaptation-{name}",
         [model],
         level,
         [
-            Way("next action", minimise=unseen(immediate_lava), executed=1, paper=leap),
+            Way("next action", minimise=at_once, search=wandering, executed=1, paper=leap),
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
-            Way("dt", "dt", masked(immediate_lava), wandering, paper=dt),
-            Way("iql", "iql", masked(immediate_lava), wandering, paper=iql),
+            Way("dt", "dt", at_once, wandering, paper=dt),
+            Way("iql", "iql", at_once, wandering, paper=iql),
         ],
         Watched,
     )
