@@ -4,6 +4,8 @@ import dataclasses
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -20,7 +22,7 @@ from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import TOY_RUN
+from tests.programs import ROOT, TOY_RUN
 
 
 @pytest.fixture(autouse=True)
@@ -249,6 +251,21 @@ def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
     monkeypatch.setattr(demonstrations, "collect", lambda *rest: pytest.fail("collected"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
+
+
+def test_output_that_nobody_reads_any_more_is_one_line():
+    """As in `--help | head -1`."""
+    code = """
+from experiments.common import program
+raise SystemExit(program.guarded("m", [], lambda: print("much to say " * 10_000)))
+"""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
+    os.close(writer)
+    assert done.returncode == 1
+    assert done.stderr == b"stopped: nobody reads the output any more\n"
 
 
 def test_a_home_that_cannot_be_written_to_has_no_compilation_cache(workplace, monkeypatch):

@@ -1,5 +1,6 @@
 """Where a program begins and ends: a user's mistake is one line and exit code 2."""
 
+import os
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -54,6 +55,10 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
             "again, and they continue from the last checkpoint",
             1,
         )
+    except BrokenPipeError:  # what read the output has ended, as in `--help | head`
+        # What is left of it has nowhere to go; the interpreter would try again at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _end("stopped: nobody reads the output any more", 1)
     return 0
 
 
