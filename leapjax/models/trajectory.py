@@ -34,6 +34,7 @@ class ModelConfig:
     dropout: float = 0.1  # of embeddings, attention and residuals
     dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
     attention: str = "full"  # of a plan's actions; "causal": no action sees a later one
+    neighbours: bool = False  # "leapjax": an action's token also holds the actions beside it
 
     def __post_init__(self) -> None:
         if self.architecture not in ARCHITECTURES:
@@ -46,6 +47,11 @@ class ModelConfig:
                 f"unknown attention {self.attention!r}: expected one of {', '.join(ATTENTIONS)}"
             )
         check_at_least(self, 1, "layers", "heads", "width")
+        if self.neighbours and (self.architecture, self.attention) != ("leapjax", "full"):
+            raise ValueError(
+                "neighbours is for architecture 'leapjax' with attention 'full': a token would "
+                "hold an action that it may not see, or a state"
+            )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
         if self.dtype not in DTYPES:
@@ -187,12 +193,22 @@ class PaperModel(nn.Module):
         return forbid_early_end(self.head(h), positions)
 
 
+class Prefix(NamedTuple):
+    """What all plans from one context share, to our network."""
+
+    known: list[KeysValues]  # of the context's tokens, per layer
+    places: jax.Array  # [T, D] what each position of the plan is
+
+
 class LeapModel(nn.Module):
     """Ours: the state once, and a cached context.
 
     The tokens of the context are a prefix that never attends to the plan, so its keys and
     values are computed once per plan, and a pass runs over T action tokens only. Where it is
     conditioned on the return to go, that is one more token of the context.
+
+    An encoder that knows what a position of the plan is, such as a cell of a board, says so:
+    `places(context, T) -> [T, D]`. Elsewhere an embedding of the position is learned.
     """
 
     config: ModelConfig
@@ -206,14 +222,18 @@ class LeapModel(nn.Module):
         if self.conditioned:
             self.goal = dense(c.width, scale=1.0)
         self.position = embed(sizes.horizon, c.width)
+        if c.neighbours:
+            scale = c.width**-0.5
+            self.before = dense(c.width, use_bias=False, scale=scale)
+            self.after = dense(c.width, use_bias=False, scale=scale)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode(
         self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
-    ) -> PyTree:
-        """Keys and values of the prefix tokens, per layer.
+    ) -> Prefix:
+        """Keys and values of the prefix tokens, and what positions of a plan are.
 
         Args:
             context: what is known.
@@ -224,22 +244,40 @@ class LeapModel(nn.Module):
         if returns is not None:
             tokens = jnp.concatenate([tokens, jnp.tanh(self.goal(returns[-1:, None]))])
         tokens = self.drop(tokens, deterministic=deterministic)
-        return self.transformer.prefix(tokens, deterministic=deterministic)
+        known = self.transformer.prefix(tokens, deterministic=deterministic)
+        horizon = self.sizes.horizon
+        if hasattr(self.context, "places"):
+            return Prefix(known, self.context.places(context, horizon))
+        return Prefix(known, self.position(jnp.arange(horizon)))
 
     def logits(
         self,
-        memory: PyTree,
+        memory: Prefix,
         actions: jax.Array,
         positions: jax.Array,
         deterministic: bool = True,
     ) -> jax.Array:
         """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
         check_plan(actions, self.sizes.horizon)
-        x = self.action(actions) + self.position(jnp.arange(self.sizes.horizon))
-        x = self.drop(x, deterministic=deterministic)
-        mask = attention_mask(self.config, self.sizes.horizon, memory[0].keys.shape[0])
-        h = self.transformer(x, positions, memory, mask, deterministic=deterministic)
+        x = self.drop(self._tokens(actions) + memory.places, deterministic=deterministic)
+        mask = attention_mask(self.config, self.sizes.horizon, memory.known[0].keys.shape[0])
+        h = self.transformer(x, positions, memory.known, mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
+
+    def _tokens(self, actions: jax.Array) -> jax.Array:
+        """`[T, D]` of the actions of a plan.
+
+        With those beside each of them a layer finds what goes with its neighbour. Otherwise one
+        has to learn to fetch the neighbour before the next can learn to use it, neither of which
+        is of use alone (short convolutions: Fu et al., 2023, H3).
+        """
+        each = self.action(actions)
+        if not self.config.neighbours:
+            return each
+        nothing = jnp.zeros_like(each[:1])
+        before = self.before(jnp.concatenate([nothing, each[:-1]]))
+        after = self.after(jnp.concatenate([each[1:], nothing]))
+        return each + before + after
 
 
 class SequenceClassifier(nn.Module):

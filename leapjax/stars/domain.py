@@ -112,10 +112,11 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own options."""
-    del name, preset
+    del name
     rate = {"learning_rate": 1e-3}
     if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
-        return {**rate, "temperature": 0.0, "windows": "start"}
+        whole = {"temperature": 0.0, "windows": "start"}
+        return {**rate, **whole, "neighbours": preset != "paper", "steps": 2000, "batch": 64}
     return rate
 
 

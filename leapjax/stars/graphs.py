@@ -19,7 +19,7 @@ from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Window
 
-LEVELS = ("Star3x5", "Star5x5")
+LEVELS = ("Star3x5", "Star5x10")
 MOST_NODES = 1000
 
 

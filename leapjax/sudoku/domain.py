@@ -27,24 +27,42 @@ class Settings:
 
 
 class BoardTokens(nn.Module):
-    """A token for each cell, and one for the cell that is written next."""
+    """A token for each cell, and one for the cell that is written next.
+
+    It says of which cell an action of the plan is (`places`), so that which cells share a row, a
+    column or a box with it need not be learned for each of them.
+    """
 
     side: int
     width: int
 
-    @nn.compact
+    def setup(self) -> None:  # noqa: D102
+        self.row = embed(self.side, self.width)
+        self.column = embed(self.side, self.width)
+        self.box = embed(self.side, self.width)
+        self.digit = embed(self.side + 1, self.width)
+        self.task = embed(1, self.width)
+
     def __call__(self, context: Context) -> jax.Array:
         """Tokens `[cells + 1, D]`."""
-        board, cells = context.observation, self.side**2
-        row, column = jnp.divmod(jnp.arange(cells), self.side)
+        here = self._groups(context.observation.cell[None])
+        task = self.task(jnp.zeros(1, jnp.int32))
+        return jnp.concatenate([self._cells(context), task + here])
+
+    def places(self, context: Context, horizon: int) -> jax.Array:
+        """`[T, D]`: the cells that a plan fills, and what is in them."""
+        ahead = context.observation.cell + jnp.arange(horizon)
+        return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]
+
+    def _cells(self, context: Context) -> jax.Array:
+        """`[cells, D]`."""
+        return self._groups(jnp.arange(self.side**2)) + self.digit(context.observation.digits)
+
+    def _groups(self, cells: jax.Array) -> jax.Array:
+        """`[n, D]` the row, column and box of cells `[n]`; of the last, where there is none."""
+        row, column = jnp.divmod(jnp.minimum(cells, self.side**2 - 1), self.side)
         box = boards.side_of_box(self.side)
-        groups = {"row": row, "column": column, "box": row // box * box + column // box}
-        each = [embed(self.side, self.width, name)(at) for name, at in groups.items()]
-        place = jnp.stack(each).sum(axis=0)  # [cells, D]
-        digits = embed(self.side + 1, self.width, "digit")(board.digits)
-        task = embed(1, self.width, "task")(jnp.zeros(1, jnp.int32))
-        here = place[jnp.minimum(board.cell, cells - 1)]
-        return jnp.concatenate([place + digits, task + here])
+        return self.row(row) + self.column(column) + self.box(row // box * box + column // box)
 
 
 def make(name: str, settings: Settings) -> Domain:
