@@ -34,8 +34,10 @@ EVERYWHERE = np.arange(HORIZON)
 
 
 def make(kind, architecture, past, dtype="float32"):
-    """A tiny model of BabyAI's states."""
-    config = ModelConfig(architecture, layers=2, heads=2, width=16, dtype=dtype)
+    """A tiny model of BabyAI's states; "neighbours" is ours with that option."""
+    neighbours = architecture == "neighbours"
+    architecture = "leapjax" if neighbours else architecture
+    config = ModelConfig(architecture, 2, 2, width=16, dtype=dtype, neighbours=neighbours)
     settings = Settings(channels=8, rounds=1, fields=2, sweeps=5, word_heads=2)
     encoder = {
         "paper": encoders.StateTokens(SIDE, config.width, dtype),
@@ -136,6 +138,7 @@ def largest_change(after, before):
 
 EACH_MODEL = pytest.mark.parametrize("past", [0, 2])
 EACH_ARCHITECTURE = pytest.mark.parametrize("architecture", ARCHITECTURES)
+EACH_NETWORK = pytest.mark.parametrize("architecture", (*ARCHITECTURES, "neighbours"))
 
 
 # What holds for both architectures.
@@ -162,7 +165,7 @@ def test_only_plans_that_end_at_once_have_infinite_energy(architecture, past):
         assert np.isposinf(total) if actions[0] == END else np.isfinite(total)
 
 
-@EACH_ARCHITECTURE
+@EACH_NETWORK
 @EACH_MODEL
 def test_total_is_a_loop_over_masked_positions(architecture, past):
     context = random_context(2, past)
@@ -186,7 +189,7 @@ def test_a_plan_that_holds_mask_has_infinite_energy(architecture, past):
         assert np.isposinf(run(architecture, past, random_context(3, past), actions)["total"])
 
 
-@EACH_ARCHITECTURE
+@EACH_NETWORK
 @EACH_MODEL
 def test_the_action_before_masking_is_not_seen(architecture, past):
     context = random_context(4, past)
@@ -203,7 +206,7 @@ def test_the_action_before_masking_is_not_seen(architecture, past):
             assert largest_change(other, seen[0]) > 1e-3
 
 
-@EACH_ARCHITECTURE
+@EACH_NETWORK
 @EACH_MODEL
 def test_positions_masked_together_see_none_of_each_other(architecture, past):
     context = random_context(5, past)
@@ -215,7 +218,7 @@ def test_positions_masked_together_see_none_of_each_other(architecture, past):
         np.testing.assert_allclose(together, expected, rtol=1e-5, atol=1e-5)
 
 
-@EACH_ARCHITECTURE
+@EACH_NETWORK
 @EACH_MODEL
 def test_one_queried_position_has_the_logits_of_all(architecture, past):
     context = random_context(6, past)
@@ -437,6 +440,20 @@ def test_with_causal_attention_no_action_sees_a_later_one(architecture):
             np.testing.assert_array_equal(differs, seen)
 
 
+def test_a_token_holds_the_actions_beside_it_and_no_other():
+    params, _ = model("neighbours", 0)
+    module = make(build, "neighbours", 0)
+    tokens = quick_jit(functools.partial(module.apply, params, method="_tokens"))
+    own = params["params"]
+    table, before, after = (
+        own["action"]["embedding"], own["before"]["kernel"], own["after"]["kernel"],
+    )  # fmt: skip
+    first, middle, last = table[np.array([2, MASK, 5])]
+    expected = [first + middle @ after, middle + first @ before + last @ after]
+    expected.append(last + middle @ before)
+    np.testing.assert_allclose(tokens(np.array([2, MASK, 5])), expected, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("past", [0, 2])
 def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     """The paper's network, conditioned on returns; with full attention it keeps all tokens."""
@@ -536,6 +553,14 @@ def test_unknown_architecture_is_refused():
 def test_width_that_does_not_split_into_heads_is_refused():
     with pytest.raises(ValueError, match="width 10 is not a multiple of 4 heads"):
         ModelConfig(width=10, heads=4)
+
+
+@pytest.mark.parametrize(
+    "options", [{"architecture": "paper"}, {"architecture": "leapjax", "attention": "causal"}]
+)
+def test_a_token_that_would_hold_what_it_may_not_see_is_refused(options):
+    with pytest.raises(ValueError, match="neighbours is for architecture 'leapjax' with attention"):
+        ModelConfig(**options, neighbours=True)
 
 
 def judge(module, context, actions):

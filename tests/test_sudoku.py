@@ -18,9 +18,10 @@ from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.sudoku import boards
 from leapjax.sudoku.boards import Size, SudokuAdapter
-from leapjax.sudoku.domain import Settings, make
+from leapjax.sudoku.domain import BoardTokens, Settings, make
 from leapjax.sudoku.rules import rules
 from leapjax.types import pad_token
+from tests.parameters import random_like
 
 SMALL, LARGE = Size(4, 6), Size(9, 36)
 SIZES = pytest.mark.parametrize("size", [SMALL, LARGE], ids=str)
@@ -131,6 +132,32 @@ def test_a_transformed_window_is_that_of_another_board(size, cell):
                 np.testing.assert_array_equal(after, board.digits)
         seen.add(tuple(board.digits))
     assert len(seen) == 8
+
+
+def test_a_position_of_a_plan_is_the_cell_that_it_fills():
+    side, cells = 4, 16
+    module = BoardTokens(side, width=8)
+    digits = np.arange(cells, dtype=np.int32) % (side + 1)
+
+    def context(cell):
+        return blank_context(make("Sudoku4x6", Settings()), 0)._replace(
+            observation=boards.Board(digits, np.int32(cell))
+        )
+
+    params = random_like(jax.eval_shape(module.init, jax.random.key(0), context(0)))
+    places = jax.jit(functools.partial(module.apply, params, horizon=cells, method="places"))
+    tokens = module.apply(params, context(0))
+    assert tokens.shape == (cells + 1, 8)
+    whole = np.asarray(places(context(0)))
+    np.testing.assert_array_equal(whole, tokens[:cells])  # what the network sees of a cell
+    assert len(np.unique(whole, axis=0)) == cells
+    for cell in (
+        1,
+        7,
+        15,
+    ):  # later in an episode a plan begins there; what is beyond does not count
+        np.testing.assert_array_equal(places(context(cell))[: cells - cell], whole[cell:])
+    assert np.isfinite(places(context(cells))).all()  # a solved board
 
 
 def broken(digits, side):
