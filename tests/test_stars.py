@@ -111,8 +111,49 @@ def test_a_relabelled_window_is_that_of_another_graph_with_its_way():
     assert len(seen) > 10
 
 
-def agent_and_domain(method="leap"):
-    domain = make("Star3x4", Settings())
+def test_a_window_without_some_arms_is_that_of_a_smaller_graph_with_the_same_way():
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
+    prune = jax.jit(lambda key, window: graphs.leave_out_arms(key, window, STAR))
+    cut = jax.jit(lambda index: windows.window(steps, index, 2, STAR.length, LABELS))
+    arms, dropped = [], set()
+    for index in range(8):
+        window = jax.tree.map(np.asarray, cut(index))
+        for seed in range(6):
+            new = jax.tree.map(np.asarray, prune(jax.random.key(10 * index + seed), window))
+            graph, before = new.context.observation, window.context.observation
+            known = new.actions < LABELS
+            assert new.actions[known].tolist() == way(graph)
+            edges = {tuple(edge) for edge in graph.edges.tolist()}
+            left_out = {tuple(edge) for edge in before.edges.tolist()} - edges
+            assert len(graph.edges) == len(before.edges) == len(edges | left_out)
+            starts = [start for start, _ in edges]
+            centre = max(starts, key=starts.count) if len(edges) > STAR.length else None
+            arms.append(len(edges) // STAR.length)
+            # Whole arms are left: each node but their ends has an edge that leads on.
+            assert len(edges) == arms[-1] * STAR.length
+            assert centre is None or starts.count(centre) == arms[-1]
+            assert (new.context.past.edges[-1] == graph.edges).all() or not window.context.step
+            dropped.add(frozenset(left_out))
+    # Of two graphs: each of the other two arms, both or none of them.
+    assert set(arms) == {1, 2, 3} and len(dropped) == 2 * 3 + 1
+
+
+def test_edges_that_are_learned_from_are_in_no_order():
+    """Arms are left out with the goal's first: that must not be seen."""
+    agent, _ = agent_and_domain(fewer_arms=True)
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
+    drawn = jax.tree.map(np.asarray, jax.jit(agent.batch)(jax.random.key(0), steps))
+    graph = drawn.context.observation
+    kept = np.array([len(np.unique(edges, axis=0)) for edges in graph.edges])
+    assert set(kept) == {STAR.length, 2 * STAR.length, 3 * STAR.length}
+    # The edge that ends at the goal is anywhere in the list.
+    _, places = np.nonzero(graph.edges[:, :, 1] == graph.goal[:, None])
+    counts = np.bincount(places, minlength=STAR.nodes - 1)
+    assert counts.min() > 0 and counts.max() < 3 * counts.mean()
+
+
+def agent_and_domain(method="leap", **settings):
+    domain = make("Star3x4", Settings(**settings))
     config = preset("stars", "Star3x4", method, "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
     setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)

@@ -129,3 +129,29 @@ def relabel(key: jax.Array, window: Window, labels: int) -> Window:
         actions=renamed(window.context.actions),
     )
     return window._replace(context=context, actions=renamed(window.actions))
+
+
+def leave_out_arms(key: jax.Array, window: Window, star: Star) -> Window:
+    """The same window without some of the arms that do not lead to its goal.
+
+    How many are left is drawn evenly. Edges that are left are seen several times, so that there
+    are as many as before. In a smaller graph it is easier to find out that an edge leads on from
+    where another ends.
+    """
+    count_key, arm_key = jax.random.split(key)
+    graph = window.context.observation
+    following = jnp.arange(star.labels).at[graph.edges[:, 0]].set(graph.edges[:, 1])
+    # Where the arm of each edge ends. (XLA would nest unrolled steps, and compile for minutes.)
+    ends = jax.lax.fori_loop(0, star.length - 1, lambda _, at: following[at], graph.edges[:, 1])
+    rank = jax.random.uniform(arm_key, (star.labels,)).at[graph.goal].set(-1.0)
+    by_arm = jnp.argsort(rank[ends])  # the goal's comes first
+    kept = star.length * jax.random.randint(count_key, (), 1, star.arms + 1)
+    edges = by_arm[jnp.arange(len(ends)) % kept]
+
+    def pruned(graph: Graph) -> Graph:
+        return graph._replace(edges=graph.edges[..., edges, :])
+
+    context = window.context
+    return window._replace(
+        context=context._replace(observation=pruned(context.observation), past=pruned(context.past))
+    )
