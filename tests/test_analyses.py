@@ -87,6 +87,21 @@ def test_every_case_can_be_made():
             assert len(set(names)) == len(names)
 
 
+def test_ways_and_methods_can_be_chosen():
+    def chosen(**options):
+        return [
+            (case.name, [way.name for way in case.ways])
+            for case in analysis.check(properties.ANALYSIS, Options(**options))
+            if case.ways
+        ]
+
+    both = ("composition-easy", "adaptation-hard")
+    assert chosen(only=both, ways=("sum", "whole plan")) == [
+        ("adaptation-hard", ["whole plan"]), ("composition-easy", ["sum"]),
+    ]  # fmt: skip
+    assert chosen(only=both, methods=("dt",)) == [(name, ["dt"]) for name in reversed(both)]
+
+
 def test_rows_are_named_by_all_that_matters():
     case = case_of("adaptation-medium")
     of, options = properties.ANALYSIS, Options()
@@ -122,6 +137,8 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
     [
         (["--only", "adaptation-esy"], "did you mean adaptation-easy"),
         (["--methods", "bcq"], "expected some of dt, iql, leap"),
+        (["--ways", "sums"], "--ways sums: expected some of dt, dt, open doors seen as empty, iql"),
+        (["--ways", "sum", "--methods", "dt"], "none of these ways is of one of these methods"),
         (["--preset", "fast"], "unknown preset 'fast'"),
         (["--episodes", "0"], "--episodes must be at least 1"),
         (["--seeds"], "--seeds needs at least one seed"),

@@ -84,6 +84,8 @@ class Options:
     """Cases by name; none: all of them."""
     methods: tuple[str, ...] = ()
     """Methods; none: all that a case has."""
+    ways: tuple[str, ...] = ()
+    """Ways to plan, by name; none: all that a case has."""
     preset: str = "leapjax"
     """"leapjax": ours; "paper": the paper's. Of what is trained."""
     seeds: tuple[int, ...] = (0,)
@@ -143,7 +145,7 @@ def run_all(analysis: Analysis, options: Options, interruption: Interruption) ->
     work = Work(analysis, options, versions, Console(), interruption)
     rows: list[Row] = []
     for case in wanted:
-        for method in methods_of(case, options.methods):
+        for method in methods_of(case):
             for seed in options.seeds:
                 rows += run_case(work, case, method, seed)
     work.console.print(table(rows))
@@ -164,12 +166,20 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
             expected = f"expected some of {', '.join(known)}"
             raise UserError(f"unknown case {name!r}: {expected}{did_you_mean(name, known)}")
     wanted = [case for case in analysis.cases if not options.only or case.name in options.only]
-    methods = sorted({way.method for case in wanted for way in case.ways})
-    for name in options.methods:
-        if name not in methods:
-            raise UserError(f"--methods {name}: expected some of {', '.join(methods)}")
+    ways = [way for case in wanted for way in case.ways]
+    for option, given, possible in (
+        ("methods", options.methods, {way.method for way in ways}),
+        ("ways", options.ways, {way.name for way in ways}),
+    ):
+        for name in given:
+            if name not in possible:
+                expected = ", ".join(sorted(possible))
+                raise UserError(f"--{option} {name}: expected some of {expected}")
+    wanted = [case._replace(ways=ways_of(case, options)) for case in wanted]
+    if not any(case.ways for case in wanted):
+        raise UserError("--methods, --ways: none of these ways is of one of these methods")
     for case in wanted:
-        for method in methods_of(case, options.methods):
+        for method in methods_of(case):
             for seed in options.seeds:
                 for config in configurations(analysis, case, method, seed, options):
                     configs.check(config)
@@ -180,10 +190,19 @@ def _names(cases: Sequence[Case]) -> str:
     return ", ".join(case.name for case in cases)
 
 
-def methods_of(case: Case, wanted: Sequence[str] = ()) -> list[str]:
-    """The methods that a case has ways of, in their order; those wanted, or all."""
-    found = dict.fromkeys(way.method for way in case.ways)
-    return [method for method in found if not wanted or method in wanted]
+def ways_of(case: Case, options: Options) -> list[Way]:
+    """The ways of a case that are asked for."""
+    return [
+        way
+        for way in case.ways
+        if (not options.methods or way.method in options.methods)
+        and (not options.ways or way.name in options.ways)
+    ]
+
+
+def methods_of(case: Case) -> list[str]:
+    """The methods that a case has ways of, in their order."""
+    return list(dict.fromkeys(way.method for way in case.ways))
 
 
 def training_config(

@@ -155,7 +155,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
-        memory = module.encode(context, returns=to_go(context))
+        memory: PyTree = module.encode(context, returns=to_go(context))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = learning.make_init(setup, module, touch, optimizer)
