@@ -121,7 +121,7 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
         whole = {"temperature": 0.0, "windows": "start"}
         easier = {"neighbours": preset != "paper", "fewer_arms": True}
-        return {**rate, **whole, **easier, "steps": 1500, "batch": 64}
+        return {**rate, **whole, **easier, "batch": 64}
     return rate
 
 
