@@ -19,6 +19,8 @@ from leapjax.stars import graphs
 from leapjax.stars.graphs import Graph, StarAdapter
 from leapjax.types import Context
 
+LARGE = 20  # nodes: in a larger graph it takes long to find out by itself which edge leads where
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -116,13 +118,12 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a level changes of a method's own options."""
-    del name
-    rate = {"learning_rate": 1e-3}
+    options: dict[str, Any] = {"learning_rate": 1e-3}
     if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
-        whole = {"temperature": 0.0, "windows": "start"}
-        easier = {"neighbours": preset != "paper", "fewer_arms": True}
-        return {**rate, **whole, **easier, "batch": 64}
-    return rate
+        options |= {"temperature": 0.0, "windows": "start"}
+        if graphs.find_level(name).nodes > LARGE and preset != "paper":
+            options |= {"neighbours": True, "fewer_arms": True, "batch": 64}
+    return options
 
 
 STARS = DomainType(Settings, make, graphs.LEVELS, preset, tuned)
