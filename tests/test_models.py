@@ -559,7 +559,9 @@ def test_width_that_does_not_split_into_heads_is_refused():
     "options", [{"architecture": "paper"}, {"architecture": "leapjax", "attention": "causal"}]
 )
 def test_a_token_that_would_hold_what_it_may_not_see_is_refused(options):
-    with pytest.raises(ValueError, match="neighbours is for architecture 'leapjax' with attention"):
+    with pytest.raises(
+        ValueError, match="neighbours needs architecture 'leapjax', .* and attention 'full'"
+    ):
         ModelConfig(**options, neighbours=True)
 
 

@@ -34,7 +34,7 @@ class ModelConfig:
     dropout: float = 0.1  # of embeddings, attention and residuals
     dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
     attention: str = "full"  # of a plan's actions; "causal": no action sees a later one
-    neighbours: bool = False  # "leapjax": an action's token also holds the actions beside it
+    neighbours: bool = False  # LEAP's token of an action also holds the actions beside it
 
     def __post_init__(self) -> None:
         if self.architecture not in ARCHITECTURES:
@@ -49,8 +49,8 @@ class ModelConfig:
         check_at_least(self, 1, "layers", "heads", "width")
         if self.neighbours and (self.architecture, self.attention) != ("leapjax", "full"):
             raise ValueError(
-                "neighbours is for architecture 'leapjax' with attention 'full': a token would "
-                "hold an action that it may not see, or a state"
+                "neighbours needs architecture 'leapjax', where actions stand side by side, and "
+                "attention 'full': with 'causal' a token may not hold a later action"
             )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")

@@ -140,6 +140,7 @@ def leave_out_arms(key: jax.Array, window: Window, star: Star) -> Window:
     """
     count_key, arm_key = jax.random.split(key)
     graph = window.context.observation
+    # From each node to the next one of its arm; from the centre to any, but no edge ends there.
     following = jnp.arange(star.labels).at[graph.edges[:, 0]].set(graph.edges[:, 1])
     # Where the arm of each edge ends. (XLA would nest unrolled steps, and compile for minutes.)
     ends = jax.lax.fori_loop(0, star.length - 1, lambda _, at: following[at], graph.edges[:, 1])
