@@ -17,7 +17,8 @@ from leapjax.batching import compile_planner, plan_keys
 from leapjax.pretrained import Pretrained
 from leapjax.stars.graphs import Graph, Star, StarAdapter, find_level
 
-SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels
+SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels, as are the next two
+SPACING, MOST = 28, 1000  # from node to node; of a side
 PASS_MS, LAST_MS = 700, 2200
 SHOWN = ("Gibbs sampling, random order", "most certain first")
 WHITE, GREY, BLACK = (255, 255, 255), (170, 170, 170), (0, 0, 0)
@@ -56,16 +57,22 @@ def _frames(
     star: Star, graph: Graph, path: np.ndarray, traces: dict[str, np.ndarray]
 ) -> list[Frame]:
     """One frame for each pass, the planners side by side."""
-    places = layout(star, graph)
+    places, side = layout(star, graph), side_of(star)
     passes = len(next(iter(traces.values())))
     found = []
     for index in range(passes):
-        image = Image.new("RGB", (SIDE * len(traces), SIDE + CAPTION), WHITE)
+        image = Image.new("RGB", (side * len(traces), side + CAPTION), WHITE)
         for column, (name, trace) in enumerate(traces.items()):
-            panel = picture(graph, places, path, trace[: index + 1], name, index == passes - 1)
-            image.paste(panel, (SIDE * column, 0))
+            last = index == passes - 1
+            panel = picture(graph, places, side, path, trace[: index + 1], name, last)
+            image.paste(panel, (side * column, 0))
         found.append((image, LAST_MS if index == passes - 1 else PASS_MS))
     return found
+
+
+def side_of(star: Star) -> int:
+    """Pixels of a picture whose nodes do not cover each other, unless it would be too large."""
+    return min(max(SIDE, 2 * (SPACING * star.length + 2 * RADIUS)), MOST)
 
 
 def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
@@ -73,7 +80,8 @@ def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
     after: dict[int, list[int]] = {}
     for parent, child in graph.edges.tolist():
         after.setdefault(parent, []).append(child)
-    middle, step = SIDE / 2, (SIDE / 2 - 2 * RADIUS) / star.length
+    middle = side_of(star) / 2
+    step = (middle - 2 * RADIUS) / star.length
     places = {int(graph.node): (middle, middle)}
     for arm, first in enumerate(sorted(after[int(graph.node)])):
         angle = 2 * math.pi * arm / star.arms - math.pi / 2
@@ -90,6 +98,7 @@ def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
 def picture(
     graph: Graph,
     places: dict[int, tuple[float, float]],
+    side: int,
     path: np.ndarray,
     trace: np.ndarray,
     name: str,
@@ -99,7 +108,7 @@ def picture(
 
     Nodes of the plan are blue, those of this pass dark; at the end green where they are right.
     """  # fmt: skip
-    image = Image.new("RGB", (SIDE, SIDE + CAPTION), WHITE)
+    image = Image.new("RGB", (side, side + CAPTION), WHITE)
     pen = ImageDraw.Draw(image)
     plan = trace[-1]
     new = plan != (trace[-2] if len(trace) > 1 else np.full_like(plan, -1))
@@ -115,10 +124,10 @@ def picture(
         pen.ellipse(box, fill=colours.get(node, WHITE), outline=BLACK, width=3 if goal else 1)
         pen.text((x, y), str(node), fill=BLACK, anchor="mm")
     known = [str(node) if node in places else "?" for node in plan.tolist()]
-    pen.text((6, SIDE + 4), f"{name}: pass {len(trace)}", fill=BLACK)
+    pen.text((6, side + 4), f"{name}: pass {len(trace)}", fill=BLACK)
     way = f"from {int(graph.node)} to {int(graph.goal)}: {' '.join(known)}"
     right = bool((plan == path).all())
     pen.text(
-        (6, SIDE + 22), f"{way}   {'found' if right else 'wrong'}" if last else way, fill=BLACK
+        (6, side + 22), f"{way}   {'found' if right else 'wrong'}" if last else way, fill=BLACK
     )
     return image

@@ -206,6 +206,17 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.check(states._replace(goal=np.full(5, 50)), "here")
 
 
+@pytest.mark.parametrize("star", [STAR, Star(5, 10)])
+def test_nodes_are_drawn_apart_and_in_the_picture(star):
+    graph, _ = graphs.draw(star, 0)
+    places = np.array(list(star_animation.layout(star, graph).values()))
+    assert len(places) == star.nodes
+    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(star.nodes)
+    assert apart.min() > 2 * star_animation.RADIUS
+    assert (places > star_animation.RADIUS).all()
+    assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
+
+
 def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]
