@@ -23,7 +23,7 @@ SETTINGS = {
     "bcq": bcq.Settings(**QUICKLY),
     # Advantages are small here: far from the middle a wrong step costs a tenth.
     "iql": iql.Settings(**QUICKLY, inverse_temperature=30.0),
-    # What is imagined is wrong at first: with more of it, one run in eight ends up going one way.
+    # What is imagined is wrong at first: with more of it, some runs end up going one way.
     "mopo": mopo.Settings(**QUICKLY, inverse_temperature=10.0, real_share=0.8),
 }  # fmt: skip
 STEPS = 400
@@ -142,8 +142,7 @@ def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_ot
         rewards, disagreement = found[action]
         assert (disagreement < unseen).all()
         ends = 1 if action == LEFT else -1  # from where such a step leads to the middle
-        *_, second, most = np.sort(rewards)
-        assert mixed.PLACES[np.argmax(rewards)] == ends and most > max(1.25 * second, 0.15)
+        assert mixed.PLACES[np.argmax(rewards)] == ends and rewards.max() > 0.3
     assert metrics[-1]["ensemble"] < metrics[0]["ensemble"]
 
 

@@ -151,11 +151,7 @@ def test_a_position_of_a_plan_is_the_cell_that_it_fills():
     whole = np.asarray(places(context(0)))
     np.testing.assert_array_equal(whole, tokens[:cells])  # what the network sees of a cell
     assert len(np.unique(whole, axis=0)) == cells
-    for cell in (
-        1,
-        7,
-        15,
-    ):  # later in an episode a plan begins there; what is beyond does not count
+    for cell in (1, 7, 15):  # later in an episode a plan begins there, and ends beyond the board
         np.testing.assert_array_equal(places(context(cell))[: cells - cell], whole[cell:])
     assert np.isfinite(places(context(cells))).all()  # a solved board
 
