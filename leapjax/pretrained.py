@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import jax
 from jax.sharding import Mesh
 
 from leapjax import checkpoints, weights
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
 from leapjax.domain import Domain
 from leapjax.domains import find_domain
@@ -98,7 +98,13 @@ def identity(specification: Specification) -> str:
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
     changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
-    return json.dumps(values | changed, sort_keys=True)
+    named = values | changed | {"training": without_unnamed(changed["training"])}
+    return json.dumps(named, sort_keys=True)
+
+
+def without_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of training that a result depends on."""
+    return {name: value for name, value in training.items() if name not in UNNAMED}
 
 
 def save_specification(folder: Path, specification: Specification) -> None:

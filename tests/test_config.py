@@ -51,7 +51,7 @@ def test_what_a_result_depends_on_is_in_its_hash(option):
 @pytest.mark.parametrize(
     "option",
     ["--seeds 1 2", "--record", "--runs elsewhere", "--no-pictures", "--checkpoint-seconds 1",
-     "--fsdp 2", "--demos 500"],
+     "--fsdp 2", "--microbatch 8", "--demos 500"],
 )  # fmt: skip
 def test_what_it_does_not_depend_on_is_not(option):
     assert configuration_hash(parse(*option.split()), 0) == configuration_hash(parse(), 0)

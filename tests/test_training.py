@@ -519,6 +519,35 @@ def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
     assert_same_step(actual, expected)
 
 
+@pytest.mark.parametrize("microbatch", [0, 2, 3])
+def test_what_is_prepared_for_all_examples_has_its_part_in_the_gradient(microbatch):
+    def prepare(params, example):
+        return (jnp.tanh(params["first"] * example), jnp.sin(params["both"]))
+
+    def loss(params, extra, example, key, seen, both):
+        noise = jax.random.uniform(key)
+        value = jnp.sum((params["second"] + noise) * seen) * both + extra * params["both"]
+        return value, {"seen": seen.sum()}
+
+    def alone(params, extra, example, key):
+        return loss(params, extra, example, key, *prepare(params, example))
+
+    params = {"first": jnp.arange(1.0, 4), "second": jnp.array(0.5), "both": jnp.array(0.7)}
+    batch = jax.random.normal(jax.random.key(1), (6, 3))
+    optimizer = optax.trace(0.0)  # which remembers the gradient
+    state = TrainState(params, optimizer.init(params), jnp.int32(0), jnp.array(2.0))
+
+    def gradient(example_loss, **options):
+        update = jax.jit(learning.make_update(example_loss, optimizer, **options))
+        state_after, metrics = update(state, batch, jax.random.key(2))
+        return state_after.optimizer.trace, metrics
+
+    expected = gradient(alone)
+    assert all(jnp.abs(leaf).min() > 1e-3 for leaf in jax.tree.leaves(expected[0]))
+    actual = gradient(loss, microbatch=microbatch, prepare=prepare)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), actual, expected)
+
+
 def test_a_mesh_has_as_many_devices_as_split_the_batch():
     assert len(jax.devices()) == 8
     sizes = {batch: sharding.make_mesh(batch).size for batch in (1, 2, 7, 12, 22, 64)}

@@ -14,7 +14,7 @@ from leapjax.agents.learning import Method, Presets, Setup
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
-from leapjax.models.trajectory import Model
+from leapjax.models.trajectory import Model, Seen
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
 PRESETS: Presets = {
@@ -84,25 +84,33 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
     energy = learning.keeping(energy, setup, lambda memory: memory.states)
 
+    def see(params: Params, context: Context) -> Seen:
+        seen = module.apply(params, context, method="see")
+        assert isinstance(seen, Seen)
+        return seen
+
+    def see_window(params: Params, window: Window) -> tuple[Seen]:
+        return (see(params, window.context),)
+
     def window_loss(
         params: Params,
         extra: PyTree,
         window: Window,
         key: jax.Array,
-        states: jax.Array | None = None,
+        seen: Seen | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Masked cross-entropy of one window (paper, equation 1), and its accuracy.
 
-        `states`, `[K + 1, D]`, is what the network sees in it, if that is known.
+        `seen` is what the paper's network sees in it, if that is known.
         """
         del extra
-        seen: Any = {} if states is None else {"states": states}
+        given: Any = {} if seen is None else {"seen": seen}
         mask_key, encode_key, *_ = keys = jax.random.split(key, 2 + sizes.horizon)
         masks = schedules.sample_masks(mask_key, sizes.horizon, masking)  # [C, T]
         memory = module.apply(
             params, window.context, deterministic=False, method="encode",
             rngs={"dropout": encode_key}, returns=to_go(window.context, window.return_to_go),
-            **seen,
+            **given,
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
@@ -136,22 +144,27 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         So a state sees the frames before it even at the front of a window, where those before
         the window are unknown if it is encoded alone (Atari's first three).
         """
-        states: Any = module.apply(params, windows.joined(run), method="see")  # [K + S, D]
+        states = see(params, windows.joined(run)).states  # [K + S, D]
         keys = jax.random.split(key, run.actions.shape[0])
 
         def loss(window: Window, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
             place = window.context.step - run.context.step[0]
-            seen = jax.lax.dynamic_slice_in_dim(states, place, sizes.context + 1)
-            return window_loss(params, extra, window, key, seen)
+            own = jax.lax.dynamic_slice_in_dim(states, place, sizes.context + 1)
+            return window_loss(params, extra, window, key, Seen(own))
 
         losses, metrics = jax.vmap(loss)(run, keys)
         return losses.mean(), jax.tree.map(jnp.mean, metrics)
 
     # To the other architecture, what a state is depends on the window that it is seen in.
-    in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
+    paper = setup.model.architecture == "paper"
+    in_runs = setup.training.run > 1 and paper
+    # A single state is little work, and its copies much: few windows at a time suit these alone.
+    at_once = paper and not in_runs and sizes.context == 0
     update = learning.make_update(
-        run_loss if in_runs else window_loss, optimizer, mesh, microbatch=setup.training.microbatch
-    )
+        run_loss if in_runs else window_loss, optimizer, mesh,
+        microbatch=setup.training.microbatch,
+        prepare=see_window if at_once else learning.nothing_prepared,
+    )  # fmt: skip
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:

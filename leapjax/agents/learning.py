@@ -45,6 +45,9 @@ SINGLE_ACTION_PRESETS: Presets = {
     name: {**SINGLE_ACTION, **options} for name, options in NETWORK_PRESETS.items()
 }
 UNDECAYED = ("bias", "scale", "embedding")
+# Settings of training that change how a step is computed, and not what comes of it: no name of a
+# run or a checkpoint is made from them.
+UNNAMED = ("microbatch",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,9 +161,15 @@ def untrained(energy: Energy) -> Agent:
     return Agent(init, lambda key, steps: (), update, energy)
 
 
-ExampleLoss = Callable[[Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
-# (params, extra, example, key) -> loss [] and metrics
+ExampleLoss = Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
+# (params, extra, example, key, *prepared) -> loss [] and metrics
 Update = Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
+
+
+def nothing_prepared(params: Params, example: PyTree) -> tuple[()]:
+    """What most losses are given of an example beside itself."""
+    del params, example
+    return ()
 
 
 def make_update(
@@ -169,6 +178,7 @@ def make_update(
     mesh: Mesh | None = None,
     next_extra: Callable[[PyTree, Params], PyTree] = lambda extra, params: extra,
     microbatch: int = 0,
+    prepare: Callable[[Params, PyTree], tuple[PyTree, ...]] = nothing_prepared,
 ) -> Update:
     """An agent's `update`: the loss and the metrics are means over the batch.
 
@@ -179,19 +189,34 @@ def make_update(
             one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
         microbatch: see `TrainingConfig`.
+        prepare: (params, example) -> what the loss is given as well. It is computed for all
+            examples of a device at once, however few of them the loss takes at a time.
     """
 
     def batch_loss(
-        params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        params: Params, prepared: PyTree, extra: PyTree, batch: PyTree, key: jax.Array,
+        first: jax.Array | int,
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:  # fmt: skip
         # Keys by place in the whole batch: however it is split, an example meets its own.
         places = first + jnp.arange(jax.tree.leaves(batch)[0].shape[0])
         keys = jax.vmap(lambda place: jax.random.fold_in(key, place))(places)
-        each = jax.vmap(example_loss, in_axes=(None, None, 0, 0))
-        losses, metrics = each(params, extra, batch, keys)
+        each = jax.vmap(example_loss, in_axes=(None, None, 0, 0, *(0 for _ in prepared)))
+        losses, metrics = each(params, extra, batch, keys, *prepared)
         return losses.mean(), jax.tree.map(jnp.mean, metrics)
 
-    differentiate = _in_parts(jax.value_and_grad(batch_loss, has_aux=True), microbatch)
+    in_parts = _in_parts(jax.value_and_grad(batch_loss, argnums=(0, 1), has_aux=True), microbatch)
+
+    def differentiate(
+        params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
+    ) -> PyTree:
+        """((loss, metrics), gradients) of the examples of a device."""
+
+        def prepare_all(params: Params) -> PyTree:
+            return jax.vmap(prepare, in_axes=(None, 0))(params, batch)
+
+        prepared, pull_back = jax.vjp(prepare_all, params)
+        means, (gradients, of_prepared) = in_parts(params, prepared, extra, batch, key, first)
+        return means, jax.tree.map(jnp.add, gradients, *pull_back(of_prepared))
 
     def mean_gradient(params: Params, extra: PyTree, batch: PyTree, key: jax.Array) -> PyTree:
         """((loss, metrics), gradients) of a batch."""
@@ -233,29 +258,37 @@ def _in_parts(differentiate: Callable[..., PyTree], rows: int) -> Callable[..., 
     """`differentiate`, whose results are means over examples, for a few examples at a time.
 
     Args:
-        differentiate: (params, extra, batch, key, place of its first example) -> means.
+        differentiate: (params, prepared, extra, batch, key, place of its first example) ->
+            means, (gradients by the parameters, by what was prepared of each example).
         rows: at most so many; 0 for the whole batch at once.
     """
 
     def accumulated(
-        params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
-    ) -> PyTree:
+        params: Params, prepared: PyTree, extra: PyTree, batch: PyTree, key: jax.Array,
+        first: jax.Array | int,
+    ) -> PyTree:  # fmt: skip
         size = jax.tree.leaves(batch)[0].shape[0]
         if rows == 0 or size <= rows:
-            return differentiate(params, extra, batch, key, first)
+            return differentiate(params, prepared, extra, batch, key, first)
         count = next(count for count in range(-(-size // rows), size + 1) if size % count == 0)
-        parts = jax.tree.map(lambda x: x.reshape(count, size // count, *x.shape[1:]), batch)
+        parts = jax.tree.map(
+            lambda x: x.reshape(count, size // count, *x.shape[1:]), (prepared, batch)
+        )
         places = first + jnp.arange(count) * (size // count)
 
-        def add(total: PyTree, part: PyTree) -> tuple[PyTree, None]:
-            means = differentiate(params, extra, part[0], key, part[1])
-            return jax.tree.map(jnp.add, total, means), None
+        def add(total: PyTree, part: PyTree) -> tuple[PyTree, PyTree]:
+            (prepared, batch), place = part
+            means, (gradients, each) = differentiate(params, prepared, extra, batch, key, place)
+            return jax.tree.map(jnp.add, total, (means, gradients)), each
 
         one = jax.tree.map(lambda x: x[0], parts)
-        shapes = jax.eval_shape(differentiate, params, extra, one, key, first)
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        total, _ = jax.lax.scan(add, zeros, (parts, places))
-        return jax.tree.map(lambda x: x / count, total)
+        means, (gradients, _) = jax.eval_shape(
+            differentiate, params, one[0], extra, one[1], key, first
+        )
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (means, gradients))
+        total, each = jax.lax.scan(add, zeros, (parts, places))
+        (means, gradients), each = jax.tree.map(lambda x: x / count, (total, each))
+        return means, (gradients, jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), each))
 
     return accumulated
 

@@ -254,17 +254,23 @@ class StateTokens(nn.Module):
     def __call__(self, context: Context, ahead: bool = False) -> jax.Array:
         """`[K + 1, D]`: the past states and the current one; last, if asked for, that of `ahead`.
 
-        All in one batch, which takes less than one after the other.
+        All in one batch, which takes less than one after the other; but what lies ahead differs
+        from now in the pose alone, which is read late: up to there both are one.
         """
         instruction = self.instruction(context.observation.instruction).whole
-        states = [context.observation, _nowhere(context.observation)][: 1 + ahead]
-        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-        if context.encoded is None:
-            states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), context.past, states)
-        tokens = jax.vmap(self.state, in_axes=(0, None))(states, instruction)
-        if context.encoded is None:
-            return tokens
-        return jnp.concatenate([context.encoded, tokens])
+        now, past, known = context.observation, context.past, context.encoded
+        read = jax.vmap(self.state, in_axes=(0, None))
+        if not ahead:
+            states = jax.tree.map(lambda leaf: leaf[None], now)
+            if known is None:
+                states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), past, states)
+            tokens = read(states, instruction)
+        else:
+            poses = jnp.stack([now.pose, _nowhere(now).pose])
+            tokens = jax.vmap(lambda pose: self.state(now._replace(pose=pose), instruction))(poses)
+            if known is None and context.actions.shape[0]:
+                known = read(past, instruction)
+        return tokens if known is None else jnp.concatenate([known, tokens])
 
     def ahead(self, context: Context) -> jax.Array:
         """`[D]`: what later states of a plan are taken for, whose pose nobody knows: (0, 0, 0)."""

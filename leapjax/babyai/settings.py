@@ -74,11 +74,13 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
 def _tuned_paper(level: Level, method: str) -> Mapping[str, Any]:
     """LEAP is as in the authors' code (docs/experiments.md); contexts are the appendix's."""
     if method == "leap":
-        options: dict[str, Any] = {"end": False, "repeat_state": False}
+        options: dict[str, Any] = {"end": False, "repeat_state": False, "microbatch": 4}
         if level.name == "PickUpLoc":  # learned from the state alone: one copy of each window
             options |= {"masking": "all", "microbatch": 0}
         if level.name.startswith("GoToObjMazeS7"):  # the appendix: 15 and 50, which learn less
             options |= {"horizon": 10, "iterations": 30}
+        if level.horizon > 5:  # more copies of each window
+            options["microbatch"] = 2
         return options
     if method in ("classifier", "plate", "random"):
         return {}

@@ -89,6 +89,13 @@ class Memory(NamedTuple):
     states: jax.Array  # [K + 1, D] what each state of the context looks like
 
 
+class Seen(NamedTuple):
+    """What the states that a plan is about look like, to the paper's network."""
+
+    states: jax.Array  # [K + 1, D] of the context
+    ahead: jax.Array | None = None  # [D] later ones of the plan; None: nobody has looked
+
+
 class PaperModel(nn.Module):
     """The network of the paper's appendix: state and action tokens, interleaved.
 
@@ -122,16 +129,19 @@ class PaperModel(nn.Module):
         self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
-    def see(self, context: Context) -> jax.Array:
-        """A token `[K + 1, D]` for each state of a context of any length."""
-        return self.states(context)
+    def see(self, context: Context) -> Seen:
+        """A token for each state of a context of any length, and for those that follow."""
+        if self.repeat_state:
+            return Seen(self.states(context))
+        tokens = self.states(context, ahead=True)
+        return Seen(tokens[:-1], tokens[-1])
 
     def encode(
         self,
         context: Context,
         deterministic: bool = True,
         returns: jax.Array | None = None,
-        states: jax.Array | None = None,
+        seen: Seen | None = None,
     ) -> Memory:
         """What every pass shares: the context's keys and values, per layer, and embeddings.
 
@@ -143,17 +153,12 @@ class PaperModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
-            states: what `see` has made of the context, if it has.
+            seen: what `see` has made of the context, if it has.
         """
         horizon = self.sizes.horizon
-        if self.repeat_state:
-            states = self.see(context) if states is None else states
-            ahead = states[-1]
-        elif states is None:
-            seen = self.states(context, ahead=True)
-            states, ahead = seen[:-1], seen[-1]
-        else:
-            ahead = self.states.ahead(context)
+        states, ahead = self.see(context) if seen is None else seen
+        if ahead is None:
+            ahead = states[-1] if self.repeat_state else self.states.ahead(context)
 
         def with_plan(known: jax.Array, later: jax.Array) -> jax.Array:
             return jnp.concatenate([known, jnp.repeat(later[None], horizon - 1, axis=0)])
