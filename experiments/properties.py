@@ -12,20 +12,26 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+from minigrid.core.world_object import WorldObj
 
 from experiments.common import analysis
 from experiments.common.analysis import Analysis, Case, Model, Way
-from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
+    goal_before_visit,
     half_of_obstacles,
     immediate_lava,
     lava,
     left_turns,
     told_to_go,
+    turns_over,
+    unvisited,
     without_lava,
+    without_marks,
     without_open_doors,
 )
 from leapjax.babyai.levels import find_level
+from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import LEFT
 from leapjax.energy import compose, constrain, neutral, view
 from leapjax.environments import Transition
@@ -33,6 +39,8 @@ from leapjax.planners import GibbsConfig
 from leapjax.types import Context, Energy
 
 Penalty = Callable[[Context, jax.Array], jax.Array]
+TURN_BUDGET = 5  # enough to visit a cell of an empty room, and then to face an object
+ROOM_STEPS = 64  # of the longest episode in one
 WEIGHT = 20.0  # of a violation, in nats: more than any detour costs
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
@@ -68,14 +76,55 @@ class WatchedTurns(Watched):
         return super().step(action)
 
 
+class WatchedErrand(BabyAIAdapter):
+    """Needs the coloured cell to be visited; counts goals before that, and turns over a budget."""
+
+    def __init__(self, level: str) -> None:
+        super().__init__(find_level(level))
+        self.violations = 0
+        self._turns = 0
+
+    def reset(self, seed: int) -> Observation:
+        """Starts the level of a seed."""
+        self._turns = 0
+        return super().reset(seed)
+
+    def step(self, action: int) -> Transition:
+        """Takes one of MiniGrid's first six actions; what was visited is a cell like others."""
+        self._turns += action in TURNS
+        self.violations += action in TURNS and self._turns > TURN_BUDGET
+        transition = super().step(action)
+        x, y = self.env.agent_pos
+        if _is_marked(self.env.grid.get(x, y)):
+            self.env.grid.set(x, y, None)
+        early = transition.success and any(map(_is_marked, self.env.grid.grid))
+        self.violations += early
+        return transition._replace(success=transition.success and not early)
+
+
+def _is_marked(cell: WorldObj | None) -> bool:
+    return cell is not None and cell.type == "floor"
+
+
 def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[Energy]], Energy]:
-    """The energy of a model that sees no lava, and penalties that do."""
+    """The energy of a model that sees neither lava nor coloured cells, and penalties that do."""
 
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
         return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
 
-    return lambda energies: constrain(view(energies[0], without_lava), penalty, partial=True)
+    def sees(context: Context) -> Context:
+        return without_marks(without_lava(context))
+
+    return lambda energies: constrain(view(energies[0], sees), penalty, partial=True)
+
+
+few_turns = functools.partial(turns_over, budget=TURN_BUDGET)
+
+
+def first_turns(context: Context, actions: jax.Array) -> jax.Array:
+    """The same of the next action alone."""
+    return few_turns(context, actions[:1])
 
 
 # What judges the next action alone: those that violate anything at once are removed.
@@ -215,6 +264,15 @@ CASES = (
     ),
     _constraints("room", ROOM, "GoToLavaMedium"),
     _constraints("maze", OPEN_MAZE, "GoToLavaHard"),
+    Case(
+        "constraints-errand", [ROOM], "GoToVia",
+        [
+            Way("whole plan", minimise=unseen(unvisited, few_turns), search=left_to_right),
+            Way("dt", "dt", masked(goal_before_visit, first_turns), wandering),
+            Way("iql", "iql", masked(goal_before_visit, first_turns), wandering),
+        ],
+        WatchedErrand, remembered=ROOM_STEPS,
+    ),
 )  # fmt: skip
 ANALYSIS = Analysis("properties", CASES)
 

@@ -5,9 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.properties import WatchedErrand
 from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
-from leapjax.babyai.constraints import immediate_lava, lava, left_turns, told_to_go
-from leapjax.babyai.dynamics import FORWARD, roll
+from leapjax.babyai.constraints import (
+    goal_before_visit,
+    immediate_lava,
+    lava,
+    left_turns,
+    told_to_go,
+    turns_over,
+    unvisited,
+)
+from leapjax.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.vocabulary import decode
 from leapjax.rollouts import History
@@ -85,6 +94,63 @@ def test_left_turns_count_until_the_plan_ends():
     context = context_of(adapter, adapter.reset(0))
     assert float(left_turns(context, jnp.array([LEFT, RIGHT, LEFT, END, LEFT]))) == 2
     assert float(left_turns(context, jnp.array([MASK, LEFT, LEFT]))) == 0
+
+
+def test_turns_that_are_remembered_and_planned_count_against_a_budget():
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    context = History(adapter.reset(0), 3, adapter.num_actions).context()
+    plan = jnp.array([LEFT, FORWARD, RIGHT, END, LEFT])
+    assert [float(turns_over(context, plan, budget)) for budget in (3, 2, 1, 0)] == [0, 0, 1, 2]
+    context = context._replace(actions=np.array([LEFT, FORWARD, RIGHT], np.int32))
+    assert float(turns_over(context, plan, 3)) == 1
+    assert float(turns_over(context, jnp.array([MASK, LEFT, LEFT]), 2)) == 0
+
+
+def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
+    size, start = 7, (3, 3, 0)
+    found, layer = {}, [start]
+    for steps in range(4 * size):  # breadth first, as MiniGrid turns and moves
+        found |= dict.fromkeys((pose for pose in layer if pose not in found), steps)
+        following = []
+        for x, y, direction in layer:
+            dx, dy = [(1, 0), (0, 1), (-1, 0), (0, -1)][direction]
+            following += [(x, y, (direction + 1) % 4), (x, y, (direction - 1) % 4)]
+            following += [(x + dx, y + dy, direction)]
+        layer = [p for p in set(following) if p not in found and 0 <= min(p[:2]) <= max(p) < size]
+    for cell in {pose[:2] for pose in found}:
+        fewest = min(found[(*cell, direction)] for direction in range(4))
+        assert int(steps_to(jnp.array(start), jnp.array(cell))) == fewest
+
+
+def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal():
+    """As the world decides: it ends at the goal, and forgets a cell that was visited."""
+    adapter, rng = WatchedErrand("GoToVia"), np.random.default_rng(0)
+    distance, early = jax.jit(unvisited), jax.jit(goal_before_visit)
+    outcomes = set()
+    for seed in range(40):
+        observation = adapter.reset(seed)
+        actions = rng.choice([LEFT, RIGHT, FORWARD, FORWARD, FORWARD], 60)
+        before = History(observation, 0, adapter.num_actions).context()
+        played = []
+        for action in actions.tolist():
+            violations = adapter.violations
+            played.append(action)
+            context = History(observation, 0, adapter.num_actions).context()
+            transition = adapter.step(action)
+            observation = transition.observation
+            ended_early = transition.terminated and not transition.success
+            assert float(early(context, jnp.array([action, MASK]))) == ended_early
+            if ended_early:
+                assert adapter.violations > violations
+            if transition.terminated or transition.truncated:
+                break
+        tried = np.array(played + [END] * (60 - len(played)))
+        missed = float(distance(before, tried))
+        marks = (observation.grid[..., 0] == FLOOR).any()
+        assert (missed > 0) == marks
+        assert (missed >= observation.grid[..., 0].size) == ended_early
+        outcomes.add((bool(marks), bool(transition.success)))
+    assert outcomes >= {(True, False), (False, True)}
 
 
 def test_who_should_pick_something_up_is_told_to_go_to_it():

@@ -5,11 +5,18 @@ from collections import Counter
 import jax
 import numpy as np
 import pytest
+from minigrid.core.constants import DIR_TO_VEC
 
+from experiments.properties import TURN_BUDGET, WatchedErrand
 from leapjax.babyai import demonstrations, observations
 from leapjax.babyai.adapter import END, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import half_of_obstacles, without_lava, without_open_doors
-from leapjax.babyai.dynamics import LAVA
+from leapjax.babyai.constraints import (
+    half_of_obstacles,
+    without_lava,
+    without_marks,
+    without_open_doors,
+)
+from leapjax.babyai.dynamics import FLOOR, LAVA
 from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
 from leapjax.rollouts import History
 
@@ -55,6 +62,41 @@ def straight(observation, goal, lava, wide):
     if not wide:
         assert len(on_row) <= 1 and len(on_column) <= 1
         assert len(columns) == 0 or on_row or (goal in [(a, y) for a in columns])
+
+
+def fewest_turns(adapter, observation):
+    """On ways that visit the coloured cell and then face the goal."""
+    free = observation.grid[..., 0] != 2
+    free[adapter.goal] = False
+    (mark,) = cells_of(observation, FLOOR)
+    found, layer, turns = set(), {(*map(int, observation.pose), False)}, 0
+    while True:
+        stack = list(layer)
+        while stack:  # moves are free
+            x, y, direction, visited = state = stack.pop()
+            if state in found:
+                continue
+            found.add(state)
+            dx, dy = DIR_TO_VEC[direction]
+            front = (int(x + dx), int(y + dy))
+            if front == adapter.goal and visited:
+                return turns
+            if free[front] and (visited or not facing(x, y, direction, adapter.goal)):
+                stack.append((*front, direction, visited or front == mark))
+        layer = {(x, y, (d + by) % 4, v) for x, y, d, v in found for by in (-1, 1)} - found
+        turns += 1
+
+
+def facing(x, y, direction, cell):
+    return tuple(map(int, (x, y) + DIR_TO_VEC[direction])) == cell
+
+
+def test_there_is_one_coloured_cell_and_turns_enough_to_visit_it():
+    adapter = WatchedErrand("GoToVia")
+    turns = Counter(fewest_turns(adapter, adapter.reset(seed)) for seed in EPISODES)
+    assert 3 < max(turns) <= TURN_BUDGET
+    seen = without_marks(first("GoToVia", 0)[1]).observation
+    assert not cells_of(jax.device_get(seen), FLOOR)
 
 
 def test_the_planner_sees_no_lava_and_everything_else():

@@ -6,6 +6,7 @@ Each way of asking is a row beside the paper's number. What must be trained is w
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -24,8 +25,9 @@ from experiments.common.interruption import Interruption
 from experiments.common.results import Row
 from leapjax import pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.data import seeds
+from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
+from leapjax.energy import view
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
 from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, ShootingConfig
@@ -64,6 +66,7 @@ class Case(NamedTuple):
     ways: Sequence[Way]
     adapter: Callable[[str], Adapter] | None = None
     # makes one of a level; its `violations`, a number, are counted over all episodes
+    remembered: int = 0  # past steps that a way may look at; a model sees no more than its own
 
 
 class Analysis(NamedTuple):
@@ -312,14 +315,22 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
         return experiment.train(this, work.options.played, stack, plays=False)[0]
 
 
-def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
+def asked(
+    way: Way, models: Sequence[Pretrained], search: PlannerConfig, remembered: int = 0
+) -> Pretrained:
     """The models of a case as one planner, which minimises what a way says."""
-    energy = way.minimise([model.energy for model in models])
+    specification = models[0].specification
+    energies = [model.energy for model in models]
+    if remembered > specification.context:
+        recent = functools.partial(windows.recent, length=specification.context)
+        energies = [view(energy, recent) for energy in energies]
+        specification = dataclasses.replace(specification, context=remembered)
+    energy = way.minimise(energies)
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     # What weighs many plans of a context at once has a full batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
     plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
-    return Pretrained(models[0].specification, energy, params, plan)
+    return Pretrained(specification, energy, params, plan)
 
 
 def play(
@@ -342,12 +353,12 @@ def play(
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
-        planner = asked(way, models, config)
+        planner = asked(way, models, config, case.remembered)
         run.warm_up(planner, domain, options.episodes, way.executed)
         adapters.clear()
         return rollouts.evaluate(
             make_adapter, options.played, planner.plan, planner.params,
-            context=specification.context, seed=seed, executed=way.executed,
+            context=planner.specification.context, seed=seed, executed=way.executed,
             progress=lambda over, good: interruption.check(),
         )  # fmt: skip
 

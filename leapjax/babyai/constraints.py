@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
-from leapjax.babyai.adapter import END
-from leapjax.babyai.dynamics import DOOR, LAVA, OPEN, roll
+from leapjax.babyai.adapter import END, TURNS
+from leapjax.babyai.dynamics import DOOR, FLOOR, LAVA, OPEN, facing, roll, steps_to
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
@@ -38,13 +38,53 @@ def _lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
 def left_turns(context: Context, actions: jax.Array) -> jax.Array:
     """Turns to the left before the plan ends, as if they were forbidden."""
     del context
-    done = jnp.cumsum(actions >= END) == 0
-    return jnp.sum((actions == LEFT) & done).astype(jnp.float32)
+    return jnp.sum((actions == LEFT) & _before_end(actions)).astype(jnp.float32)
+
+
+def turns_over(context: Context, actions: jax.Array, budget: int) -> jax.Array:
+    """Turns over a budget: those that the context remembers, and those of the plan."""
+    turns = jnp.array(TURNS)
+    taken = jnp.isin(jnp.asarray(context.actions), turns).sum()
+    planned = (jnp.isin(actions, turns) & _before_end(actions)).sum()
+    return jnp.maximum(taken + planned - budget, 0).astype(jnp.float32)
+
+
+def _before_end(actions: jax.Array) -> jax.Array:
+    """`[T]` bool: what of a plan is executed, as far as it is certain."""
+    return jnp.cumsum(actions >= END) == 0
+
+
+def unvisited(context: Context, actions: jax.Array) -> jax.Array:
+    """How far from the coloured cell a plan ends that does not visit it, in steps; 0 if it does.
+
+    Much farther, if it gets to the goal before.
+    """
+    observation = context.observation
+    marked = jnp.asarray(observation.grid)[..., 0] == FLOOR
+    poses = roll(observation, actions)
+    visited = jnp.cumsum(marked[poses[:, 0], poses[:, 1]]) > 0
+    early = (facing(poses, observation.goal) & ~visited)[1:].any()
+    cell = jnp.stack(jnp.unravel_index(jnp.argmax(marked), marked.shape))
+    far = jnp.where(visited[-1], 0, steps_to(poses[-1], cell)) + early * marked.size
+    return jnp.where(marked.any(), far, 0).astype(jnp.float32)
+
+
+def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
+    """Whether the first action leads to the goal while a coloured cell is left: 1, or 0."""
+    observation = context.observation
+    poses = roll(observation, actions[:1])
+    left = (jnp.asarray(observation.grid)[..., 0] == FLOOR).any()
+    return (left & facing(poses[1:], observation.goal).any()).astype(jnp.float32)
 
 
 def without_lava(context: Context) -> Context:
     """A context in which lava cells look empty."""
     return _hiding(context, lambda grid, goal: grid[..., 0] == LAVA)
+
+
+def without_marks(context: Context) -> Context:
+    """A context in which coloured cells look empty."""
+    return _hiding(context, lambda grid, goal: grid[..., 0] == FLOOR)
 
 
 def without_open_doors(context: Context) -> Context:

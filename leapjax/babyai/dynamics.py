@@ -8,7 +8,7 @@ from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import AGENT, DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 
 FORWARD = ACTIONS.index("forward")
-FLOOR, DOOR, GOAL, LAVA = 3, 4, 8, 9  # MiniGrid's object indices
+FLOOR, DOOR, GOAL, LAVA = 3, 4, 8, 9  # MiniGrid's object indices; a floor is a coloured cell
 OPEN = 0  # MiniGrid's state of an open door
 PASSABLE = (EMPTY, FLOOR, GOAL, LAVA, AGENT)  # the agent's mark hides what it stands on
 
@@ -50,3 +50,18 @@ def roll(observation: Observation, actions: jax.Array) -> jax.Array:
     start = jnp.asarray(observation.pose)
     _, poses = jax.lax.scan(move, (start, jnp.bool_(False)), actions)
     return jnp.concatenate([start[None], poses])
+
+
+def facing(poses: jax.Array, cell: jax.Array) -> jax.Array:
+    """`[n]` bool: at which of the poses `[n, 3]` an agent faces a cell `[2]`."""
+    front = poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
+    return (front == cell).all(axis=1)
+
+
+def steps_to(pose: jax.Array, cell: jax.Array) -> jax.Array:
+    """`[]` int32: turns and moves from a pose `[3]` to a cell `[2]`, if nothing is in the way."""
+    offset = jnp.asarray(cell) - pose[:2]
+    ahead = offset @ jnp.asarray(DIRECTION_VECTORS)[pose[2]]
+    moves = jnp.abs(offset).sum()
+    turns = jnp.where(ahead < 0, 2, moves > jnp.abs(ahead))
+    return moves + turns

@@ -88,6 +88,7 @@ MODIFIED = {
         _room("GoToLavaEasy", "GoToBehindLava", 8, lava=2),
         _room("GoToLavaMedium", "GoToBehindLava", 8, lava=worlds.MOST_LAVA),
         _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),
+        _room("GoToVia", "GoToVia", 8),
         # Generalisation: learned in one room.
         _room("GoToLocalS8N15", "GoToLocal", 8, 15),
         _room("GoToLocalS7N1", "GoToLocal", 7),
@@ -162,6 +163,7 @@ def make_environment(level: Level) -> RoomGridLevel:
         "GoToSeq": {**rooms, **distractors},
         "GoToBehindLava": {"room_size": level.room_size, "wide": level.lava > 2},
         "GoToAmongLava": {**rooms, **distractors, "cells": level.lava},
+        "GoToVia": {"room_size": level.room_size, **distractors},
         "GoToBehindObstacles": {"room_size": level.room_size, "obstacles": level.distractors},
         "PickUpLocal": {"room_size": level.room_size, **distractors},
         "PickUp": {**rooms, **distractors, "doors_open": level.doors == "open"},

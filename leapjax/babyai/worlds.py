@@ -3,7 +3,7 @@
 The paper says little of them; the details are those of its authors' code.
 """
 
-from minigrid.core.world_object import Ball, Box, Key, Lava
+from minigrid.core.world_object import Ball, Box, Floor, Key, Lava
 from minigrid.envs.babyai import GoTo, GoToLocal
 from minigrid.envs.babyai.core.roomgrid_level import RejectSampling, RoomGridLevel
 from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc, PickupInstr
@@ -102,6 +102,18 @@ class GoToBehindObstacles(RoomGridLevel):
             self.put_obj(kind(self._rand_color()), *cell)
         self.check_objs_reachable()
         self.instrs = GoToInstr(ObjDesc(key.type, key.color))
+
+
+class GoToVia(GoToLocal):
+    """One room and one object; and a coloured cell, somewhere, that is to be visited first.
+
+    The instruction does not say so.
+    """
+
+    def gen_mission(self) -> None:
+        """Places everything."""
+        super().gen_mission()
+        self.place_obj(Floor("yellow"))
 
 
 class PickUpLocal(GoToLocal):

@@ -210,6 +210,17 @@ def joined(run: Window) -> Context:
     )
 
 
+def recent(context: Context, length: int) -> Context:
+    """The same context with only the last `length` of its past steps; nothing encoded is kept."""
+    first = context.actions.shape[0] - length
+    return context._replace(
+        past=jax.tree.map(lambda leaf: leaf[first:], context.past),
+        actions=context.actions[first:],
+        rewards=context.rewards[first:],
+        encoded=None,
+    )
+
+
 def before(context: Context) -> Context:
     """The context of a transition (K + 1 past steps) as it was before its step (K of them)."""
     reward = context.rewards[-1]
