@@ -267,7 +267,10 @@ CASES = (
     Case(
         "constraints-errand", [ROOM], "GoToVia",
         [
-            Way("whole plan", minimise=unseen(unvisited, few_turns), search=left_to_right),
+            Way(
+                "whole plan", minimise=unseen(unvisited, few_turns), search=left_to_right,
+                executed=3,
+            ),
             Way("dt", "dt", masked(goal_before_visit, first_turns), wandering),
             Way("iql", "iql", masked(goal_before_visit, first_turns), wandering),
         ],
