@@ -15,6 +15,7 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import toy
+from tests.enumerable import quick_jit
 
 TRAINING = TrainingConfig(steps=150, batch=16, warmup=10, learning_rate=1e-2, windows="step")
 MODEL = ModelConfig(layers=1, heads=1, width=16, dropout=0.0)
@@ -55,8 +56,8 @@ def test_its_energy_is_minus_the_logits_and_the_end_is_never_chosen(trained):
     agent, params, _ = trained
     _, given = contexts()
     context = jax.tree.map(lambda leaf: leaf[0], given)
-    memory = jax.jit(agent.energy.encode)(params, context)
-    (energies,) = jax.jit(agent.energy.conditional)(
+    memory = quick_jit(agent.energy.encode)(params, context)
+    (energies,) = quick_jit(agent.energy.conditional)(
         params, memory, np.array([toy.END]), np.array([0])
     )
     np.testing.assert_array_equal(energies, [*-memory["logits"][-1], np.inf])
@@ -79,9 +80,9 @@ def test_the_loss_is_the_cross_entropy_of_the_actions_that_are_known(architectur
     model = dataclasses.replace(MODEL, architecture=architecture)
     agent = bc.make_agent(SETUP._replace(domain=domain, model=model))
     data = jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
-    batch = jax.jit(agent.batch)(jax.random.key(2), data)
-    state = jax.jit(agent.init)(jax.random.key(0))
-    memory = jax.jit(jax.vmap(agent.energy.encode, (None, 0)))(state.params, batch.context)
+    batch = quick_jit(agent.batch)(jax.random.key(2), data)
+    state = quick_jit(agent.init)(jax.random.key(0))
+    memory = quick_jit(jax.vmap(agent.energy.encode, (None, 0)))(state.params, batch.context)
     likelihoods = np.asarray(jax.nn.log_softmax(memory["logits"]))  # [B, P, A - 1]
     assert likelihoods.shape[1] == targets
     losses = []
@@ -90,5 +91,5 @@ def test_the_loss_is_the_cross_entropy_of_the_actions_that_are_known(architectur
         known = [row[a] for row, a in zip(rows, done, strict=True) if a < toy.END]
         losses.append(-np.mean(known))
     assert (np.asarray(batch.context.actions) > toy.END).any()  # some had not begun
-    _, metrics = jax.jit(agent.update)(state, batch, jax.random.key(3))
+    _, metrics = quick_jit(agent.update)(state, batch, jax.random.key(3))
     assert metrics["loss"] == pytest.approx(np.mean(losses), rel=1e-4)

@@ -18,6 +18,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
+from tests.enumerable import quick_jit
 from tests.parameters import random_parameters
 from tests.recorder import Recorder
 
@@ -51,8 +52,8 @@ def episode(domain: Domain, length: int, steps: int, act: Callable[[History], np
 def test_states_look_as_they_did_when_they_were_current(name, length):
     domain = level_of(name)
     encoder = domain.encoders["paper"](MODEL, length)
-    params = jax.jit(encoder.init)(jax.random.key(0), blank_context(domain, length))
-    encode = jax.jit(encoder.apply)
+    params = quick_jit(encoder.init)(jax.random.key(0), blank_context(domain, length))
+    encode = quick_jit(encoder.apply)
     known, moved = [], []
 
     def act(history):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from leapjax.babyai import encoders
+from tests.enumerable import quick_jit
 
 SIDE = 6
 
@@ -191,7 +192,7 @@ def test_groups_are_normalised_as_by_flax(shape):
             normalised = module.apply(params, image)
             return (normalised * weights).sum(), normalised
 
-        return jax.value_and_grad(of, argnums=(0, 1), has_aux=True)(params, image)
+        return quick_jit(jax.value_and_grad(of, argnums=(0, 1), has_aux=True))(params, image)
 
     ours, usual = loss(encoders.GroupNorm()), loss(nn.GroupNorm(encoders.NORM_GROUPS))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, usual)

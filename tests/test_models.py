@@ -404,7 +404,7 @@ def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
             functools.partial(module.init, method=everything), jax.random.key(0), context, actions
         )
         assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
-        scores = jax.jit(functools.partial(module.apply, method=everything))
+        scores = quick_jit(functools.partial(module.apply, method=everything))
         programs[dtype] = scores.lower(params, context, actions)
         pattern = r"stablehlo.dot_general.*-> tensor<[^>]*x(\w+)>"
         products = re.findall(pattern, programs[dtype].as_text())
@@ -508,10 +508,18 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     for each in later:
         np.testing.assert_array_equal(each, later[0])
     assert (np.abs(later[0] - now).max() > 1e-4) == (not repeat_state)
-    seen = module.apply(params, here, method="see")  # as where windows share their states
-    for given in (seen, seen._replace(ahead=None)):  # without: what is ahead is encoded alone
-        again = module.apply(params, here, seen=given, method="encode")
-        np.testing.assert_allclose(again.tokens[::2][past:], states(here), rtol=1e-5, atol=1e-6)
+
+    @quick_jit
+    def again(params, context):
+        """As where what was seen is given; without what lies ahead, that is encoded alone."""
+        seen = module.apply(params, context, method="see")
+        return [
+            module.apply(params, context, seen=given, method="encode").tokens
+            for given in (seen, seen._replace(ahead=None))
+        ]
+
+    for tokens in again(params, here):
+        np.testing.assert_allclose(tokens[::2][past:], states(here), rtol=1e-5, atol=1e-6)
     assert differ(pose=(here.observation.pose + 1) % 4).tolist() == [True] + [repeat_state] * 2
     assert differ(goal=(here.observation.goal + 1) % SIDE).all()
     assert differ(grid=here.observation.grid[::-1].copy()).all()

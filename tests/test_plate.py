@@ -14,6 +14,7 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
+from tests.enumerable import quick_jit
 from tests.parameters import random_parameters
 
 HORIZON = 4
@@ -38,7 +39,7 @@ def data():
 def untrained(architecture, past):
     """An agent, parameters that are all random, and windows."""
     agent = plate.make_agent(setup_of(architecture, past))
-    batch = jax.jit(agent.batch)(jax.random.key(2), data())
+    batch = quick_jit(agent.batch)(jax.random.key(2), data())
     return agent, random_parameters(agent), jax.tree.map(np.asarray, batch)
 
 
@@ -52,8 +53,8 @@ def test_an_action_depends_on_those_before_it_alone(architecture, past):
     agent, params, batch = untrained(architecture, past)
     context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, past)
     everywhere = np.arange(HORIZON)
-    memory = jax.jit(agent.energy.encode)(params, context)
-    energies = jax.jit(agent.energy.conditional)
+    memory = quick_jit(agent.energy.encode)(params, context)
+    energies = quick_jit(agent.energy.conditional)
     before = np.asarray(energies(params, memory, np.zeros(HORIZON, np.int32), everywhere))
     for changed in range(HORIZON):
         plan = np.arange(HORIZON, dtype=np.int32) == changed
@@ -93,7 +94,7 @@ def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
     plan = jnp.array([0, 1, 2, 0])
     states, before = module.apply(params, context, method="encode")
     between = jnp.concatenate([before, plan[:-1]])
-    read = jax.jit(functools.partial(module.apply, method="read"))
+    read = quick_jit(functools.partial(module.apply, method="read"))
     states = jnp.concatenate([states, jnp.zeros((HORIZON - 1, states.shape[1]))])
     for place in range(HORIZON - 1):
         _, led = read(params, states, between)

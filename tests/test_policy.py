@@ -11,6 +11,7 @@ import pytest
 from leapjax.models.policy import PolicyModel, past_and_present
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Context, pad_token
+from tests.enumerable import quick_jit
 from tests.parameters import random_like
 
 PAST, ACTIONS = 3, 4
@@ -49,7 +50,7 @@ def model(architecture, past=PAST):
     config = ModelConfig(architecture, layers=2, heads=2, width=16)
     module = PolicyModel(config, Sizes(ACTIONS, past, 1, 20), States(), HEADS)
     shapes = jax.eval_shape(module.init, jax.random.key(0), context(1, past))
-    return jax.jit(module.apply), random_like(shapes, scale=1.0)
+    return quick_jit(module.apply), random_like(shapes, scale=1.0)
 
 
 @pytest.mark.parametrize(("architecture", "states"), [("paper", PAST + 1), ("leapjax", 1)])

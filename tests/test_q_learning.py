@@ -16,6 +16,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Agent, TrainState
 from tests import mixed
+from tests.enumerable import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
 
 MODULES = {"cql": cql, "qr_dqn": qr_dqn, "rem": rem}
@@ -61,7 +62,7 @@ def trained(case):
     agent = MODULES[case.split()[0]].make_agent(Setup(domain, 0, 1, model, learn, settings))
     step, metrics = training.make_train_step(agent), []
     state = training.train(
-        step, jax.jit(agent.init)(jax.random.key(0)), data(), jax.random.key(1), learn.steps,
+        step, quick_jit(agent.init)(jax.random.key(0)), data(), jax.random.key(1), learn.steps,
         lambda done, state, means: metrics.append(means),
     )  # fmt: skip
     return Trained(agent, step, state, metrics)
@@ -150,12 +151,12 @@ def test_the_loss_of_one_q_function_is_what_it_is_by_hand(name):
         lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype),
         jax.eval_shape(agent.init, jax.random.key(0)),
     )
-    batch = jax.jit(agent.batch)(jax.random.key(3), data())
-    loss = jax.jit(lambda *update: agent.update(*update)[1]["loss"])(
+    batch = quick_jit(agent.batch)(jax.random.key(3), data())
+    loss = quick_jit(lambda *update: agent.update(*update)[1]["loss"])(
         state, batch, jax.random.key(4)
     )
 
-    apply = jax.jit(jax.vmap(setup.policy(("q", 2)).apply, (None, 0)))
+    apply = quick_jit(jax.vmap(setup.policy(("q", 2)).apply, (None, 0)))
     earlier, after = (jax.vmap(f)(batch.context) for f in (windows.before, windows.after))
     judged = (apply(state.params, earlier), apply(state.params, after), apply(state.extra, after))
     now, later, held = (np.asarray(said["q"], np.float64) for said in judged)  # [B, P, 2]

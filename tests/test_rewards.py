@@ -14,6 +14,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
+from tests.enumerable import quick_jit
 from tests.toy import LEFT, RIGHT
 
 MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql, "mopo": mopo}
@@ -55,7 +56,7 @@ def acts(agent, params, past=0):
 
 
 def memories(agent, params):
-    return jax.jit(jax.vmap(agent.energy.encode, (None, 0)))(params, mixed.contexts(0))
+    return quick_jit(jax.vmap(agent.energy.encode, (None, 0)))(params, mixed.contexts(0))
 
 
 def test_cloning_does_what_was_done_most_often():
@@ -112,7 +113,7 @@ def test_iql_values_lie_between_what_the_data_do_and_what_is_best():
         TrainingConfig(), SETTINGS["iql"],
     )  # fmt: skip
     module = setup.policy(("value", 1), ("q1", 3), ("q2", 3))
-    said = jax.jit(jax.vmap(module.apply, (None, 0)))(critic, mixed.contexts(0))
+    said = quick_jit(jax.vmap(module.apply, (None, 0)))(critic, mixed.contexts(0))
     best = mixed.best_values(0.9)
     value = np.asarray(said["value"])[:, 0, 0]
     assert (value < best.max(axis=1) + 0.05).all() and (value > best.min(axis=1) - 0.15).all()
@@ -148,14 +149,14 @@ def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_ot
 
 def test_the_target_network_follows_slowly():
     agent, state, _ = trained("iql")
-    batch = jax.jit(agent.batch)(jax.random.key(5), mixed.steps())
-    after, _ = jax.jit(agent.update)(state, batch, jax.random.key(6))
+    batch = quick_jit(agent.batch)(jax.random.key(5), mixed.steps())
+    after, _ = quick_jit(agent.update)(state, batch, jax.random.key(6))
     online = {"params": after.params["params"]["critic"]}
     expected = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, state.extra, online)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), after.extra, expected
     )
-    fresh = jax.jit(agent.init)(jax.random.key(0))
+    fresh = quick_jit(agent.init)(jax.random.key(0))
     begun = {"params": fresh.params["params"]["critic"]}
     jax.tree.map(np.testing.assert_array_equal, fresh.extra, begun)
 

@@ -16,6 +16,7 @@ from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from tests import toy
+from tests.enumerable import quick_jit
 
 CONTEXT, HORIZON, RUN = 2, 3, 4
 MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0.0)
@@ -51,7 +52,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def runs(data):
-    return jax.jit(run_batches(setup(domain=DOMAIN._replace(augmentations=()))))(
+    return quick_jit(run_batches(setup(domain=DOMAIN._replace(augmentations=()))))(
         jax.random.key(0), data
     )
 
@@ -78,10 +79,10 @@ def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs, data)
 def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
     agent = leap.make_agent(setup(returns=returns))
     alone = leap.make_agent(setup(run=1, returns=returns))
-    state = jax.jit(agent.init)(jax.random.key(0))
+    state = quick_jit(agent.init)(jax.random.key(0))
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), runs)
-    together, metrics = jax.jit(agent.update)(state, runs, jax.random.key(1))
-    one_by_one, expected = jax.jit(alone.update)(state, flat, jax.random.key(1))
+    together, metrics = quick_jit(agent.update)(state, runs, jax.random.key(1))
+    one_by_one, expected = quick_jit(alone.update)(state, flat, jax.random.key(1))
     for name in ("loss", "accuracy", "gradient_norm"):
         assert float(metrics[name]) == pytest.approx(float(expected[name]), rel=1e-5)
     changed = 0.0
@@ -112,7 +113,7 @@ def test_a_run_is_augmented_as_a_whole(data):
         return window._replace(return_to_go=jax.random.uniform(key))
 
     domain = DOMAIN._replace(augmentations=(turn,))
-    drawn = jax.jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
+    drawn = quick_jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
     marks = np.asarray(drawn.return_to_go)
     assert (marks == marks[:, :1]).all() and len(np.unique(marks)) == len(marks)
 

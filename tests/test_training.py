@@ -26,6 +26,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
+from tests.enumerable import quick_jit
 
 MODEL = ModelConfig(layers=1, heads=2, width=16)
 EXACT = dataclasses.replace(MODEL, dropout=0.0)
@@ -41,7 +42,7 @@ def setup(domain=toy.DOMAIN, model=MODEL, training=TRAINING) -> Setup:
 def tiny() -> tuple[Agent, object]:
     """An agent and its train step, compiled once for all tests."""
     agent = leap.make_agent(setup())
-    return agent._replace(init=jax.jit(agent.init)), training.make_train_step(agent)
+    return agent._replace(init=quick_jit(agent.init)), training.make_train_step(agent)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +171,7 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
         return found
 
     monkeypatch.setattr(schedules, "sample_masks", remember)
-    update, total_energy = jax.jit(agent.update), jax.jit(agent.energy.total)
+    update, total_energy = quick_jit(agent.update), quick_jit(agent.energy.total)
     energy, pad = agent.energy, toy.DOMAIN.num_actions + 1
 
     @jax.jit
@@ -204,7 +205,7 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
             total += float(jnp.where(masked & ~beyond, each, 0).sum())
         assert float(metrics["loss"]) == pytest.approx(total / drawn.sum(), rel=1e-4)
         if (masking, end, row) == ("each", True, 0):  # the energy of a plan, over T
-            memory = jax.jit(energy.encode)(state.params, context)
+            memory = quick_jit(energy.encode)(state.params, context)
             whole = float(total_energy(state.params, memory, one.actions[0]))
             assert whole == pytest.approx(total, rel=1e-4)
     assert ended > 0 or end
@@ -213,9 +214,9 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
 def test_without_an_end_action_no_plan_ends():
     made = setup()._replace(settings=leap.Settings("each", end=False))
     energy, params = leap.make_agent(made).energy, tiny()[0].init(jax.random.key(0)).params
-    memory = jax.jit(energy.encode)(params, blank_context(toy.DOMAIN, 0))
+    memory = quick_jit(energy.encode)(params, blank_context(toy.DOMAIN, 0))
     mask = np.full(4, toy.DOMAIN.num_actions)
-    energies = np.asarray(jax.jit(energy.conditional)(params, memory, mask, np.arange(4)))
+    energies = np.asarray(quick_jit(energy.conditional)(params, memory, mask, np.arange(4)))
     assert (energies[:, toy.END] == np.inf).all()
     assert np.isfinite(energies[:, : toy.END]).all()
 
@@ -223,7 +224,7 @@ def test_without_an_end_action_no_plan_ends():
 def entropy_of_positions(data) -> float:
     """The least loss of a model that looks at nothing but the position in the plan."""
     many = dataclasses.replace(TRAINING, batch=1000)
-    draw = jax.jit(window_batches(setup(LEVEL, training=many)))
+    draw = quick_jit(window_batches(setup(LEVEL, training=many)))
     actions = np.asarray(draw(jax.random.key(0), data).actions)
     shares = np.stack([(actions == action).mean(axis=0) for action in range(NUM_ACTIONS)])
     return float(-(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=0).mean())
@@ -239,7 +240,7 @@ def test_it_learns_a_few_demonstrations_by_heart(local_demonstrations):
         losses.append(means["loss"])
         accuracies.append(means["accuracy"])
 
-    state = jax.jit(agent.init)(jax.random.key(0))
+    state = quick_jit(agent.init)(jax.random.key(0))
     training.train(step, state, data, jax.random.key(1), TRAINING.steps, report, 25)
     assert len(losses) == 10
     assert losses[-1] < 0.6 * losses[0]

@@ -8,6 +8,7 @@ import numpy as np
 from leapjax import training
 from leapjax.domain import Domain
 from leapjax.types import Demonstration
+from tests.enumerable import quick_jit
 
 LEFT, RIGHT, WAIT, END = range(4)
 FARTHEST = 5
@@ -66,7 +67,7 @@ def learn(agent, data, steps):
     """A state after so many steps of training, and the metrics on the way."""
     metrics = []
     state = training.train(
-        training.make_train_step(agent), jax.jit(agent.init)(jax.random.key(0)),
+        training.make_train_step(agent), quick_jit(agent.init)(jax.random.key(0)),
         jax.tree.map(jnp.asarray, data), jax.random.key(1), steps,
         lambda done, state, means: metrics.append(means),
     )  # fmt: skip
