@@ -25,7 +25,7 @@ from rich.table import Table
 from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
 from experiments.common import runtime
-from experiments.common.config import make_domain, preset, specify
+from experiments.common.config import make_domain, preset, specify, with_options
 from leapjax import pretrained
 from leapjax.babyai import levels
 from leapjax.babyai.levels import Level
@@ -136,8 +136,9 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
 
 
 def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
-    """A preset's energy with random parameters."""
-    config = preset("babyai", level.name, "leap", name)
+    """A preset's energy with random parameters, with the horizon of the appendix."""
+    default = preset("babyai", level.name, "leap", name)
+    config = with_options(default, {"horizon": level.horizon})
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     return agent.energy, jax.jit(agent.init)(jax.random.key(0)).params, domain

@@ -23,9 +23,9 @@ from leapjax.babyai.constraints import (
     immediate_lava,
     lava,
     left_turns,
+    steps_to_visit,
     told_to_go,
     turns_over,
-    unvisited,
     without_lava,
     without_marks,
     without_open_doors,
@@ -41,7 +41,7 @@ from leapjax.types import Context, Energy
 Penalty = Callable[[Context, jax.Array], jax.Array]
 TURN_BUDGET = 5  # enough to visit a cell of an empty room, and then to face an object
 ROOM_STEPS = 64  # of the longest episode in one
-WEIGHT = 20.0  # of a violation, in nats: more than any detour costs
+WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
 FALSE_STARTS = {"leap": {"false_starts": 0.6, "steps": 3000}}
@@ -120,11 +120,6 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[En
 
 
 few_turns = functools.partial(turns_over, budget=TURN_BUDGET)
-
-
-def first_turns(context: Context, actions: jax.Array) -> jax.Array:
-    """The same of the next action alone."""
-    return few_turns(context, actions[:1])
 
 
 # What judges the next action alone: those that violate anything at once are removed.
@@ -268,11 +263,13 @@ CASES = (
         "constraints-errand", [ROOM], "GoToVia",
         [
             Way(
-                "whole plan", minimise=unseen(unvisited, few_turns), search=left_to_right,
+                "whole plan", minimise=unseen(steps_to_visit, few_turns), search=left_to_right,
                 executed=3,
             ),
-            Way("dt", "dt", masked(goal_before_visit, first_turns), wandering),
-            Way("iql", "iql", masked(goal_before_visit, first_turns), wandering),
+            Way("dt", "dt", masked(goal_before_visit, few_turns), wandering),
+            Way("iql", "iql", masked(goal_before_visit, few_turns), wandering),
+            Way("dt, told how far", "dt", unseen(steps_to_visit, few_turns)),
+            Way("iql, told how far", "iql", unseen(steps_to_visit, few_turns)),
         ],
         WatchedErrand, remembered=ROOM_STEPS,
     ),

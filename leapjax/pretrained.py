@@ -98,8 +98,8 @@ def identity(specification: Specification) -> str:
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
     changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
-    named = values | changed | {"training": without_unnamed(changed["training"])}
-    return json.dumps(named, sort_keys=True)
+    changed["training"] = without_unnamed(changed["training"])
+    return json.dumps(values | changed, sort_keys=True)
 
 
 def without_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:

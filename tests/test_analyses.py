@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
@@ -54,6 +55,21 @@ def test_a_constraint_is_asked_for_and_counted(place, capsys):
     assert analysis.main(of, [*SHORT, "--record"]) == 0
     assert "recorded already" in capsys.readouterr().out
     assert rows(place, "properties", "results") == [row]
+
+
+def test_constraints_remember_what_models_do_not_see(place, monkeypatch):
+    lengths = []
+
+    def watched(context, actions):
+        lengths.append(context.actions.shape[0])
+        return jnp.zeros(())
+
+    case = case_of("constraints-errand")
+    way = case.ways[-1]._replace(minimise=properties.unseen(watched))
+    of = small(case._replace(ways=[way]), way.name)
+    assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
+    (row,) = rows(place, "properties")
+    assert set(lengths) == {properties.ROOM_STEPS} and row["violations"] >= 0
 
 
 def test_two_models_are_composed(place):

@@ -27,6 +27,7 @@ from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
 from tests.enumerable import quick_jit
+from tests.programs import only_long
 
 MODEL = ModelConfig(layers=1, heads=2, width=16)
 EXACT = dataclasses.replace(MODEL, dropout=0.0)
@@ -547,6 +548,29 @@ def test_what_is_prepared_for_all_examples_has_its_part_in_the_gradient(microbat
     assert all(jnp.abs(leaf).min() > 1e-3 for leaf in jax.tree.leaves(expected[0]))
     actual = gradient(loss, microbatch=microbatch, prepare=prepare)
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), actual, expected)
+
+
+@only_long
+@pytest.mark.parametrize("repeat_state", [True, False])
+def test_what_the_papers_network_sees_is_prepared_for_all(repeat_state, local_demonstrations):
+    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
+    settings = leap.Settings(masking="each", repeat_state=repeat_state)
+    model, key = dataclasses.replace(MODEL, architecture="paper"), jax.random.key(0)
+
+    def gradient(microbatch, mesh=None):
+        parts = dataclasses.replace(TRAINING, batch=8, microbatch=microbatch)
+        agent = leap.make_agent(Setup(LEVEL, 0, 3, model, parts, settings), mesh)
+        state, batch = quick_jit(agent.init)(key), quick_jit(agent.batch)(key, data)
+        if mesh is not None:
+            state = sharding.place(state, sharding.parameter_shardings(state, mesh))
+        state, metrics = quick_jit(agent.update)(state, batch, key)
+        return jax.device_get((optax.tree.get(state.optimizer, "mu"), metrics))
+
+    whole = gradient(0)
+    assert_same_step(gradient(3), whole)
+    assert_same_step(gradient(2, sharding.make_mesh(8, jax.devices()[:2])), whole)
+    last = whole[0]["params"]["state"]["FiLMBlock_3"]
+    assert all(np.abs(leaf).max() > 1e-7 for leaf in jax.tree.leaves(last))
 
 
 def test_a_mesh_has_as_many_devices_as_split_the_batch():

@@ -22,7 +22,7 @@ PRESETS: Presets = {
     # masked in turn. The copies of a few windows at a time stay in a core's cache.
     "paper": {
         "architecture": "paper", "dropout": 0.1, "masking": "each", "windows": "episode",
-        "microbatch": 8,
+        "microbatch": 4,
     },
     # Ours, chosen on validation levels (docs/tried.md). A little noise leads out of plans
     # that lead nowhere.

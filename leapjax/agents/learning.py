@@ -63,7 +63,7 @@ class TrainingConfig:
     weight_decay: float = 0.1  # not on embeddings, norms and biases
     clip: float = 1.0  # global norm of the gradient
     windows: str = "episode"  # drawn by "episode", by "step", or at the "start" of episodes
-    microbatch: int = 0  # examples a device takes the gradient of at a time; 0: all of its own
+    microbatch: int = 0  # examples whose loss a device takes at a time; 0: all of its own
     run: int = 1  # windows in a row that make an example; each state of theirs is encoded once
 
     def __post_init__(self) -> None:
@@ -183,14 +183,15 @@ def make_update(
     """An agent's `update`: the loss and the metrics are means over the batch.
 
     Args:
-        example_loss: of one example; its gradient is taken by the parameters alone.
+        example_loss: of one example; its gradient is taken by the parameters and what is prepared.
         optimizer: turns gradients into updates.
         mesh: splits every batch, and the state as `sharding.parameter_specs` says; None for
             one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
         microbatch: see `TrainingConfig`.
         prepare: (params, example) -> what the loss is given as well. It is computed for all
-            examples of a device at once, however few of them the loss takes at a time.
+            examples of a device at once, however few of them the loss takes at a time; arrays of
+            floating-point numbers.
     """
 
     def batch_loss(

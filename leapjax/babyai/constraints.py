@@ -1,7 +1,7 @@
 """Constraints on plans in a grid world that no model has learned, and views that hide things.
 
 Each penalty is `(context, actions [T]) -> []`, for `leapjax.constrain` with `partial`: the number
-of violations in what is certain of the plan.
+of violations in what is certain of the plan, or how far it is from what is asked for.
 """
 
 from collections.abc import Callable
@@ -54,7 +54,7 @@ def _before_end(actions: jax.Array) -> jax.Array:
     return jnp.cumsum(actions >= END) == 0
 
 
-def unvisited(context: Context, actions: jax.Array) -> jax.Array:
+def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
     """How far from the coloured cell a plan ends that does not visit it, in steps; 0 if it does.
 
     Much farther, if it gets to the goal before.

@@ -254,8 +254,8 @@ class StateTokens(nn.Module):
     def __call__(self, context: Context, ahead: bool = False) -> jax.Array:
         """`[K + 1, D]`: the past states and the current one; last, if asked for, that of `ahead`.
 
-        All in one batch, which takes less than one after the other; but what lies ahead differs
-        from now in the pose alone, which is read late: up to there both are one.
+        In one batch, which takes less than one after the other; but what lies ahead differs from
+        now in the pose alone, which is read late: up to there both are one, apart from the past.
         """
         instruction = self.instruction(context.observation.instruction).whole
         now, past, known = context.observation, context.past, context.encoded

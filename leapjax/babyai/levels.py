@@ -88,6 +88,7 @@ MODIFIED = {
         _room("GoToLavaEasy", "GoToBehindLava", 8, lava=2),
         _room("GoToLavaMedium", "GoToBehindLava", 8, lava=worlds.MOST_LAVA),
         _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),
+        # An errand: what is learned has no coloured cell.
         _room("GoToVia", "GoToVia", 8),
         # Generalisation: learned in one room.
         _room("GoToLocalS8N15", "GoToLocal", 8, 15),

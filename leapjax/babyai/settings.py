@@ -74,7 +74,7 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
 def _tuned_paper(level: Level, method: str) -> Mapping[str, Any]:
     """LEAP is as in the authors' code (docs/experiments.md); contexts are the appendix's."""
     if method == "leap":
-        options: dict[str, Any] = {"end": False, "repeat_state": False, "microbatch": 4}
+        options: dict[str, Any] = {"end": False, "repeat_state": False}
         if level.name == "PickUpLoc":  # learned from the state alone: one copy of each window
             options |= {"masking": "all", "microbatch": 0}
         if level.name.startswith("GoToObjMazeS7"):  # the appendix: 15 and 50, which learn less
