@@ -153,7 +153,10 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
     [
         (["--only", "adaptation-esy"], "did you mean adaptation-easy"),
         (["--methods", "bcq"], "expected some of dt, iql, leap"),
-        (["--ways", "sums"], "--ways sums: expected some of dt, dt, open doors seen as empty, iql"),
+        (
+            ["--ways", "sums"],
+            "--ways sums: expected some of dt, dt, open doors seen as empty, dt, told how far, iql",
+        ),
         (["--ways", "sum", "--methods", "dt"], "none of these ways is of one of these methods"),
         (["--preset", "fast"], "unknown preset 'fast'"),
         (["--episodes", "0"], "--episodes must be at least 1"),
