@@ -76,13 +76,8 @@ class WatchedTurns(Watched):
         return super().step(action)
 
 
-class WatchedErrand(BabyAIAdapter):
+class WatchedErrand(Watched):
     """Needs the coloured cell to be visited; counts goals before that, and turns over a budget."""
-
-    def __init__(self, level: str) -> None:
-        super().__init__(find_level(level))
-        self.violations = 0
-        self._turns = 0
 
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""

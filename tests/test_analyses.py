@@ -57,7 +57,7 @@ def test_a_constraint_is_asked_for_and_counted(place, capsys):
     assert rows(place, "properties", "results") == [row]
 
 
-def test_constraints_remember_what_models_do_not_see(place, monkeypatch):
+def test_constraints_remember_what_models_do_not_see(place):
     lengths = []
 
     def watched(context, actions):

@@ -347,10 +347,9 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
     defaults = resolved(blank(**names), seed=-1)
-    settings = checkpoints.differences(resolved(config, seed), defaults)
-    named = pretrained.without_unnamed(settings.pop("training", {}))
-    if named:
-        settings["training"] = named
+    values = resolved(config, seed)
+    values["training"] = pretrained.without_unnamed(values["training"])
+    settings = checkpoints.differences(values, defaults)
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
