@@ -5,21 +5,13 @@ joint and whose total is its exact negative logarithm. The same numbers, in plai
 and by counting over all plans, are `joint_probabilities` and `conditional_by_counting`.
 """
 
-import functools
 import itertools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
 from leapjax.types import Energy, mask_token
-
-# Programs this small cost seconds to optimise and milliseconds to run.
-quick_jit = functools.partial(
-    jax.jit,
-    compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
-)
 
 
 def enumerable_energy(horizon: int, num_actions: int) -> Energy:

@@ -15,7 +15,7 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import toy
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 
 TRAINING = TrainingConfig(steps=150, batch=16, warmup=10, learning_rate=1e-2, windows="step")
 MODEL = ModelConfig(layers=1, heads=1, width=16, dropout=0.0)

@@ -12,7 +12,7 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import toy
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 
 NUM_ACTIONS, END = toy.DOMAIN.num_actions, toy.END
 TRAINING = TrainingConfig(steps=150, batch=16, warmup=10, learning_rate=1e-2)

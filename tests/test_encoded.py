@@ -18,8 +18,8 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
-from tests.enumerable import quick_jit
 from tests.parameters import random_parameters
+from tests.quick import quick_jit
 from tests.recorder import Recorder
 
 MODEL = ModelConfig("paper", layers=1, heads=2, width=16, dropout=0.0, attention="causal")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from leapjax.babyai import encoders
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 
 SIDE = 6
 

@@ -22,8 +22,9 @@ from leapjax.models.trajectory import (
 from leapjax.models.transformer import causal_mask
 from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
-from tests.enumerable import all_plans, quick_jit
+from tests.enumerable import all_plans
 from tests.parameters import scaled_like
+from tests.quick import quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
 SIDE = 7

@@ -14,8 +14,8 @@ from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
-from tests.enumerable import quick_jit
 from tests.parameters import random_parameters
+from tests.quick import quick_jit
 
 HORIZON = 4
 EACH_ARCHITECTURE = pytest.mark.parametrize(

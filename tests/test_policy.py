@@ -11,8 +11,8 @@ import pytest
 from leapjax.models.policy import PolicyModel, past_and_present
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Context, pad_token
-from tests.enumerable import quick_jit
 from tests.parameters import random_like
+from tests.quick import quick_jit
 
 PAST, ACTIONS = 3, 4
 HEADS = (("logits", ACTIONS - 1), ("value", 1))

@@ -16,7 +16,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Agent, TrainState
 from tests import mixed
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
 
 MODULES = {"cql": cql, "qr_dqn": qr_dqn, "rem": rem}

@@ -14,7 +14,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT
 
 MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql, "mopo": mopo}

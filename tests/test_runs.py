@@ -16,7 +16,7 @@ from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from tests import toy
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 
 CONTEXT, HORIZON, RUN = 2, 3, 4
 MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0.0)

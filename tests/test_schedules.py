@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from leapjax.schedules import MASKINGS, sample_masks
-from tests.enumerable import fit_p_value, quick_jit
+from tests.enumerable import fit_p_value
+from tests.quick import quick_jit
 
 HORIZON = 4
 DRAWS = 4000

@@ -26,8 +26,8 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
-from tests.enumerable import quick_jit
 from tests.programs import only_long
+from tests.quick import quick_jit
 
 MODEL = ModelConfig(layers=1, heads=2, width=16)
 EXACT = dataclasses.replace(MODEL, dropout=0.0)
@@ -523,8 +523,9 @@ def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
 
 @pytest.mark.parametrize("microbatch", [0, 2, 3])
 def test_what_is_prepared_for_all_examples_has_its_part_in_the_gradient(microbatch):
-    def prepare(params, example):
-        return (jnp.tanh(params["first"] * example), jnp.sin(params["both"]))
+    def prepare(params, extra, examples):
+        seen = jnp.tanh(extra * params["first"] * examples)
+        return seen, jnp.sin(params["both"]).repeat(len(examples))
 
     def loss(params, extra, example, key, seen, both):
         noise = jax.random.uniform(key)
@@ -532,7 +533,8 @@ def test_what_is_prepared_for_all_examples_has_its_part_in_the_gradient(microbat
         return value, {"seen": seen.sum()}
 
     def alone(params, extra, example, key):
-        return loss(params, extra, example, key, *prepare(params, example))
+        prepared = prepare(params, extra, example[None])
+        return loss(params, extra, example, key, *(each[0] for each in prepared))
 
     params = {"first": jnp.arange(1.0, 4), "second": jnp.array(0.5), "both": jnp.array(0.7)}
     batch = jax.random.normal(jax.random.key(1), (6, 3))

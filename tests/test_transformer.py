@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask
-from tests.enumerable import quick_jit
 from tests.parameters import random_like
+from tests.quick import quick_jit
 
 LAYERS, WIDTH, HEADS = 2, 16, 2
 PREFIX, TOKENS = 4, 5

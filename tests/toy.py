@@ -8,7 +8,7 @@ import numpy as np
 from leapjax import training
 from leapjax.domain import Domain
 from leapjax.types import Demonstration
-from tests.enumerable import quick_jit
+from tests.quick import quick_jit
 
 LEFT, RIGHT, WAIT, END = range(4)
 FARTHEST = 5

@@ -46,15 +46,21 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return likely_values(said, settings.threshold)
 
     def transition_loss(
-        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
+        params: Params,
+        target: PyTree,
+        transition: TransitionWindow,
+        key: jax.Array,
+        sees: jax.Array | None = None,
+        target_sees: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
         said: Any = module.apply(
-            params, context, deterministic=False, rngs={"dropout": key}, method="transition"
-        )
+            params, context, deterministic=False, rngs={"dropout": key}, method="transition",
+            seen=sees,
+        )  # fmt: skip
         now, later = said
-        held: Any = module.apply(target, windows.after(context))
+        held: Any = module.apply(target, windows.after(context), seen=target_sees)
         # Chosen by the one network and valued by the other, as in double Q-learning.
         best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]
@@ -70,7 +76,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch,
+        setup.training.microbatch, setup.seen_at_once(learning.both_see(module, windows.after)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say, likely)
     return Agent(init, transition_batches(setup), update, energy)

@@ -34,13 +34,17 @@ def make_imitator(
         return module.apply(params, context, returns=wanted(context))
 
     def window_loss(
-        params: Params, extra: PyTree, window: Window, key: jax.Array
+        params: Params,
+        extra: PyTree,
+        window: Window,
+        key: jax.Array,
+        seen: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions of one context and of the one that followed."""
         del extra
         said: Any = module.apply(
             params, window.context, deterministic=False, rngs={"dropout": key},
-            returns=wanted(window.context, window.return_to_go),
+            returns=wanted(window.context, window.return_to_go), seen=seen,
         )  # fmt: skip
         logits = said["logits"]  # [P, A - 1]
         taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)
@@ -52,8 +56,9 @@ def make_imitator(
         return module(context, returns=wanted(context))["logits"]
 
     update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
-    )
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch,
+        prepare=setup.seen_at_once(learning.sees(module)),
+    )  # fmt: skip
     init = learning.make_init(setup, module, touch, optimizer)
     energy = learning.acting_energy(setup, say)
     return Agent(init, window_batches(setup), update, energy)

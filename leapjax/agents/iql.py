@@ -49,13 +49,21 @@ class Networks(nn.Module):
         """What both say of a context."""
         return self.policy(context), self.critic(context)
 
-    def act(self, context: Context, deterministic: bool = True) -> Said:
+    def act(
+        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+    ) -> Said:
         """What the policy says of a context."""
-        return self.policy(context, deterministic)
+        return self.policy(context, deterministic, seen=seen)
 
-    def judge(self, context: Context, deterministic: bool = True) -> tuple[Said, Said]:
+    def judge(
+        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+    ) -> tuple[Said, Said]:
         """What the critic says before and after the step of a transition."""
-        return self.critic.transition(context, deterministic)
+        return self.critic.transition(context, deterministic, seen)
+
+    def see(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
+        """What the policy sees before the step of B transitions, and the critic around it."""
+        return self.policy.see(jax.vmap(windows.before)(contexts)), self.critic.see(contexts)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
@@ -68,16 +76,31 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def say(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="act")
 
+    def see(
+        params: Params, target: Params, examples: TransitionWindow
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """What policy and critic see of each state, and the target of those before the step."""
+        mine: Any = module.apply(params, examples.context, method="see")
+        earlier = jax.vmap(windows.before)(examples.context)
+        held: Any = critic.apply(target, earlier, method="see")
+        return (*mine, held)
+
     def transition_loss(
-        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
+        params: Params,
+        target: PyTree,
+        transition: TransitionWindow,
+        key: jax.Array,
+        policy_sees: jax.Array | None = None,
+        critic_sees: jax.Array | None = None,
+        target_sees: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
         context = transition.context
         earlier = windows.before(context)
         options: Any = {"deterministic": False, "rngs": {"dropout": key}}
-        policy: Any = module.apply(params, earlier, method="act", **options)
-        judged: Any = module.apply(params, context, method="judge", **options)
-        held: Any = critic.apply(target, earlier)
+        policy: Any = module.apply(params, earlier, method="act", seen=policy_sees, **options)
+        judged: Any = module.apply(params, context, method="judge", seen=critic_sees, **options)
+        held: Any = critic.apply(target, earlier, seen=target_sees)
         now, later = judged
         taken, known = losses.last_actions(context, len(held["value"]), choices)
         least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))
@@ -96,7 +119,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     init = learning.make_init(setup, module, _say, optimizer, target=_critic)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic),
-        setup.training.microbatch,
+        setup.training.microbatch, setup.seen_at_once(see),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say)
     return Agent(init, transition_batches(setup), update, energy)

@@ -84,13 +84,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
     energy = learning.keeping(energy, setup, lambda memory: memory.states)
 
-    def see(params: Params, context: Context) -> Seen:
-        seen = module.apply(params, context, method="see")
+    def see(params: Params, extra: PyTree, examples: Window) -> tuple[Seen]:
+        del extra
+        seen = module.apply(params, examples.context, method="see_all")
         assert isinstance(seen, Seen)
-        return seen
-
-    def see_window(params: Params, window: Window) -> tuple[Seen]:
-        return (see(params, window.context),)
+        return (seen,)
 
     def window_loss(
         params: Params,
@@ -144,7 +142,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         So a state sees the frames before it even at the front of a window, where those before
         the window are unknown if it is encoded alone (Atari's first three).
         """
-        states = see(params, windows.joined(run)).states  # [K + S, D]
+        seen = module.apply(params, windows.joined(run), method="see")
+        assert isinstance(seen, Seen)
+        states = seen.states  # [K + S, D]
         keys = jax.random.split(key, run.actions.shape[0])
 
         def loss(window: Window, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -156,14 +156,10 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return losses.mean(), jax.tree.map(jnp.mean, metrics)
 
     # To the other architecture, what a state is depends on the window that it is seen in.
-    paper = setup.model.architecture == "paper"
-    in_runs = setup.training.run > 1 and paper
-    # A single state is little work, and its copies much: few windows at a time suit these alone.
-    at_once = paper and not in_runs and sizes.context == 0
+    in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
     update = learning.make_update(
         run_loss if in_runs else window_loss, optimizer, mesh,
-        microbatch=setup.training.microbatch,
-        prepare=see_window if at_once else learning.nothing_prepared,
+        microbatch=setup.training.microbatch, prepare=setup.seen_at_once(see),
     )  # fmt: skip
     batch = run_batches(setup) if in_runs else window_batches(setup)
 

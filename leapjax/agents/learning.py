@@ -85,6 +85,39 @@ class TrainingConfig:
             raise ValueError(f"unknown windows {self.windows!r}: expected one of {known}")
 
 
+Prepare = Callable[[Params, PyTree, PyTree], tuple[PyTree, ...]]
+# (params, extra, examples [B, ...]) -> what a loss is given of them beside themselves, [B, ...]
+
+
+def nothing_prepared(params: Params, extra: PyTree, examples: PyTree) -> tuple[()]:
+    """What most losses are given."""
+    del params, extra, examples
+    return ()
+
+
+def sees(module: nn.Module) -> Prepare:
+    """The tokens of all states of the examples, by `module.see`."""
+
+    def see(params: Params, extra: PyTree, examples: PyTree) -> tuple[PyTree, ...]:
+        del extra
+        return (module.apply(params, examples.context, method="see"),)
+
+    return see
+
+
+def both_see(
+    module: nn.Module, part: Callable[[Context], Context] = lambda context: context
+) -> Prepare:
+    """The same, and what the target network sees of a part of each example's context."""
+
+    def see(params: Params, target: Params, examples: PyTree) -> tuple[PyTree, ...]:
+        seen = jax.vmap(part)(examples.context)
+        held = module.apply(target, seen, method="see")
+        return module.apply(params, examples.context, method="see"), held
+
+    return see
+
+
 class Setup(NamedTuple):
     """What every method is made from."""
 
@@ -114,6 +147,11 @@ class Setup(NamedTuple):
                 f"expected one of {', '.join(self.domain.encoders)}"
             )
         return self.domain.encoders[name](self.model, self.context)
+
+    def seen_at_once(self, see: Prepare) -> Prepare:
+        """`see`, where the encoder has a better way for many contexts than one by one."""
+        at_once = hasattr(self.encoder(), "of_all")
+        return see if at_once and self.training.run == 1 else nothing_prepared
 
     def policy(self, *heads: tuple[str, int], conditioned: bool = False) -> PolicyModel:
         """The network of a method that chooses one action at a time.
@@ -166,19 +204,13 @@ ExampleLoss = Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
 Update = Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
 
 
-def nothing_prepared(params: Params, example: PyTree) -> tuple[()]:
-    """What most losses are given of an example beside itself."""
-    del params, example
-    return ()
-
-
 def make_update(
     example_loss: ExampleLoss,
     optimizer: optax.GradientTransformation,
     mesh: Mesh | None = None,
     next_extra: Callable[[PyTree, Params], PyTree] = lambda extra, params: extra,
     microbatch: int = 0,
-    prepare: Callable[[Params, PyTree], tuple[PyTree, ...]] = nothing_prepared,
+    prepare: Prepare = nothing_prepared,
 ) -> Update:
     """An agent's `update`: the loss and the metrics are means over the batch.
 
@@ -189,9 +221,8 @@ def make_update(
             one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
         microbatch: see `TrainingConfig`.
-        prepare: (params, example) -> what the loss is given as well. It is computed for all
-            examples of a device at once, however few of them the loss takes at a time; arrays of
-            floating-point numbers.
+        prepare: what the loss is given as well, arrays of floating-point numbers. It is computed
+            for all examples of a device at once, however few of them the loss takes at a time.
     """
 
     def batch_loss(
@@ -211,11 +242,7 @@ def make_update(
         params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
     ) -> PyTree:
         """((loss, metrics), gradients) of the examples of a device."""
-
-        def prepare_all(params: Params) -> PyTree:
-            return jax.vmap(prepare, in_axes=(None, 0))(params, batch)
-
-        prepared, pull_back = jax.vjp(prepare_all, params)
+        prepared, pull_back = jax.vjp(lambda params: prepare(params, extra, batch), params)
         means, (gradients, of_prepared) = in_parts(params, prepared, extra, batch, key, first)
         return means, jax.tree.map(jnp.add, gradients, *pull_back(of_prepared))
 

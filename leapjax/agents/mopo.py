@@ -89,11 +89,15 @@ class Networks(nn.Module):
         said = self.trunk(context)
         return {"logits": self.logits(self.norm(said["features"])), "tokens": said["tokens"]}
 
+    def see(self, contexts: Context) -> jax.Array:
+        """What the trunk sees of each state of B contexts."""
+        return self.trunk.see(contexts)
+
     def transition(
-        self, context: Context, deterministic: bool = True
+        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
     ) -> tuple[jax.Array, jax.Array]:
         """Features `[P, D]` before and after the step of a transition."""
-        now, later = self.trunk.transition(context, deterministic)
+        now, later = self.trunk.transition(context, deterministic, seen)
         return self.norm(now["features"]), self.norm(later["features"])
 
     def logits(self, features: jax.Array) -> jax.Array:
@@ -185,14 +189,19 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return found.mean(), differ.mean()
 
     def transition_loss(
-        params: Params, target: Params, transition: TransitionWindow, key: jax.Array
+        params: Params,
+        target: Params,
+        transition: TransitionWindow,
+        key: jax.Array,
+        sees: jax.Array | None = None,
+        target_sees: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the policy on the data and on what is imagined, and of the ensemble."""
         context = transition.context
         drop_key, rollout_key = jax.random.split(key)
         options = {"deterministic": False, "rngs": {"dropout": drop_key}}
-        now, later = call(params, "transition", context, **options)
-        seen, seen_later = call(target, "transition", context)
+        now, later = call(params, "transition", context, seen=sees, **options)
+        seen, seen_later = call(target, "transition", context, seen=target_sees)
         taken, known = losses.last_actions(context, len(now), choices)
         rewards = context.rewards[-len(now) :]
 
@@ -226,7 +235,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     )  # fmt: skip
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch,
+        setup.training.microbatch, setup.seen_at_once(learning.both_see(module)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, lambda params, context: call(params, "act", context))
     return Agent(init, transition_batches(setup), update, energy)

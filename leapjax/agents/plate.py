@@ -47,11 +47,15 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = autoregressive(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 
     def window_loss(
-        params: Params, extra: PyTree, window: Window, key: jax.Array
+        params: Params,
+        extra: PyTree,
+        window: Window,
+        key: jax.Array,
+        seen: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions; squared error of the states that they lead to."""
         del extra
-        states, actions = _encoded(module, params, window.context)
+        states, actions = module.apply(params, window.context, seen, method="encode_unrolled")
         found: Any = module.apply(
             params, states, actions, deterministic=False, rngs={"dropout": key}, method="read"
         )
@@ -67,17 +71,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return loss, {"accuracy": accuracy, "state_error": error}
 
     update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
-    )
+        window_loss, optimizer, mesh, microbatch=setup.training.microbatch,
+        prepare=setup.seen_at_once(learning.sees(module)),
+    )  # fmt: skip
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
     return Agent(init, window_batches(setup, windows.unrolled_window), update, energy)
-
-
-def _encoded(
-    module: AlternatingModel, params: Params, context: Context
-) -> tuple[jax.Array, jax.Array]:
-    found: Any = module.apply(params, context, method="encode_unrolled")
-    return found
 
 
 def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.Array) -> PyTree:

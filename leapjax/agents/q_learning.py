@@ -66,16 +66,21 @@ def make_agent(
         return module.apply(params, context)
 
     def transition_loss(
-        params: Params, target: PyTree, transition: TransitionWindow, key: jax.Array
+        params: Params,
+        target: PyTree,
+        transition: TransitionWindow,
+        key: jax.Array,
+        sees: jax.Array | None = None,
+        target_sees: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         context = transition.context
         dropout_key, loss_key = jax.random.split(key)
         said: Any = module.apply(
             params, context, deterministic=False, rngs={"dropout": dropout_key},
-            method="transition",
+            method="transition", seen=sees,
         )  # fmt: skip
         now, later = (each["q"] for each in said)
-        held: Any = module.apply(target, windows.after(context))
+        held: Any = module.apply(target, windows.after(context), seen=target_sees)
         taken, known = losses.last_actions(context, len(now), choices)
 
         def returns(values: jax.Array) -> jax.Array:
@@ -91,7 +96,7 @@ def make_agent(
     init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch,
+        setup.training.microbatch, setup.seen_at_once(learning.both_see(module, windows.after)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
     return Agent(init, transition_batches(setup), update, energy)

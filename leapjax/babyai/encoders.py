@@ -19,6 +19,7 @@ from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.adapter import NUM_ACTIONS
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
+from leapjax.models import once
 from leapjax.models.linear import linear
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, pad_token
@@ -28,6 +29,7 @@ OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
+AT_A_TIME = 16  # states
 BARRIER = 8.0  # steps that one goes round for each nat
 # Where embeddings start: as PyTorch's, which are the authors'; and as Flax's.
 LARGE = nn.initializers.normal(1.0)
@@ -271,6 +273,27 @@ class StateTokens(nn.Module):
             if known is None and context.actions.shape[0]:
                 known = read(past, instruction)
         return tokens if known is None else jnp.concatenate([known, tokens])
+
+    def of_all(self, contexts: Context, ahead: bool = False) -> jax.Array:
+        """The same of B contexts in which nothing is encoded yet, `[B, ...]`: `[B, K + 1, D]`.
+
+        A few states at a time, whose maps stay in a core's cache; and what stands in a context for
+        the time before its episode is always the same, so it is looked at once.
+        """
+        if not contexts.actions.shape[1]:
+            return jax.vmap(lambda context: self(context, ahead))(contexts)
+        now = contexts.observation
+        later = [jax.vmap(_nowhere)(now)] if ahead else []
+        states = jax.tree.map(
+            lambda past, *others: jnp.concatenate([past, *(x[:, None] for x in others)], axis=1),
+            contexts.past, now, *later,
+        )  # fmt: skip
+        told = jax.vmap(lambda instruction: self.instruction(instruction).whole)(now.instruction)
+        first, total, which = once.distinct(states)
+        length = which.shape[1]
+        each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], states)
+        tokens = once.of_first(self.state, each, told[first // length], total, AT_A_TIME)
+        return tokens[which]
 
     def ahead(self, context: Context) -> jax.Array:
         """`[D]`: what later states of a plan are taken for, whose pose nobody knows: (0, 0, 0)."""

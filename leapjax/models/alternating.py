@@ -62,19 +62,28 @@ class AlternatingModel(nn.Module):
         """States `[past + 1, D]` up to the current one, and the actions `[past]` between them."""
         return self._states(context), context.actions[context.actions.shape[0] - self.past :]
 
-    def encode_unrolled(self, context: Context) -> tuple[jax.Array, jax.Array]:
-        """The same of an unrolled window: states `[past + T, D]`, actions `[past + T - 1]`."""
+    def encode_unrolled(
+        self, context: Context, seen: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """The same of an unrolled window: states `[past + T, D]`, actions `[past + T - 1]`.
+
+        `seen` is what `see` has made of its states, if it has.
+        """
         count = self.past + self.sizes.horizon
         if self.config.architecture == "paper":
-            states = self._states(context)  # each is encoded once
+            states = self._states(context, seen)  # each is encoded once
         else:
             places = range(self.sizes.horizon)
             contexts = [windows.context_at(context, n, self.sizes.context) for n in places]
             states = jnp.concatenate([self._states(each) for each in contexts])
         return states, context.actions[context.actions.shape[0] - (count - 1) :]
 
-    def _states(self, context: Context) -> jax.Array:
-        tokens = self.encoder(context)
+    def see(self, contexts: Context) -> jax.Array:
+        """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
+        return self.encoder.of_all(contexts)
+
+    def _states(self, context: Context, seen: jax.Array | None = None) -> jax.Array:
+        tokens = self.encoder(context) if seen is None else seen
         if self.config.architecture != "paper":
             tokens = tokens.reshape(1, -1)
         return self.norm(self.summary(tokens))

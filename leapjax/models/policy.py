@@ -50,6 +50,7 @@ class PolicyModel(nn.Module):
         context: Context,
         deterministic: bool = True,
         returns: jax.Array | None = None,
+        seen: jax.Array | None = None,
     ) -> Said:
         """What each head says, `[P, count]`, at the last P states, the current one last.
 
@@ -57,15 +58,23 @@ class PolicyModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
+            seen: the tokens of the states, if they are known; of a batch, by `see`.
         """
-        return self._say(self.encoder(context), context, deterministic, returns)
+        tokens = self.encoder(context) if seen is None else seen
+        return self._say(tokens, context, deterministic, returns)
 
-    def transition(self, context: Context, deterministic: bool = True) -> tuple[Said, Said]:
+    def see(self, contexts: Context) -> jax.Array:
+        """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
+        return self.encoder.of_all(contexts)
+
+    def transition(
+        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+    ) -> tuple[Said, Said]:
         """What is said before and after the step of a `TransitionWindow`, of its context."""
         earlier, later = windows.before(context), windows.after(context)
         if self.config.architecture != "paper":
             return self(earlier, deterministic), self(later, deterministic)
-        states = self.encoder(context)  # [K + 2, D]: each is encoded once
+        states = self.encoder(context) if seen is None else seen  # [K + 2, D]: each is encoded once
         return (
             self._say(states[:-1], earlier, deterministic, None),
             self._say(states[1:], later, deterministic, None),

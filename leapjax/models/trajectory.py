@@ -136,6 +136,13 @@ class PaperModel(nn.Module):
         tokens = self.states(context, ahead=True)
         return Seen(tokens[:-1], tokens[-1])
 
+    def see_all(self, contexts: Context) -> Seen:
+        """The same of B contexts, `[B, ...]`, of an encoder with `of_all`."""
+        if self.repeat_state:
+            return Seen(self.states.of_all(contexts))
+        tokens = self.states.of_all(contexts, ahead=True)
+        return Seen(tokens[:, :-1], tokens[:, -1])
+
     def encode(
         self,
         context: Context,
