@@ -228,7 +228,8 @@ def load(
                     f"{folder} was trained on {domain.level}, whose {name} is "
                     f"{domain.signature.get(name)}: it cannot play {level}, where it is {value}"
                 )
-        domain = other
+        # A network that counts steps counts no further than it has learned to.
+        domain = other._replace(max_steps=domain.max_steps)
     agent = make_agent(specification, domain)
     like = jax.eval_shape(agent.init, jax.random.key(0)).params
     if (folder / WEIGHTS).exists():

@@ -24,9 +24,9 @@ from tests.enumerable import (
     fit_p_value,
     joint_probabilities,
     no_tilt,
-    quick_jit,
     random_table,
 )
+from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
 MASK = mask_token(ACTIONS)

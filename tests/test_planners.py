@@ -30,10 +30,10 @@ from tests.enumerable import (
     joint_probabilities,
     no_tilt,
     plan_counts,
-    quick_jit,
     random_table,
     total_variation,
 )
+from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
 PLANS = all_plans(HORIZON, ACTIONS)

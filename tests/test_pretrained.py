@@ -8,6 +8,7 @@ from leapjax import pretrained
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from tests.programs import untrained_run
+from tests.quick import quick_jit
 
 
 def test_a_planner_can_be_asked_for_another_return(tmp_path):
@@ -41,3 +42,25 @@ def test_who_has_not_learned_returns_cannot_be_asked_for_one(tmp_path, method):
     folder = untrained_run(tmp_path, "--method", method)
     with pytest.raises(UserError, match=f"this {method} has not learned"):
         pretrained.load(folder, target_return=0.5)
+
+
+def test_it_plays_a_level_of_longer_episodes(tmp_path):
+    """A network that knows what time it is counts no further than it has learned to."""
+    folder = untrained_run(tmp_path, "--level", "GoToLocalS7N1", "--architecture", "paper")
+    trained = pretrained.load(folder)
+    domain = pretrained.make_domain(trained.specification)
+    actions = np.zeros(trained.specification.planner.horizon, np.int32)
+
+    def energy(planner, steps):
+        context = blank_context(domain, 0)._replace(step=np.int32(steps))
+
+        @quick_jit
+        def judge(params):
+            return planner.energy.total(params, planner.energy.encode(params, context), actions)
+
+        return float(judge(planner.params))
+
+    early, last = (energy(trained, steps) for steps in (0, domain.max_steps))
+    there = pretrained.load(folder, level="GoToObjMazeS4R2")
+    beyond = energy(there, domain.max_steps + 9)
+    assert beyond == pytest.approx(last, rel=1e-6) and beyond != pytest.approx(early, rel=1e-4)
