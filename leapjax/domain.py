@@ -92,7 +92,8 @@ class Domain(NamedTuple):
     max_steps: int  # of the longest episode
     blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
     encoders: Mapping[str, Callable[[ModelConfig, int], nn.Module]]
-    # by architecture, (model, K) -> module; see leapjax.models.trajectory
+    # by architecture, (model, K) -> module; see leapjax.models.trajectory. One of `paper` may have
+    # `of_all` as well, (B contexts) -> tokens [B, K + 1, D], where training is faster with it
     augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
     extras: Callable[[Demonstration], PyTree] = _no_extras
     # what augmentations must know of each step, [n, ...]; no model sees it

@@ -50,17 +50,17 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         target: PyTree,
         transition: TransitionWindow,
         key: jax.Array,
-        sees: jax.Array | None = None,
-        target_sees: jax.Array | None = None,
+        tokens: jax.Array | None = None,
+        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
         said: Any = module.apply(
             params, context, deterministic=False, rngs={"dropout": key}, method="transition",
-            seen=sees,
+            seen=tokens,
         )  # fmt: skip
         now, later = said
-        held: Any = module.apply(target, windows.after(context), seen=target_sees)
+        held: Any = module.apply(target, windows.after(context), seen=target_tokens)
         # Chosen by the one network and valued by the other, as in double Q-learning.
         best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]

@@ -38,13 +38,13 @@ def make_imitator(
         extra: PyTree,
         window: Window,
         key: jax.Array,
-        seen: jax.Array | None = None,
+        tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions of one context and of the one that followed."""
         del extra
         said: Any = module.apply(
             params, window.context, deterministic=False, rngs={"dropout": key},
-            returns=wanted(window.context, window.return_to_go), seen=seen,
+            returns=wanted(window.context, window.return_to_go), seen=tokens,
         )  # fmt: skip
         logits = said["logits"]  # [P, A - 1]
         taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)

@@ -61,9 +61,11 @@ class Networks(nn.Module):
         """What the critic says before and after the step of a transition."""
         return self.critic.transition(context, deterministic, seen)
 
-    def see(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
+    def see_all(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
         """What the policy sees before the step of B transitions, and the critic around it."""
-        return self.policy.see(jax.vmap(windows.before)(contexts)), self.critic.see(contexts)
+        return self.policy.see_all(jax.vmap(windows.before)(contexts)), self.critic.see_all(
+            contexts
+        )
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
@@ -80,9 +82,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         params: Params, target: Params, examples: TransitionWindow
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """What policy and critic see of each state, and the target of those before the step."""
-        mine: Any = module.apply(params, examples.context, method="see")
+        mine: Any = module.apply(params, examples.context, method="see_all")
         earlier = jax.vmap(windows.before)(examples.context)
-        held: Any = critic.apply(target, earlier, method="see")
+        held: Any = critic.apply(target, earlier, method="see_all")
         return (*mine, held)
 
     def transition_loss(
@@ -90,17 +92,17 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         target: PyTree,
         transition: TransitionWindow,
         key: jax.Array,
-        policy_sees: jax.Array | None = None,
-        critic_sees: jax.Array | None = None,
-        target_sees: jax.Array | None = None,
+        policy_tokens: jax.Array | None = None,
+        critic_tokens: jax.Array | None = None,
+        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
         context = transition.context
         earlier = windows.before(context)
         options: Any = {"deterministic": False, "rngs": {"dropout": key}}
-        policy: Any = module.apply(params, earlier, method="act", seen=policy_sees, **options)
-        judged: Any = module.apply(params, context, method="judge", seen=critic_sees, **options)
-        held: Any = critic.apply(target, earlier, seen=target_sees)
+        policy: Any = module.apply(params, earlier, method="act", seen=policy_tokens, **options)
+        judged: Any = module.apply(params, context, method="judge", seen=critic_tokens, **options)
+        held: Any = critic.apply(target, earlier, seen=target_tokens)
         now, later = judged
         taken, known = losses.last_actions(context, len(held["value"]), choices)
         least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))

@@ -84,12 +84,6 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
     energy = learning.keeping(energy, setup, lambda memory: memory.states)
 
-    def see(params: Params, extra: PyTree, examples: Window) -> tuple[Seen]:
-        del extra
-        seen = module.apply(params, examples.context, method="see_all")
-        assert isinstance(seen, Seen)
-        return (seen,)
-
     def window_loss(
         params: Params,
         extra: PyTree,
@@ -159,7 +153,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
     update = learning.make_update(
         run_loss if in_runs else window_loss, optimizer, mesh,
-        microbatch=setup.training.microbatch, prepare=setup.seen_at_once(see),
+        microbatch=setup.training.microbatch, prepare=setup.seen_at_once(learning.sees(module)),
     )  # fmt: skip
     batch = run_batches(setup) if in_runs else window_batches(setup)
 

@@ -96,11 +96,11 @@ def nothing_prepared(params: Params, extra: PyTree, examples: PyTree) -> tuple[(
 
 
 def sees(module: nn.Module) -> Prepare:
-    """The tokens of all states of the examples, by `module.see`."""
+    """What a network sees of all states of the examples, by `module.see_all`."""
 
     def see(params: Params, extra: PyTree, examples: PyTree) -> tuple[PyTree, ...]:
         del extra
-        return (module.apply(params, examples.context, method="see"),)
+        return (module.apply(params, examples.context, method="see_all"),)
 
     return see
 
@@ -112,8 +112,8 @@ def both_see(
 
     def see(params: Params, target: Params, examples: PyTree) -> tuple[PyTree, ...]:
         seen = jax.vmap(part)(examples.context)
-        held = module.apply(target, seen, method="see")
-        return module.apply(params, examples.context, method="see"), held
+        held = module.apply(target, seen, method="see_all")
+        return module.apply(params, examples.context, method="see_all"), held
 
     return see
 
@@ -150,8 +150,8 @@ class Setup(NamedTuple):
 
     def seen_at_once(self, see: Prepare) -> Prepare:
         """`see`, where the encoder has a better way for many contexts than one by one."""
-        at_once = hasattr(self.encoder(), "of_all")
-        return see if at_once and self.training.run == 1 else nothing_prepared
+        paper = self.model.architecture == "paper" and self.training.run == 1
+        return see if paper and hasattr(self.encoder(), "of_all") else nothing_prepared
 
     def policy(self, *heads: tuple[str, int], conditioned: bool = False) -> PolicyModel:
         """The network of a method that chooses one action at a time.

@@ -89,9 +89,9 @@ class Networks(nn.Module):
         said = self.trunk(context)
         return {"logits": self.logits(self.norm(said["features"])), "tokens": said["tokens"]}
 
-    def see(self, contexts: Context) -> jax.Array:
+    def see_all(self, contexts: Context) -> jax.Array:
         """What the trunk sees of each state of B contexts."""
-        return self.trunk.see(contexts)
+        return self.trunk.see_all(contexts)
 
     def transition(
         self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
@@ -193,15 +193,15 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         target: Params,
         transition: TransitionWindow,
         key: jax.Array,
-        sees: jax.Array | None = None,
-        target_sees: jax.Array | None = None,
+        tokens: jax.Array | None = None,
+        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the policy on the data and on what is imagined, and of the ensemble."""
         context = transition.context
         drop_key, rollout_key = jax.random.split(key)
         options = {"deterministic": False, "rngs": {"dropout": drop_key}}
-        now, later = call(params, "transition", context, seen=sees, **options)
-        seen, seen_later = call(target, "transition", context, seen=target_sees)
+        now, later = call(params, "transition", context, seen=tokens, **options)
+        seen, seen_later = call(target, "transition", context, seen=target_tokens)
         taken, known = losses.last_actions(context, len(now), choices)
         rewards = context.rewards[-len(now) :]
 

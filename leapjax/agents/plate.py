@@ -51,11 +51,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         extra: PyTree,
         window: Window,
         key: jax.Array,
-        seen: jax.Array | None = None,
+        tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions; squared error of the states that they lead to."""
         del extra
-        states, actions = module.apply(params, window.context, seen, method="encode_unrolled")
+        states, actions = module.apply(params, window.context, tokens, method="encode_unrolled")
         found: Any = module.apply(
             params, states, actions, deterministic=False, rngs={"dropout": key}, method="read"
         )

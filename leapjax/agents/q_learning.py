@@ -70,17 +70,17 @@ def make_agent(
         target: PyTree,
         transition: TransitionWindow,
         key: jax.Array,
-        sees: jax.Array | None = None,
-        target_sees: jax.Array | None = None,
+        tokens: jax.Array | None = None,
+        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         context = transition.context
         dropout_key, loss_key = jax.random.split(key)
         said: Any = module.apply(
             params, context, deterministic=False, rngs={"dropout": dropout_key},
-            method="transition", seen=sees,
+            method="transition", seen=tokens,
         )  # fmt: skip
         now, later = (each["q"] for each in said)
-        held: Any = module.apply(target, windows.after(context), seen=target_sees)
+        held: Any = module.apply(target, windows.after(context), seen=target_tokens)
         taken, known = losses.last_actions(context, len(now), choices)
 
         def returns(values: jax.Array) -> jax.Array:

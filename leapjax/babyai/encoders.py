@@ -277,10 +277,10 @@ class StateTokens(nn.Module):
     def of_all(self, contexts: Context, ahead: bool = False) -> jax.Array:
         """The same of B contexts in which nothing is encoded yet, `[B, ...]`: `[B, K + 1, D]`.
 
-        A few states at a time, whose maps stay in a core's cache; and what stands in a context for
-        the time before its episode is always the same, so it is looked at once.
+        On a CPU a few states at a time, whose maps stay in a core's cache; and what stands in a
+        context for the time before its episode is always the same, so it is looked at once.
         """
-        if not contexts.actions.shape[1]:
+        if not contexts.actions.shape[1] or jax.default_backend() != "cpu":
             return jax.vmap(lambda context: self(context, ahead))(contexts)
         now = contexts.observation
         later = [jax.vmap(_nowhere)(now)] if ahead else []
@@ -289,7 +289,7 @@ class StateTokens(nn.Module):
             contexts.past, now, *later,
         )  # fmt: skip
         told = jax.vmap(lambda instruction: self.instruction(instruction).whole)(now.instruction)
-        first, total, which = once.distinct(states)
+        first, total, which = once.runs(states)
         length = which.shape[1]
         each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], states)
         tokens = once.of_first(self.state, each, told[first // length], total, AT_A_TIME)

@@ -67,7 +67,7 @@ class AlternatingModel(nn.Module):
     ) -> tuple[jax.Array, jax.Array]:
         """The same of an unrolled window: states `[past + T, D]`, actions `[past + T - 1]`.
 
-        `seen` is what `see` has made of its states, if it has.
+        `seen` is what `see_all` has made of its states, if it has.
         """
         count = self.past + self.sizes.horizon
         if self.config.architecture == "paper":
@@ -78,7 +78,7 @@ class AlternatingModel(nn.Module):
             states = jnp.concatenate([self._states(each) for each in contexts])
         return states, context.actions[context.actions.shape[0] - (count - 1) :]
 
-    def see(self, contexts: Context) -> jax.Array:
+    def see_all(self, contexts: Context) -> jax.Array:
         """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
         return self.encoder.of_all(contexts)
 

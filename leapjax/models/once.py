@@ -1,8 +1,7 @@
-"""What repeats in a sequence is computed once, however often it repeats.
+"""States that stay the same for some steps are computed once.
 
-How often that is depends on the data, and shapes may not: results have room for a sequence without
-repetitions, and a loop ends where the distinct ones do. A loop of that kind has no gradient, and
-one that goes on to the end would write zeros for most of it; so it is given here.
+How many differ depends on the data, and shapes may not: results have room for all of them, and a
+loop ends where they do. JAX differentiates no loop of unknown length, so its gradient is here.
 """
 
 import functools
@@ -15,16 +14,16 @@ import jax.numpy as jnp
 from leapjax.types import PyTree
 
 
-class Distinct(NamedTuple):
-    """Which of B sequences of n things repeat the one before."""
+class Runs(NamedTuple):
+    """Runs of equal things in B sequences of n."""
 
-    first: jax.Array  # [B * n] int32: where each distinct one is first; then zeros
-    total: jax.Array  # [] int32: as many there are
-    which: jax.Array  # [B, n] int32: of which distinct one each is a copy
+    first: jax.Array  # [B * n] int32: of each run its first, an index into all B * n; then zeros
+    total: jax.Array  # [] int32: how many runs there are
+    which: jax.Array  # [B, n] int32: the run that each is of
 
 
-def distinct(sequences: PyTree) -> Distinct:
-    """Of things with leaves `[B, n, ...]`, n > 0: those unlike the one before in their sequence."""
+def runs(sequences: PyTree) -> Runs:
+    """Of things with leaves `[B, n, ...]`, n > 0: one ends where the next thing is another."""
 
     def changed(leaf: jax.Array) -> jax.Array:
         return jnp.any(leaf[:, 1:] != leaf[:, :-1], axis=range(2, leaf.ndim))
@@ -32,7 +31,7 @@ def distinct(sequences: PyTree) -> Distinct:
     differ = jax.tree.reduce(jnp.logical_or, jax.tree.map(changed, sequences))  # [B, n - 1]
     new = jnp.pad(differ, ((0, 0), (1, 0)), constant_values=True)
     first = jnp.nonzero(new.reshape(-1), size=new.size)[0].astype(jnp.int32)
-    return Distinct(first, jnp.sum(new), (jnp.cumsum(new) - 1).reshape(new.shape))
+    return Runs(first, jnp.sum(new), (jnp.cumsum(new) - 1).reshape(new.shape))
 
 
 def of_first(
@@ -45,12 +44,12 @@ def of_first(
     """`function(thing, row)` of the first `count` of N: `[N, ...]`; beyond them anything.
 
     Args:
-        function: of one; it may depend on other arrays, such as parameters.
-        things: leaves `[N, ...]` by which no gradient is taken.
+        function: of one; it may capture arrays of floating-point numbers, such as parameters.
+        things: leaves `[N, ...]` of any type, by which no gradient is taken.
         rows: floating-point numbers `[N, ...]`.
         count: `[]` int32, in 0 .. N.
-        size: as many are taken at a time. The gradient computes them again: to store what it takes
-            costs more, and room for N of them.
+        size: as many are taken at a time; so some beyond `count` are, and must be finite. The
+            gradient computes them again: to store what it takes costs more, and room for N.
     """
     total = jax.tree.leaves(things)[0].shape[0]
 

@@ -58,12 +58,12 @@ class PolicyModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
-            seen: the tokens of the states, if they are known; of a batch, by `see`.
+            seen: the tokens of the states, if they are known; of a batch, by `see_all`.
         """
         tokens = self.encoder(context) if seen is None else seen
         return self._say(tokens, context, deterministic, returns)
 
-    def see(self, contexts: Context) -> jax.Array:
+    def see_all(self, contexts: Context) -> jax.Array:
         """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
         return self.encoder.of_all(contexts)
 
