@@ -5,7 +5,6 @@ the data make likely: the ones it knows the value of. It acts the same way.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
-from leapjax.data import windows
+from leapjax.agents.q_learning import look_around, seen_around
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
@@ -50,17 +49,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         target: PyTree,
         transition: TransitionWindow,
         key: jax.Array,
-        tokens: jax.Array | None = None,
-        target_tokens: jax.Array | None = None,
+        *seen: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
-        said: Any = module.apply(
-            params, context, deterministic=False, rngs={"dropout": key}, method="transition",
-            seen=tokens,
-        )  # fmt: skip
-        now, later = said
-        held: Any = module.apply(target, windows.after(context), seen=target_tokens)
+        now, later, held = look_around(module, params, target, context, key, *seen)
         # Chosen by the one network and valued by the other, as in double Q-learning.
         best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]
@@ -76,7 +69,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch, setup.seen_at_once(learning.both_see(module, windows.after)),
+        setup.training.microbatch, setup.seen_at_once(seen_around(module)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say, likely)
     return Agent(init, transition_batches(setup), update, energy)

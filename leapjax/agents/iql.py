@@ -61,11 +61,9 @@ class Networks(nn.Module):
         """What the critic says before and after the step of a transition."""
         return self.critic.transition(context, deterministic, seen)
 
-    def see_all(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
+    def see_all(self, earlier: Context, contexts: Context) -> tuple[jax.Array, jax.Array]:
         """What the policy sees before the step of B transitions, and the critic around it."""
-        return self.policy.see_all(jax.vmap(windows.before)(contexts)), self.critic.see_all(
-            contexts
-        )
+        return self.policy.see_all(earlier), self.critic.see_all(contexts)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
@@ -82,8 +80,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         params: Params, target: Params, examples: TransitionWindow
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """What policy and critic see of each state, and the target of those before the step."""
-        mine: Any = module.apply(params, examples.context, method="see_all")
         earlier = jax.vmap(windows.before)(examples.context)
+        mine: Any = module.apply(params, earlier, examples.context, method="see_all")
         held: Any = critic.apply(target, earlier, method="see_all")
         return (*mine, held)
 

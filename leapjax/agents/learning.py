@@ -90,7 +90,7 @@ Prepare = Callable[[Params, PyTree, PyTree], tuple[PyTree, ...]]
 
 
 def nothing_prepared(params: Params, extra: PyTree, examples: PyTree) -> tuple[()]:
-    """What most losses are given."""
+    """What a loss is given that needs nothing else."""
     del params, extra, examples
     return ()
 
@@ -111,9 +111,8 @@ def both_see(
     """The same, and what the target network sees of a part of each example's context."""
 
     def see(params: Params, target: Params, examples: PyTree) -> tuple[PyTree, ...]:
-        seen = jax.vmap(part)(examples.context)
-        held = module.apply(target, seen, method="see_all")
-        return module.apply(params, examples.context, method="see_all"), held
+        held = module.apply(target, jax.vmap(part)(examples.context), method="see_all")
+        return *sees(module)(params, target, examples), held
 
     return see
 

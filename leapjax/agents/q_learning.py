@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import Setup
+from leapjax.agents.learning import Prepare, Setup
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -35,6 +35,39 @@ class Judged(NamedTuple):
     later: jax.Array  # [P, W] after it
     held: jax.Array  # [P, W] after it, by the target network
     taken: jax.Array  # [P] int32: the action
+
+
+def look_around(
+    module: PolicyModel,
+    params: Params,
+    target: Params,
+    context: Context,
+    key: jax.Array,
+    tokens: jax.Array | None = None,
+    target_tokens: jax.Array | None = None,
+) -> tuple[Said, Said, Said]:
+    """What is said before and after the step of a transition, and after it by the target network.
+
+    Args:
+        module: the network.
+        params: its parameters.
+        target: those of the target network.
+        context: of the transition.
+        key: of dropout; the target network has none.
+        tokens: what `seen_around` has found, if it has: of the network,
+        target_tokens: and of the target network.
+    """
+    said: Any = module.apply(
+        params, context, deterministic=False, rngs={"dropout": key}, method="transition",
+        seen=tokens,
+    )  # fmt: skip
+    held: Any = module.apply(target, windows.after(context), seen=target_tokens)
+    return *said, held
+
+
+def seen_around(module: PolicyModel) -> Prepare:
+    """What both see of transitions, for `look_around`."""
+    return learning.both_see(module, windows.after)
 
 
 Returns = Callable[[jax.Array], jax.Array]
@@ -70,23 +103,18 @@ def make_agent(
         target: PyTree,
         transition: TransitionWindow,
         key: jax.Array,
-        tokens: jax.Array | None = None,
-        target_tokens: jax.Array | None = None,
+        *seen: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         context = transition.context
         dropout_key, loss_key = jax.random.split(key)
-        said: Any = module.apply(
-            params, context, deterministic=False, rngs={"dropout": dropout_key},
-            method="transition", seen=tokens,
-        )  # fmt: skip
-        now, later = (each["q"] for each in said)
-        held: Any = module.apply(target, windows.after(context), seen=target_tokens)
+        said = look_around(module, params, target, context, dropout_key, *seen)
+        now, later, held = (each["q"] for each in said)
         taken, known = losses.last_actions(context, len(now), choices)
 
         def returns(values: jax.Array) -> jax.Array:
             return losses.bellman(transition, values, settings.discount)
 
-        each = loss(Judged(now, later, held["q"], taken), returns, loss_key)
+        each = loss(Judged(now, later, held, taken), returns, loss_key)
         q = values(now)
         return losses.mean_where(each, known), {
             "accuracy": losses.mean_where(jnp.argmax(q, axis=1) == taken, known),
@@ -96,7 +124,7 @@ def make_agent(
     init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch, setup.seen_at_once(learning.both_see(module, windows.after)),
+        setup.training.microbatch, setup.seen_at_once(seen_around(module)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
     return Agent(init, transition_batches(setup), update, energy)

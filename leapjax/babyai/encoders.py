@@ -29,7 +29,7 @@ OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
 NORM_GROUPS = 8
 FAR = 64.0  # the distance of what no way leads to
-AT_A_TIME = 16  # states
+AT_A_TIME = 16  # states that a core encodes
 BARRIER = 8.0  # steps that one goes round for each nat
 # Where embeddings start: as PyTorch's, which are the authors'; and as Flax's.
 LARGE = nn.initializers.normal(1.0)
@@ -275,7 +275,7 @@ class StateTokens(nn.Module):
         return tokens if known is None else jnp.concatenate([known, tokens])
 
     def of_all(self, contexts: Context, ahead: bool = False) -> jax.Array:
-        """The same of B contexts in which nothing is encoded yet, `[B, ...]`: `[B, K + 1, D]`.
+        """The same of B contexts, `[B, ...]`, in which nothing is encoded yet: `[B, K + 1, D]`.
 
         On a CPU a few states at a time, whose maps stay in a core's cache; and what stands in a
         context for the time before its episode is always the same, so it is looked at once.
