@@ -19,9 +19,10 @@ import jax
 import pytest
 
 from experiments import babyai
+from leapjax import training
 from leapjax.babyai import demonstrations, levels
 from leapjax.types import Demonstration
-from tests import OURS
+from tests import OURS, parameters
 from tests.programs import TOY_RUN
 
 # Tracing makes very many objects, of which few are garbage; JAX tidies up at each collection, too.
@@ -49,6 +50,12 @@ def minari_folder(tmp_path, monkeypatch):
     folder = tmp_path / "minari"
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
     return folder
+
+
+@pytest.fixture
+def quick_begin(monkeypatch):
+    """Runs begin with any parameters: nothing is compiled to draw them."""
+    monkeypatch.setattr(training, "make_begin", parameters.make_begin)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,10 @@
 """Parameters of networks that have learned nothing, and yet say something of what they see."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from leapjax import sharding
 
 
 def random_like(shapes, scale=0.5, seed=0):
@@ -29,3 +32,25 @@ def scaled_like(shapes, seed=0):
 def random_parameters(agent, scale=0.5, seed=0):
     """The same for the parameters of an agent."""
     return random_like(jax.eval_shape(agent.init, jax.random.key(0)).params, scale, seed)
+
+
+def random_state(agent):
+    """A `TrainState` with such parameters, before any step."""
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
+    state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+    return state._replace(
+        params=random_like(shapes.params, 0.1), extra=random_like(shapes.extra, 0.1)
+    )
+
+
+def make_begin(agent, mesh):
+    """In the place of `training.make_begin`, which takes as long to compile as a step.
+
+    For tests that ask neither what a network begins with nor whether it learns.
+    """
+    state = random_state(agent)
+    whole = jax.sharding.NamedSharding(mesh, sharding.REPLICATED)
+    return jax.jit(
+        lambda seed: (jax.tree.map(jnp.asarray, state), jax.random.key(seed)),
+        out_shardings=(sharding.parameter_shardings(state, mesh), whole),
+    )

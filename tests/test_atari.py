@@ -324,7 +324,7 @@ def test_collecting_goes_on_where_it_was_stopped(collected):
     assert shard.stat().st_mtime_ns > when and shard.read_bytes() == before
 
 
-def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys):
+def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys, quick_begin):
     folder, _ = collected
     monkeypatch.chdir(tmp_path)
     options = {

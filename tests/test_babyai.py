@@ -225,7 +225,7 @@ def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
         pytest.param("leapjax", "BabyAI-PutNextS4N1-v0", marks=only_long),
     ],
 )
-def test_both_presets_run_on_any_level_with_context(workplace, name, level):
+def test_both_presets_run_on_any_level_with_context(workplace, name, level, quick_begin):
     runs = f"{name} {level}"
     arguments = ["--preset", name, "--level", level, "--context", "2", "--runs", runs]
     arguments += [] if LONG else ["--steps", "0"]  # the gradient takes long to compile

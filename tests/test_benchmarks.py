@@ -82,7 +82,7 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     assert plot.stat().st_size > 1000
 
 
-def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch):
+def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, quick_begin):
     monkeypatch.setattr(training, "preset", tiny_preset)
     monkeypatch.setattr(training, "matmul_peak", lambda *rest: 100.0)  # measured for planning
     rows = tmp_path / "rows.json"

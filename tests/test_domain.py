@@ -62,7 +62,7 @@ def plans_of(planner, count):
     return planner(leap.plan_keys(0, np.arange(count), np.zeros(count)), contexts)
 
 
-def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
+def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quick_begin):
     for name in () if LONG else ("classifier", "bc", "bcq", "mopo", "cql", "qr_dqn", "rem"):
         less = methods.METHODS[name]._replace(everywhere=False)  # the others are no different
         monkeypatch.setitem(methods.METHODS, name, less)
@@ -83,7 +83,7 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
+def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace, quick_begin):
     arguments = [*EVERY, *"--demos 2 --episodes 2 --steps 4 --method classifier".split()]
     leaps = [*EVERY, *"--demos 2 --episodes 2 --steps 0".split()]
     assert experiment.main(LAKE, leaps) == experiment.main(LAKE, arguments) == 0
@@ -98,7 +98,9 @@ def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace):
     assert plan.actions.max() < 5
 
 
-def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(workplace, capsys):
+def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(
+    workplace, capsys, quick_begin
+):
     lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
     collection = frozen_lake.collect(3, 0, lambda done: None)
     for demonstration in collection.demonstrations:

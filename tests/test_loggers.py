@@ -33,7 +33,7 @@ def events(folder):
 
 
 @pytest.fixture
-def workplace(tmp_path, monkeypatch):
+def workplace(tmp_path, monkeypatch, quick_begin):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(domains.DOMAINS, LAKE.domain, FROZEN_LAKE)
     return tmp_path

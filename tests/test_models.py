@@ -24,6 +24,7 @@ from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
 from tests.enumerable import all_plans
 from tests.parameters import scaled_like
+from tests.programs import LONG
 from tests.quick import quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
@@ -137,15 +138,23 @@ def largest_change(after, before):
     return np.abs(after[finite] - before[finite]).max()
 
 
-EACH_MODEL = pytest.mark.parametrize("past", [0, 2])
+# A program for each pair of architecture and length of the past, which all tests of it share.
+MODELS = [(architecture, 2) for architecture in ARCHITECTURES]
+OTHERS = [(architecture, 0) for architecture in ARCHITECTURES] + [("neighbours", 2)]
+
+
+def of_each(*pairs):
+    return pytest.mark.parametrize(("architecture", "past"), pairs)
+
+
 EACH_ARCHITECTURE = pytest.mark.parametrize("architecture", ARCHITECTURES)
-EACH_NETWORK = pytest.mark.parametrize("architecture", (*ARCHITECTURES, "neighbours"))
+EACH_MODEL = of_each(*MODELS, *(OTHERS[:-1] if LONG else ()))
+EACH_NETWORK = of_each(*MODELS, ("neighbours", 0), *(OTHERS if LONG else ()))
 
 
 # What holds for both architectures.
 
 
-@EACH_ARCHITECTURE
 @EACH_MODEL
 def test_end_is_forbidden_at_the_first_position_only(architecture, past):
     context = random_context(0, past)
@@ -157,7 +166,6 @@ def test_end_is_forbidden_at_the_first_position_only(architecture, past):
         assert np.isfinite(logits[~expected]).all()
 
 
-@EACH_ARCHITECTURE
 @EACH_MODEL
 def test_only_plans_that_end_at_once_have_infinite_energy(architecture, past):
     context = random_context(1, past)
@@ -167,7 +175,6 @@ def test_only_plans_that_end_at_once_have_infinite_energy(architecture, past):
 
 
 @EACH_NETWORK
-@EACH_MODEL
 def test_total_is_a_loop_over_masked_positions(architecture, past):
     context = random_context(2, past)
     for actions in ([0, 1, 2], [3, END, END], [1, 1, 0]):
@@ -181,7 +188,6 @@ def test_total_is_a_loop_over_masked_positions(architecture, past):
         assert total == pytest.approx(expected, rel=1e-4)
 
 
-@EACH_ARCHITECTURE
 @EACH_MODEL
 def test_a_plan_that_holds_mask_has_infinite_energy(architecture, past):
     for t in range(HORIZON):
@@ -191,7 +197,6 @@ def test_a_plan_that_holds_mask_has_infinite_energy(architecture, past):
 
 
 @EACH_NETWORK
-@EACH_MODEL
 def test_the_action_before_masking_is_not_seen(architecture, past):
     context = random_context(4, past)
     for t in range(HORIZON):
@@ -208,7 +213,6 @@ def test_the_action_before_masking_is_not_seen(architecture, past):
 
 
 @EACH_NETWORK
-@EACH_MODEL
 def test_positions_masked_together_see_none_of_each_other(architecture, past):
     context = random_context(5, past)
     blank = run(architecture, past, context, [MASK] * 3)
@@ -220,7 +224,6 @@ def test_positions_masked_together_see_none_of_each_other(architecture, past):
 
 
 @EACH_NETWORK
-@EACH_MODEL
 def test_one_queried_position_has_the_logits_of_all(architecture, past):
     context = random_context(6, past)
     for t in range(HORIZON):
@@ -228,7 +231,6 @@ def test_one_queried_position_has_the_logits_of_all(architecture, past):
         np.testing.assert_allclose(result["alone"], result["logits"][t], rtol=1e-5, atol=1e-5)
 
 
-@EACH_ARCHITECTURE
 @EACH_MODEL
 def test_what_the_model_must_know_changes_its_logits(architecture, past):
     context = random_context(8, past)
@@ -372,7 +374,7 @@ def _rotations(past):
     return rotate
 
 
-@EACH_MODEL
+@pytest.mark.parametrize("past", [0, 2] if LONG else [2])
 @pytest.mark.parametrize("goal", [True, False])
 def test_turning_the_whole_world_changes_no_logits(past, goal):
     context = random_context(13, past, goal)
@@ -485,8 +487,10 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     np.testing.assert_allclose(found[1, :-1], wanted[1, :-1], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("past", [0, 2])
-@pytest.mark.parametrize("repeat_state", [True, False])
+@pytest.mark.parametrize(
+    ("past", "repeat_state"),
+    [(2, False), (0, True), *([(0, False), (2, True)] if LONG else ())],
+)
 def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     """The current one, as equation 4 has it; or what does not depend on where the agent is."""
     encoder = encoders.StateTokens(SIDE, 16)

@@ -16,6 +16,7 @@ from leapjax.methods import find_method
 from leapjax.models import once
 from leapjax.models.trajectory import ModelConfig
 from tests import mixed
+from tests.parameters import random_state
 from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.test_models import SIDE, random_context
@@ -153,7 +154,7 @@ def test_methods_learn_the_same_from_what_is_seen_at_once(name, monkeypatch):
 
     def step():
         agent = method.make_agent(setup, None)
-        state = quick_jit(agent.init)(key)
+        state = random_state(agent)
         batch = quick_jit(agent.batch)(key, mixed.steps(episodes=1))
         state, metrics = quick_jit(agent.update)(state, batch, key)
         return jax.device_get((optax.tree.get(state.optimizer, "mu"), metrics))

@@ -12,7 +12,7 @@ from experiments.common.runtime import Cluster
 from leapjax import processes
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes, join
-from tests.programs import BABYAI, COMMAND, ROOT, only_long, place_with_a_run
+from tests.programs import ROOT, only_long, place_with_a_run
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
@@ -23,11 +23,10 @@ def free_address():
         return f"localhost:{free.getsockname()[1]}"
 
 
-def start_two(place, runs, *options, command=COMMAND):
+def start_two(place, runs, *options):
     together = ("--coordinator", free_address(), "--num-processes", "2", *options)
     return [
-        place.start(runs, *together, "--process-id", str(index), devices=1, command=command)
-        for index in range(2)
+        place.start(runs, *together, "--process-id", str(index), devices=1) for index in range(2)
     ]
 
 
@@ -74,8 +73,7 @@ def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
 
 
 def test_what_one_process_refuses_is_refused_by_all_before_any_work(place):
-    # Of all that the command line asks of BabyAI nothing may touch a device before they join.
-    runs = start_two(place, "refused", "--batch", "5", command=BABYAI)
+    runs = start_two(place, "refused", "--batch", "5")
     errors = [run.communicate(timeout=100)[1] for run in runs]
     assert [run.returncode for run in runs] == [2, 2]
     assert all("a batch of 5" in error and "2 process(es)" in error for error in errors)

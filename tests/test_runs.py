@@ -16,6 +16,7 @@ from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from tests import toy
+from tests.parameters import random_state
 from tests.quick import quick_jit
 
 CONTEXT, HORIZON, RUN = 2, 3, 4
@@ -79,7 +80,7 @@ def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs, data)
 def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
     agent = leap.make_agent(setup(returns=returns))
     alone = leap.make_agent(setup(run=1, returns=returns))
-    state = quick_jit(agent.init)(jax.random.key(0))
+    state = random_state(agent)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), runs)
     together, metrics = quick_jit(agent.update)(state, runs, jax.random.key(1))
     one_by_one, expected = quick_jit(alone.update)(state, flat, jax.random.key(1))

@@ -18,15 +18,10 @@ from leapjax.babyai.settings import Settings
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
-from tests import frozen_lake
-from tests.programs import LONG, TOY, only_long
+from tests.programs import TOY, only_long
 
-CYCLES, RUNS = 300 if LONG else 5, 20
-DOMAIN = (
-    BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
-    if LONG
-    else frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())  # it compiles sooner
-)
+CYCLES, RUNS = 300, 20
+DOMAIN = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
 
 
 def open_files():
@@ -65,6 +60,7 @@ class Watch:
         )
 
 
+@only_long
 def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
     model, learning = ModelConfig(layers=1, heads=2, width=16), TrainingConfig(steps=10, batch=4)
     mesh = sharding.make_mesh(learning.batch)

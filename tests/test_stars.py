@@ -217,7 +217,7 @@ def test_nodes_are_drawn_apart_and_in_the_picture(star):
     assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
 
 
-def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys):
+def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     monkeypatch.chdir(tmp_path)
     few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]
     monkeypatch.setattr(searches, "SEARCHES", few)

@@ -251,7 +251,7 @@ def test_data_that_solve_no_board_are_refused():
             domain.check(wrong, "here")
 
 
-def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypatch):
+def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypatch, quick_begin):
     monkeypatch.chdir(tmp_path)
     few = [search for search in searches.SEARCHES if search.name == "all at once"]
     monkeypatch.setattr(searches, "SEARCHES", few)
