@@ -18,7 +18,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
-from tests.parameters import random_parameters, scaled_like
+from tests.parameters import random_parameters
 from tests.quick import quick_jit
 from tests.recorder import Recorder
 
@@ -52,9 +52,7 @@ def episode(domain: Domain, length: int, steps: int, act: Callable[[History], np
 def test_states_look_as_they_did_when_they_were_current(name, length):
     domain = level_of(name)
     encoder = domain.encoders["paper"](MODEL, length)
-    params = scaled_like(
-        jax.eval_shape(encoder.init, jax.random.key(0), blank_context(domain, length))
-    )
+    params = quick_jit(encoder.init)(jax.random.key(0), blank_context(domain, length))
     encode = quick_jit(encoder.apply)
     known, moved = [], []
 
