@@ -31,7 +31,7 @@ TOY_RUN = [*TOY, "--steps", "4", "--iterations", "3"]  # what most tests look at
 RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
 
 # What processes of their own run. The short form trains a method of single actions in another
-# domain, which compiles in a fourth of the time; what happens to a process depends on neither.
+# domain, which compiles sooner; what happens to a process depends on neither.
 LAKE = Experiment("lake", "frozen_lake")
 NAME, COMMAND = (
     ("babyai", ["-m", "experiments.babyai", *TOY])
@@ -67,7 +67,7 @@ class Place:
     def __init__(self, folder):
         self.folder = folder
 
-    def start(self, runs, *options, devices=2, command=COMMAND, cache=None):
+    def start(self, runs, *options, devices=2, cache=None):
         """Starts a run whose results go to the folder `runs`; `cache`: of compiled programs."""
         environment = {
             **os.environ,
@@ -79,7 +79,7 @@ class Place:
             environment["LEAPJAX_COMPILATION_CACHE"] = cache
         often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
         return subprocess.Popen(
-            [sys.executable, *command, *often, "--runs", runs, *options],
+            [sys.executable, *COMMAND, *often, "--runs", runs, *options],
             cwd=self.folder, env=environment, text=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip

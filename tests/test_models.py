@@ -24,7 +24,7 @@ from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
 from tests.enumerable import all_plans
 from tests.parameters import scaled_like
-from tests.programs import LONG
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 # Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
@@ -139,17 +139,14 @@ def largest_change(after, before):
 
 
 # A program for each pair of architecture and length of the past, which all tests of it share.
-MODELS = [(architecture, 2) for architecture in ARCHITECTURES]
-OTHERS = [(architecture, 0) for architecture in ARCHITECTURES] + [("neighbours", 2)]
-
-
-def of_each(*pairs):
-    return pytest.mark.parametrize(("architecture", "past"), pairs)
-
-
+MODELS = [
+    *((architecture, 2) for architecture in ARCHITECTURES),
+    *(pytest.param(architecture, 0, marks=only_long) for architecture in ARCHITECTURES),
+]
+NETWORKS = [*MODELS, ("neighbours", 0), pytest.param("neighbours", 2, marks=only_long)]
 EACH_ARCHITECTURE = pytest.mark.parametrize("architecture", ARCHITECTURES)
-EACH_MODEL = of_each(*MODELS, *(OTHERS[:-1] if LONG else ()))
-EACH_NETWORK = of_each(*MODELS, ("neighbours", 0), *(OTHERS if LONG else ()))
+EACH_MODEL = pytest.mark.parametrize(("architecture", "past"), MODELS)
+EACH_NETWORK = pytest.mark.parametrize(("architecture", "past"), NETWORKS)
 
 
 # What holds for both architectures.
@@ -374,7 +371,7 @@ def _rotations(past):
     return rotate
 
 
-@pytest.mark.parametrize("past", [0, 2] if LONG else [2])
+@pytest.mark.parametrize("past", [2, pytest.param(0, marks=only_long)])
 @pytest.mark.parametrize("goal", [True, False])
 def test_turning_the_whole_world_changes_no_logits(past, goal):
     context = random_context(13, past, goal)
@@ -489,7 +486,12 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
 
 @pytest.mark.parametrize(
     ("past", "repeat_state"),
-    [(2, False), (0, True), *([(0, False), (2, True)] if LONG else ())],
+    [
+        (2, False),
+        (0, True),
+        pytest.param(0, False, marks=only_long),
+        pytest.param(2, True, marks=only_long),
+    ],
 )
 def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     """The current one, as equation 4 has it; or what does not depend on where the agent is."""

@@ -26,7 +26,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
-from tests.programs import LONG, only_long
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 MODEL = ModelConfig(layers=1, heads=2, width=16)
@@ -510,7 +510,9 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     assert_same_step(actual, expected)
 
 
-@pytest.mark.parametrize("microbatch", [6, 20, *((8, 1) if LONG else ())])
+@pytest.mark.parametrize(
+    "microbatch", [6, 20, pytest.param(8, marks=only_long), pytest.param(1, marks=only_long)]
+)
 def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
     agent, step = tiny()
     key = jax.random.key(0)
