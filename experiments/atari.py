@@ -22,7 +22,7 @@ from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
 from leapjax import files
-from leapjax.atari.domain import FOLDER, LONGEST, Settings, make
+from leapjax.atari.domain import FOLDER, LONGEST, Settings, make, preset
 from leapjax.atari.games import find_game
 from leapjax.checkpoints import read_json
 
@@ -37,8 +37,8 @@ class Collect:
 
     game: str
     """Breakout, Qbert, Pong or Seaquest."""
-    transitions: int = Settings.transitions
-    """At least so many, in whole games."""
+    transitions: int | None = None
+    """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
     """Where to; a game that was begun there goes on."""
     run: int = 1
@@ -73,9 +73,11 @@ def run(options: Collect) -> None:
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console()
-    with Meter(console, "transitions", options.transitions) as meter:
+    ours = preset(options.game, "leapjax").get("transitions", Settings.transitions)
+    transitions = options.transitions or ours
+    with Meter(console, "transitions", transitions) as meter:
         made = collect(
-            options.folder, find_game(options.game), options.transitions, options.run,
+            options.folder, find_game(options.game), transitions, options.run,
             options.longest, options.workers, meter.update,
         )  # fmt: skip
     games = [game for manifest in made for game in manifest["games"]]

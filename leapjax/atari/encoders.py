@@ -95,7 +95,8 @@ class StateTokens(nn.Module):
 class CurrentTokens(nn.Module):
     """A few tokens for the current state alone, and what changed before it: `[tokens, D]`.
 
-    Before its start an episode is taken to have stood still.
+    Before its start an episode is taken to have stood still. Frames that a shorter context does not
+    hold are black: without a past the whole frame is what has changed.
     """
 
     width: int
