@@ -123,9 +123,7 @@ PAPER = {
     "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
 }  # fmt: skip
 EPOCHS = 10
-# Of preset `leapjax`, where games differ. What moves in Seaquest looks where it goes; who sees the
-# past there learns to go on as before, too low to come up for air in time (docs/tried.md).
-OURS: Mapping[str, Mapping[str, Any]] = {"Seaquest": {"context": 0, "transitions": 200_000}}
+TRANSITIONS = {"Seaquest": 200_000}  # to learn from with preset `leapjax`, where not as elsewhere
 IMITATORS = ("leap", "bc", "dt")  # they sample what to do; to ask for a ball can be improbable
 
 
@@ -150,7 +148,7 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     return {
         **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 10_000,
         "layers": 2, "width": 64, "features": 16, "mirror": True, "max_steps": LONGEST,
-        **OURS.get(name, {}),
+        "transitions": TRANSITIONS.get(name, Settings.transitions),
     }  # fmt: skip
 
 
@@ -170,6 +168,10 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
         options["learning_rate"] = 1e-3
     if method in IMITATORS:
         options["temperature"] = 0.1 if preset == "leapjax" else 1.0
+        if preset == "leapjax" and name == "Seaquest":
+            # What moves there looks where it goes. Who imitates and sees the past learns to go on as
+            # before, too low to come up for air in time (docs/tried.md).
+            options["context"] = 0
     if method == "cql" and preset == "leapjax":
         options["alpha"] = 1.0  # with less it learns nothing in so few steps (docs/tried.md)
     return options
