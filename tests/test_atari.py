@@ -131,6 +131,19 @@ def test_encoders_see_what_they_should(architecture):
             assert differs.all() if changed >= 3 else not differs.any()
 
 
+def test_without_a_past_the_whole_frame_has_changed():
+    context = window(8, context=0).context
+    assert context.past.shape == (0, 84, 84)
+    shown = encoders.changes(encoders.stacked(encoders.seen(context), 1))[0]
+    np.testing.assert_array_equal(shown[..., 1:3], 0)
+    np.testing.assert_allclose(shown[..., 3], encoders.CHANGES * shown[..., 0], rtol=1e-5)
+    encoder = domain.make("Seaquest", domain.Settings()).encoders["leapjax"](MODEL, 0)
+    params = random_like(jax.eval_shape(encoder.init, jax.random.key(0), context), 0.05)
+    encode = jax.jit(encoder.apply)
+    first = context._replace(step=jnp.int32(0))
+    np.testing.assert_array_equal(encode(params, context), encode(params, first))
+
+
 def test_a_shift_moves_all_frames_alike():
     drawn = window(5)
     move = jax.jit(functools.partial(augmentation.shifted, most=4))
