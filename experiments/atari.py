@@ -22,7 +22,7 @@ from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
 from leapjax import files
-from leapjax.atari.domain import FOLDER, LONGEST, TRANSITIONS, Settings, make
+from leapjax.atari.domain import FOLDER, LONGEST, Settings, make, preset
 from leapjax.atari.games import find_game
 from leapjax.checkpoints import read_json
 
@@ -73,7 +73,7 @@ def run(options: Collect) -> None:
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console()
-    transitions = options.transitions or TRANSITIONS.get(options.game, Settings.transitions)
+    transitions = options.transitions or preset(options.game, "leapjax")["transitions"]
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
             options.folder, find_game(options.game), transitions, options.run,

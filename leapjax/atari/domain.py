@@ -170,7 +170,7 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
         options["temperature"] = 0.1 if preset == "leapjax" else 1.0
         if preset == "leapjax" and name == "Seaquest":
             # What moves there looks where it goes. Who imitates and sees the past learns to go on
-            # as before, too low to come up for air in time (docs/tried.md).
+            # as before (docs/tried.md).
             options["context"] = 0
     if method == "cql" and preset == "leapjax":
         options["alpha"] = 1.0  # with less it learns nothing in so few steps (docs/tried.md)
