@@ -35,13 +35,16 @@ from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import LEFT
 from leapjax.energy import compose, constrain, neutral, view
 from leapjax.environments import Transition
-from leapjax.planners import GibbsConfig
+from leapjax.planners import BeamConfig, GibbsConfig
 from leapjax.types import Context, Energy
 
 Penalty = Callable[[Context, jax.Array], jax.Array]
-TURN_BUDGET = 5  # enough to visit a cell of an empty room, and then to face an object
+# Turns enough to visit a cell of a room, and then to face an object: of the room when empty, and
+# where six more objects are in the way.
+FEW_TURNS, DETOUR_TURNS = 5, 9
 ROOM_STEPS = 64  # of the longest episode in one
 WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
+LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
 FALSE_STARTS = {"leap": {"false_starts": 0.6, "steps": 3000}}
@@ -79,6 +82,10 @@ class WatchedTurns(Watched):
 class WatchedErrand(Watched):
     """Needs the coloured cell to be visited; counts goals before that, and turns over a budget."""
 
+    def __init__(self, level: str, budget: int) -> None:
+        super().__init__(level)
+        self._budget = budget
+
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""
         self._turns = 0
@@ -87,7 +94,7 @@ class WatchedErrand(Watched):
     def step(self, action: int) -> Transition:
         """Takes one of MiniGrid's first six actions; what was visited is a cell like others."""
         self._turns += action in TURNS
-        self.violations += action in TURNS and self._turns > TURN_BUDGET
+        self.violations += action in TURNS and self._turns > self._budget
         transition = super().step(action)
         x, y = self.env.agent_pos
         if _is_marked(self.env.grid.get(x, y)):
@@ -114,9 +121,6 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[En
     return lambda energies: constrain(view(energies[0], sees), penalty, partial=True)
 
 
-few_turns = functools.partial(turns_over, budget=TURN_BUDGET)
-
-
 # What judges the next action alone: those that violate anything at once are removed.
 masked = functools.partial(unseen, weight=math.inf)
 
@@ -124,6 +128,11 @@ masked = functools.partial(unseen, weight=math.inf)
 def left_to_right(trained: GibbsConfig) -> GibbsConfig:
     """Gibbs sampling that fills a plan from its beginning, which a constraint then judges."""
     return dataclasses.replace(trained, fill="sequential", iterations=trained.horizon, resampled=1)
+
+
+def beams(trained: GibbsConfig) -> BeamConfig:
+    """Many beginnings of a plan at once: where what leads to the end first leads away from it."""
+    return BeamConfig(horizon=trained.horizon, beams=16)
 
 
 def noisily(trained: GibbsConfig, temperature: float = 2.0) -> GibbsConfig:
@@ -190,6 +199,28 @@ def _constraints(name: str, model: Model, level: str) -> Case:
     )
 
 
+def _errand(name: str, model: Model, level: str, budget: int) -> Case:
+    few_turns = functools.partial(turns_over, budget=budget)
+    at_once = masked(goal_before_visit, few_turns)
+    told = unseen(steps_to_visit, few_turns)
+    lightly = unseen(steps_to_visit, few_turns, weight=LIGHT)
+    return Case(
+        f"constraints-{name}",
+        [model],
+        level,
+        [
+            Way("whole plan", minimise=told, search=left_to_right, executed=3),
+            Way("whole plan, beam search", minimise=lightly, search=beams, executed=3),
+            Way("dt", "dt", at_once, wandering),
+            Way("iql", "iql", at_once, wandering),
+            Way("dt, told how far", "dt", told),
+            Way("iql, told how far", "iql", told),
+        ],
+        functools.partial(WatchedErrand, budget=budget),
+        remembered=ROOM_STEPS,
+    )
+
+
 def _plain(paper: tuple[float, float, float]) -> list[Way]:
     leap, dt, iql = paper
     return [
@@ -226,6 +257,9 @@ def _composed(
 
 MAZE, OBSTACLES = "GoToObjMazeS4", "GoToBehindObstacles"
 ROOM, OPEN_MAZE = Model("GoToLocalS8N1", more=BOTH), Model(MAZE, more=FALSE_STARTS)
+# A detour around objects is longer than the plans that are learned there.
+LONGER = {"horizon": 10, "iterations": 10}
+OBJECTS = Model("GoToLocalS8N7", more={"leap": {**LONGER, **FALSE_STARTS["leap"]}})
 CASES = (
     _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
     _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
@@ -254,20 +288,8 @@ CASES = (
     ),
     _constraints("room", ROOM, "GoToLavaMedium"),
     _constraints("maze", OPEN_MAZE, "GoToLavaHard"),
-    Case(
-        "constraints-errand", [ROOM], "GoToVia",
-        [
-            Way(
-                "whole plan", minimise=unseen(steps_to_visit, few_turns), search=left_to_right,
-                executed=3,
-            ),
-            Way("dt", "dt", masked(goal_before_visit, few_turns), wandering),
-            Way("iql", "iql", masked(goal_before_visit, few_turns), wandering),
-            Way("dt, told how far", "dt", unseen(steps_to_visit, few_turns)),
-            Way("iql, told how far", "iql", unseen(steps_to_visit, few_turns)),
-        ],
-        WatchedErrand, remembered=ROOM_STEPS,
-    ),
+    _errand("errand", ROOM, "GoToVia", FEW_TURNS),
+    _errand("detour", OBJECTS, "GoToViaDetour", DETOUR_TURNS),
 )  # fmt: skip
 ANALYSIS = Analysis("properties", CASES)
 

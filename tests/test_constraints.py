@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.properties import TURN_BUDGET, WatchedErrand
+from experiments.properties import FEW_TURNS, WatchedErrand
 from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -124,7 +124,7 @@ def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
 
 def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal():
     """As the world decides: it ends at the goal, and forgets a cell that was visited."""
-    adapter, rng = WatchedErrand("GoToVia"), np.random.default_rng(0)
+    adapter, rng = WatchedErrand("GoToVia", FEW_TURNS), np.random.default_rng(0)
     distance, early = jax.jit(steps_to_visit), jax.jit(goal_before_visit)
     outcomes = set()
     for seed in range(40):
@@ -154,12 +154,12 @@ def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal():
 
 
 def test_turns_over_the_budget_are_counted_in_each_episode():
-    adapter = WatchedErrand("GoToVia")
+    adapter = WatchedErrand("GoToVia", FEW_TURNS)
     for seed in (0, 1):
         adapter.reset(seed)
         before = adapter.violations
         counts = [adapter.step(LEFT) and adapter.violations - before for _ in range(7)]
-        assert counts == [0] * TURN_BUDGET + [1, 2]
+        assert counts == [0] * FEW_TURNS + [1, 2]
 
 
 def test_who_should_pick_something_up_is_told_to_go_to_it():

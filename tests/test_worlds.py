@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from minigrid.core.constants import DIR_TO_VEC
 
-from experiments.properties import TURN_BUDGET, WatchedErrand
+from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand
 from leapjax.babyai import demonstrations, observations
 from leapjax.babyai.adapter import END, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
@@ -91,11 +91,14 @@ def facing(x, y, direction, cell):
     return tuple(map(int, (x, y) + DIR_TO_VEC[direction])) == cell
 
 
-def test_there_is_one_coloured_cell_and_turns_enough_to_visit_it():
-    adapter = WatchedErrand("GoToVia")
+@pytest.mark.parametrize(
+    ("level", "budget"), [("GoToVia", FEW_TURNS), ("GoToViaDetour", DETOUR_TURNS)]
+)
+def test_there_is_one_coloured_cell_and_turns_enough_to_visit_it(level, budget):
+    adapter = WatchedErrand(level, budget)
     turns = Counter(fewest_turns(adapter, adapter.reset(seed)) for seed in EPISODES)
-    assert 3 < max(turns) <= TURN_BUDGET
-    seen = without_marks(first("GoToVia", 0)[1]).observation
+    assert budget // 2 < max(turns) <= budget
+    seen = without_marks(first(level, 0)[1]).observation
     assert not cells_of(jax.device_get(seen), FLOOR)
 
 

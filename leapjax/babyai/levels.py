@@ -90,6 +90,7 @@ MODIFIED = {
         _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),
         # An errand: what is learned has no coloured cell.
         _room("GoToVia", "GoToVia", 8),
+        _room("GoToViaDetour", "GoToVia", 8, 7),
         # Generalisation: learned in one room.
         _room("GoToLocalS8N15", "GoToLocal", 8, 15),
         _room("GoToLocalS7N1", "GoToLocal", 7),

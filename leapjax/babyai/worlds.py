@@ -55,7 +55,7 @@ class GoToBehindLava(GoToLocal):
             lava += [cell for cell in beside if cell not in lava]
         for cell in free_cells(self, list(dict.fromkeys(lava)))[:MOST_LAVA]:
             self.grid.set(*cell, Lava())
-        require_a_way(self)
+        require_a_way(self, target_cell(self))
 
 
 class GoToAmongLava(GoTo):
@@ -72,7 +72,7 @@ class GoToAmongLava(GoTo):
             column, row = self._rand_int(0, self.num_cols), self._rand_int(0, self.num_rows)
             room = self.get_room(column, row)
             self.place_obj(Lava(), room.top, room.size, max_tries=1000)
-        require_a_way(self)
+        require_a_way(self, target_cell(self))
 
 
 class GoToBehindObstacles(RoomGridLevel):
@@ -105,7 +105,7 @@ class GoToBehindObstacles(RoomGridLevel):
 
 
 class GoToVia(GoToLocal):
-    """One room and one object; and a coloured cell, somewhere, that is to be visited first.
+    """One room, with objects; and a coloured cell, somewhere, that is to be visited first.
 
     The instruction does not say so.
     """
@@ -113,7 +113,8 @@ class GoToVia(GoToLocal):
     def gen_mission(self) -> None:
         """Places everything."""
         super().gen_mission()
-        self.place_obj(Floor("yellow"))
+        x, y = self.place_obj(Floor("yellow"))
+        require_a_way(self, (int(x), int(y)))
 
 
 class PickUpLocal(GoToLocal):
@@ -134,17 +135,17 @@ class PickUp(GoTo):
         self.instrs = PickupInstr(self.instrs.desc)  # type: ignore[assignment]
 
 
-def require_a_way(env: RoomGridLevel) -> None:
-    """Refuses levels, while they are made, where lava is on every way to the object."""
-    start, goal = agent_cell(env), target_cell(env)
+def require_a_way(env: RoomGridLevel, to: Cell) -> None:
+    """Refuses levels, while they are made, where lava or objects are on every way to a cell."""
+    start = agent_cell(env)
     reached, stack = {start}, [start]
     while stack:
         x, y = stack.pop()
         for near in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
-            if near == goal:
+            if near == to:
                 return
             cell = env.grid.get(*near)
             if near not in reached and (cell is None or cell.type == "door"):
                 reached.add(near)
                 stack.append(near)
-    raise RejectSampling("lava is on every way")
+    raise RejectSampling("something is on every way")
