@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.properties import FEW_TURNS, WatchedErrand
+from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand
 from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -19,6 +19,9 @@ from leapjax.babyai.constraints import (
 from leapjax.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.vocabulary import decode
+from leapjax.batching import compile_planner
+from leapjax.energy import constrain, pseudo_likelihood
+from leapjax.planners import BeamConfig, GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import mask_token
 
@@ -151,6 +154,32 @@ def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal():
         assert (missed >= observation.grid[..., 0].size) == ended_early
         outcomes.add((bool(marks), bool(transition.success)))
     assert outcomes >= {(True, False), (False, True)}
+
+
+def test_beams_go_around_what_left_to_right_stands_in_front_of():
+    """A prior that only turns and moves, told how far the cell is but not what is in the way."""
+    sensible = jnp.isin(jnp.arange(NUM_ACTIONS), jnp.array([LEFT, RIGHT, FORWARD]))
+    prior = pseudo_likelihood(
+        lambda params, context: (),
+        lambda params, memory, tokens, positions: jnp.tile(
+            jnp.where(sensible, 0.0, -jnp.inf), (positions.shape[0], 1)
+        ),
+        NUM_ACTIONS,
+    )
+    told = constrain(
+        prior, lambda context, actions: 5.0 * steps_to_visit(context, actions), partial=True
+    )
+    adapter = WatchedErrand("GoToViaDetour", DETOUR_TURNS)
+    contexts = [context_of(adapter, adapter.reset(seed)) for seed in range(24)]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *contexts)
+    keys = jax.random.split(jax.random.key(0), len(contexts))
+    far = {}
+    for config in (GibbsConfig(10, 10, fill="sequential"), BeamConfig(10, beams=64)):
+        plans = compile_planner(told, config)({}, keys, batch)
+        far[type(config)] = jax.vmap(steps_to_visit)(batch, plans.actions)
+    assert (far[BeamConfig] <= far[GibbsConfig]).all()
+    around = (far[BeamConfig] == 0) & (far[GibbsConfig] > 0)
+    assert around.sum() >= 3
 
 
 def test_turns_over_the_budget_are_counted_in_each_episode():
