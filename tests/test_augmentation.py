@@ -28,6 +28,8 @@ GRID_WORDS = augmentation.GridWords(
 augment = jax.jit(augmentation.augment, static_argnums=3)
 clutter = jax.jit(augmentation.clutter)
 window_at = jax.jit(windows.window, static_argnums=(2, 3, 4))
+unrolled_at = jax.jit(windows.unrolled_window, static_argnums=(2, 3, 4))
+transition_at = jax.jit(windows.transition_window, static_argnums=(2, 3))
 lay_out = functools.partial(windows.concatenate, extras=augmentation.way)
 
 
@@ -121,6 +123,28 @@ def test_the_past_is_transformed_with_the_present(name):
             np.testing.assert_array_equal(before.goal, after.goal)
 
 
+@pytest.mark.parametrize("name", ["GoToLocalS7N5", "GoToObjMazeS4"])
+@pytest.mark.parametrize("place", [0, 2])
+def test_the_future_of_an_unrolled_window_is_transformed_with_its_past(name, place):
+    """From the first step on, when more states are known than steps were made."""
+    level, horizon = levels.find_level(name), 4
+    collected = demonstrations.collect(level, 20, seed=1).demonstrations
+    [demonstration] = [d for d in collected if len(d.actions) > place + horizon][:1]
+    steps = jax.tree.map(jnp.asarray, lay_out([demonstration]))
+    window = unrolled_at(steps, jnp.int32(place), 0, horizon, END)
+    mirrored = Counter()
+    for key in range(8):
+        changed = jax.device_get(augment(jax.random.key(key), window, GRID_WORDS, True))
+        past = [jax.tree.map(lambda x, i=i: x[i], changed.context.past) for i in range(horizon - 1)]
+        moments = [*past, changed.context.observation]
+        for (before, after), action in zip(pairwise(moments), changed.actions[:-1], strict=True):
+            np.testing.assert_array_equal(stepped(before, int(action)).pose, after.pose)
+            np.testing.assert_array_equal(before.instruction, after.instruction)
+            np.testing.assert_array_equal(before.goal, after.goal)
+        mirrored[bool((moments[0].pose != window.context.past.pose[0]).any())] += 1
+    assert min(mirrored[False], mirrored[True]) > 0
+
+
 def test_half_of_the_sequences_are_said_the_other_way_round():
     window = next(
         window
@@ -183,6 +207,26 @@ def test_in_clutter_a_demonstration_stays_possible_and_shortest(name):
             assert shortest(start) == shortest(before)
             filled += int(where.sum())
     assert filled > 100
+
+
+def test_clutter_is_unlike_a_target_that_is_picked_up_meanwhile():
+    """In the last transition of a demonstration the target's cell is empty afterwards."""
+    collected = demonstrations.collect(levels.find_level("PickUpLoc"), 12, seed=1).demonstrations
+    steps = jax.tree.map(jnp.asarray, lay_out(collected))
+    seen = 0
+    for last in np.asarray(steps.starts + steps.lengths - 1):
+        window = transition_at(steps, last, 0, END)
+        before = jax.tree.map(lambda x: x[-1], window.context.past)
+        kind, colour, _ = np.asarray(before.grid)[tuple(before.goal)]
+        assert np.asarray(window.context.observation.grid)[tuple(before.goal)][0] == EMPTY
+        for key in range(4):
+            changed = clutter(jax.random.key(key), window, 1.0)
+            new = np.asarray(changed.context.past.grid[-1])[
+                added(before, jax.tree.map(lambda x: x[-1], changed.context.past))
+            ]
+            assert (new[:, 0] != kind).all() and (new[:, 1] != colour).all()
+            seen += len(new)
+    assert seen > 100
 
 
 def test_clutter_leaves_half_of_the_windows_and_fills_up_to_its_share():

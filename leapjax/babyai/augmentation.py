@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.babyai import symmetries, vocabulary
-from leapjax.babyai.dynamics import FORWARD, passable
+from leapjax.babyai.dynamics import DOOR, FORWARD, passable
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.domain import Augmentation
-from leapjax.types import Array, Demonstration, Window
+from leapjax.types import Array, Context, Demonstration, Window
 
 FALSE_MOVES, DETOUR_MOVES = 6, 8  # at most, at the beginning of a window
 TRIES = 8  # to find a detour
@@ -100,7 +100,7 @@ def clutter(
     probability = share * jax.random.uniform(share_key, minval=-1.0)  # negative: none
     filled = jax.random.uniform(where_key, cells) < probability
     filled &= free & ~window.extras & (goal[0] >= 0)
-    target = grid[goal[0], goal[1]].astype(jnp.int32)
+    target = _target(context)
     if lookalikes is None:
         kind, colour = _unlike(kind_key, colour_key, target, cells)
     else:
@@ -117,6 +117,16 @@ def clutter(
     observation = context.observation._replace(grid=fill(grid))
     before = context.past._replace(grid=jax.vmap(fill)(past))
     return window._replace(context=context._replace(observation=observation, past=before))
+
+
+def _target(context: Context) -> jax.Array:
+    """`[3]` int32: what is on the goal's cell, or was there before it was picked up."""
+    x, y = context.observation.goal
+    now = jnp.asarray(context.observation.grid)[x, y]
+    seen = jnp.concatenate([jnp.asarray(context.past.grid)[:, x, y], now[None]])  # [K + 1, 3]
+    thing = (seen[:, 0] >= DOOR) & (seen[:, 0] <= symmetries.INTERCHANGEABLE[-1])
+    last = jnp.argmax(thing * jnp.arange(1, len(seen) + 1))
+    return seen[last].astype(jnp.int32)
 
 
 def _unlike(
@@ -392,9 +402,10 @@ def reflect(window: Window, mirrored_words: jax.Array) -> Window:
     """The mirror image of one window."""
     context = window.context
     past = jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past)
-    # Blank states before the start have no mirror image.
+    # Blank states before the start have no mirror image. (How many they are does not follow from
+    # the step: an unrolled window's past goes on beyond it.)
     length = context.actions.shape[0]
-    known = jnp.arange(length, 0, -1) <= context.step
+    known = (jnp.asarray(context.past.grid) != 0).any(axis=(1, 2, 3))
 
     def keep_blank(mirrored: jax.Array, original: jax.Array) -> jax.Array:
         return jnp.where(known.reshape(length, *(1,) * (mirrored.ndim - 1)), mirrored, original)
