@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Energy, Params, PyTree, mask_token, nothing_encoded
+from leapjax.types import Energy, Params, PyTree, mask_token, no_violation, nothing_encoded
 
 EncodeFn = Callable[[Params, PyTree], PyTree]
 LogitsFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
@@ -95,8 +95,8 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
 def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """An energy from its total alone: any function of a complete plan will do.
 
-    The conditional tries every action at every position, `P * A` evaluations; MASK is not
-    accepted, so planners start from uniform actions.
+    The conditional tries every action at every position while all others are as they are, `P * A`
+    evaluations; MASK is not accepted, so planners start from uniform actions.
 
     Args:
         encode: (params, context) -> memory.
@@ -210,6 +210,7 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
+        actions, positions = jnp.asarray(actions), jnp.asarray(positions)
         result = jnp.zeros((positions.shape[0], energies[0].num_actions), jnp.float32)
         for i in active:
             result += weights[i] * energies[i].conditional(params[i], memory[i], actions, positions)
@@ -228,7 +229,11 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
         return result
 
     accepts_mask = all(energies[i].accepts_mask for i in active)
-    return Energy(encode, conditional, total, energies[0].num_actions, accepts_mask, violation)
+    free = all(energies[i].violation is no_violation for i in active)
+    return Energy(
+        encode, conditional, total, energies[0].num_actions, accepts_mask,
+        no_violation if free else violation,
+    )  # fmt: skip
 
 
 def constrain(
@@ -236,6 +241,7 @@ def constrain(
 ) -> Energy:
     """Adds a test-time constraint (paper, section 4, online adaptation).
 
+    Each position is judged with all others as they are, those that are asked for with it, too.
     While a plan still holds MASK outside the position in question the penalty is not
     evaluated: it is a function of complete plans. So the first, all-masked iteration
     ignores it and every later one obeys it. A penalty that grows with the number of
@@ -267,6 +273,7 @@ def constrain(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         inner, context = memory
+        actions, positions = _check_query(actions, positions, energy.num_actions)
         base = energy.conditional(params, inner, actions, positions)
         extra = _try_every_action(
             lambda plan: known(context, plan), actions, positions, energy.num_actions
@@ -317,9 +324,12 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
         actions: that it should say nothing of; at least one is left.
 
     Raises:
-        ValueError: the energy accepts no MASK, or the actions are none, all, or none of its own.
+        ValueError: the energy accepts no MASK, the actions are none, all, or none of its own, or
+            it is constrained: what is MASK would not be judged.
     """
     chosen = sorted(set(actions))
+    if energy.violation is not no_violation:
+        raise ValueError("neutral comes before constrain: constrain what it returns")
     if not energy.accepts_mask:
         raise ValueError("neutral needs an energy that accepts MASK (accepts_mask is False)")
     if not chosen or len(chosen) >= energy.num_actions:

@@ -416,12 +416,16 @@ def beam_search(
     blank = jnp.full((config.beams, config.horizon), mask_token(actions), jnp.int32)
     # One plan is blank, not W: the others would only repeat it.
     sums = jnp.full(config.beams, jnp.inf).at[0].set(0.0)
-    (beams, _), (trace, invalid) = jax.lax.scan(extend, (blank, sums), jnp.arange(config.horizon))
-    best = beams[0]
-    plan = Plan(best, trace, energy.violation(params, memory, best) <= 0, ~invalid.any())
+    positions = jnp.arange(config.horizon)
+    (beams, sums), (trace, invalid) = jax.lax.scan(extend, (blank, sums), positions)
+    # In a dead end a constraint says nothing, so what it forbids may have the least sum.
+    violations = jax.vmap(lambda beam: energy.violation(params, memory, beam))(beams)
+    found = jnp.argmin(jnp.where(jnp.isposinf(violations), jnp.inf, sums))
+    best, satisfied = beams[found], violations[found] <= 0
+    plan = Plan(best, trace.at[-1].set(best), satisfied, ~invalid.any())
     if config.score:
-        found = energy.total(params, memory, best)
-        plan = plan._replace(energy=found, valid=plan.valid & ~undefined(found))
+        total = energy.total(params, memory, best)
+        plan = plan._replace(energy=total, valid=plan.valid & ~undefined(total))
     return plan
 
 

@@ -74,7 +74,8 @@ def nothing_encoded(memory: PyTree) -> None:
     del memory
 
 
-def _no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+    """That of an energy without constraints: 0."""
     del params, memory, actions
     return jnp.zeros(())
 
@@ -90,12 +91,12 @@ class Energy(NamedTuple):
     # (params, context) -> memory; computed once per plan
     conditional: Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
     # (params, memory, actions [T], positions [P]) -> [P, A]: the energy of each action at
-    # each position, up to a constant per position; all P positions are masked together
+    # each position, up to a constant per position; a model's masks all P positions together
     total: Callable[[Params, PyTree, jax.Array], jax.Array]
     # (params, memory, actions [T]) -> []: the energy of a complete plan
     num_actions: int  # A, the end action included
     accepts_mask: bool = True  # False: planning starts from uniform actions, not from MASK
-    violation: Callable[[Params, PyTree, jax.Array], jax.Array] = _no_violation
+    violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
     # (params, memory, actions [T]) -> []: 0 where every constraint holds, else positive
     encoded: Callable[[PyTree], jax.Array | None] = nothing_encoded
     # (memory) -> [K + 1, D]: what `encode` made of each state, for the `encoded` of later contexts;

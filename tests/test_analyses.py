@@ -80,6 +80,19 @@ def test_two_models_are_composed(place):
     assert row["train_seconds"] == 0  # for no step
 
 
+def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):
+    """Metrics are written first, and a kill may come before the checkpoint is."""
+    of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
+    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
+    folder = analysis.run_folder(config, 0)
+    folder.mkdir(parents=True)
+    write_metrics(folder, [{"step": config.training.steps, "seconds": 1.0, "loss": 1.0}])
+    assert analysis.main(of, SHORT) == 0
+    assert f"training {folder}" in capsys.readouterr().out.replace("\n", "")
+    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert "training" not in capsys.readouterr().out
+
+
 def test_what_training_took_is_that_of_all_its_parts(tmp_path):
     assert analysis.training_seconds(tmp_path) == 0
     write_metrics(

@@ -109,6 +109,17 @@ def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
     assert [path.name for path in left.iterdir()] == ["episodes.csv"]  # nothing was trained
 
 
+def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_path, capsys):
+    folder = tmp_path / "learned"
+    shutil.copytree(run_folder(workplace), folder)
+    noted = json.loads((folder / "data.json").read_text())
+    (folder / "data.json").write_text(json.dumps({**noted, "seeds": [*noted["seeds"], 7]}))
+    arguments = ["--checkpoint", str(folder), "--episodes", "3", "--no-pictures"]
+    assert len(noted["seeds"]) > 3
+    assert babyai.main([*arguments, "--test-seed", "5"]) == 2
+    assert "level seed 7 is both a demonstration and a test episode" in capsys.readouterr().err
+
+
 def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
     folder = untrained_run(tmp_path / "random", "--method", "random", "--seeds", "2")
     arguments = ["--checkpoint", str(folder), "--episodes", "1", "--runs", str(tmp_path / "again")]

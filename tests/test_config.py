@@ -9,6 +9,7 @@ import pytest
 import experiments.__main__ as programs
 from experiments.common import config
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
+from experiments.common.searches import searches
 from leapjax import checkpoints, domains, pretrained
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
@@ -120,6 +121,30 @@ def test_all_levels_are_those_of_the_paper():
     assert [each.level for each in found] == list(BABYAI.levels)
     assert {each.demos for each in found} == {9}
     assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
+
+
+@pytest.mark.parametrize(
+    ("method", "option", "value", "why"),
+    [
+        ("classifier", "--fill", "sequential", "judges complete plans only"),
+        ("random", "--horizon", "3", "its horizon is 1"),
+    ],
+)
+def test_a_method_is_not_asked_to_plan_in_a_way_that_it_cannot(method, option, value, why):
+    with pytest.raises(UserError, match=f"{option} {value}.*{why}"):
+        config.parse("babyai", ["--method", method, option, value])
+
+
+def test_every_method_can_search_stars_and_boards():
+    """Whose presets fill plans one action at a time, which the classifier cannot judge."""
+    for domain in ("stars", "sudoku"):
+        (found,) = config.parse(domain, ["--method", "classifier"])
+        ways = searches(found)
+        assert found.planner.fill == "together" and len(ways) > 5
+        assert {way["fill"] for way in ways} == {"together"}
+        (found,) = config.parse(domain, ["--method", "leap"])
+        assert found.planner.fill == "confident"
+        assert len(searches(found)) > len(ways)
 
 
 def test_every_program_is_known_by_name(capsys):

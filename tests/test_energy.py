@@ -466,6 +466,22 @@ def test_neutral_refuses_what_it_cannot_do():
             neutral(ENUMERABLE, actions)
     with pytest.raises(ValueError, match="not all in 0 .. 2"):
         neutral(ENUMERABLE, [3])
+    with pytest.raises(ValueError, match="neutral comes before constrain"):
+        neutral(compose([CONSTRAINED, CONSTRAINED]), [2])
+    assert neutral(compose([ENUMERABLE, ENUMERABLE]), [2]).accepts_mask
+
+
+def test_a_constrained_or_composed_energy_takes_what_others_take():
+    """Arrays of NumPy, and lists."""
+    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
+    for energy, params in (
+        (CONSTRAINED, TABLE), (compose([CONSTRAINED, CONSTRAINED]), (TABLE, TABLE))
+    ):  # fmt: skip
+        memory = energy.encode(params, context)
+        actions, positions = PLANS[5], np.arange(HORIZON)
+        expected = energy.conditional(params, memory, jnp.asarray(actions), jnp.asarray(positions))
+        for given in ((actions, positions), (actions.tolist(), positions.tolist())):
+            np.testing.assert_array_equal(energy.conditional(params, memory, *given), expected)
 
 
 def test_nothing_is_nan_where_everything_is_forbidden():

@@ -644,6 +644,23 @@ def test_beam_search_obeys_a_constraint_where_its_beams_leave_a_choice():
     np.testing.assert_array_equal(plan.actions[0], second)
 
 
+def test_beam_search_keeps_no_plan_that_is_forbidden_while_another_is_allowed():
+    """A beam that leads into a dead end pays nothing there, and is the best by its sum."""
+    table = np.zeros_like(TABLE)
+
+    def forbids_first(context, actions):  # known only once there is a second action
+        return jnp.where((actions[0] != 2) & (actions[1] < ACTIONS), jnp.inf, 0.0)
+
+    tilt = np.zeros((HORIZON, ACTIONS), np.float32)
+    tilt[0, 2] = -5.0  # the only allowed beginning is the unlikeliest
+    for partial in (False, True):
+        safe = constrain(ENUMERABLE, forbids_first, partial=partial)
+        plan = plans_of(safe, BeamConfig(HORIZON, 40, score=True), table, tilt, chains=1)
+        assert plan.actions[0, 0] == 2 and plan.satisfied.all()
+        np.testing.assert_array_equal(plan.actions, plan.trace[:, -1])
+        assert np.isfinite(plan.energy).all()
+
+
 def test_beam_search_needs_an_energy_of_plans_that_are_begun():
     with pytest.raises(ValueError, match="accepts_mask is False"):
         bind(FROM_TOTAL, BeamConfig(HORIZON))(TABLE, jax.random.key(0), NO_TILT)

@@ -306,8 +306,8 @@ def training_seconds(folder: Path) -> float:
 def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
     training, folder = training_of(config), run_folder(config, seed)
-    steps = [entry["step"] for entry in run.read_metrics(folder)]
-    if steps and steps[-1] >= config.training.steps:
+    # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
+    if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
         return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
     work.console.print(f"training {folder}", highlight=False, markup=False)
     this = experiment.make_run(training, config, seed, work.console, work.interruption)

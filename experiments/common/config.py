@@ -250,7 +250,13 @@ def check(config: AnyConfig) -> None:
             f"may last: its step limit is {limit}"
         )
     # An agent costs nothing to make, and says what its method cannot do.
-    pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
+    agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
+    fill = getattr(config.planner, "fill", "from left to right")
+    if not agent.energy.accepts_mask and fill != "together":
+        raise UserError(
+            f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
+            "begin at once (--fill together)"
+        )
     check_memory(config, domain)
 
 

@@ -134,6 +134,8 @@ def run_one(
         if processes.is_first():
             this = run.with_loggers(this, name, stack)
         if config.checkpoint is not None:
+            if config.play is None:  # another level's seeds are others
+                seeds.check_disjoint(run.demonstrated(config.checkpoint), played)
             planner = run.reuse(this, config.checkpoint)
         else:
             planner, metrics = train(this, played, stack)

@@ -210,7 +210,7 @@ def fit(
     """
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
-    check_data(folder, windows.fingerprint(examples))
+    check_data(folder, windows.fingerprint(examples), [each.seed for each in data])
     processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
@@ -277,8 +277,10 @@ def training_mesh(config: AnyConfig) -> Mesh:
         raise UserError(f"--batch, --fsdp: {error}") from None
 
 
-def check_data(folder: Path, fingerprint: str) -> None:
+def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> None:
     """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
+
+    Notes what they are, and their level seeds, for `demonstrated`.
 
     Raises:
         UserError: the run was begun on others, or processes have read different ones.
@@ -292,7 +294,8 @@ def check_data(folder: Path, fingerprint: str) -> None:
     def check() -> None:
         path = folder / "data.json"
         if not path.exists():
-            return files.write_text(path, json.dumps({"fingerprint": fingerprint}))
+            noted = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            return files.write_text(path, json.dumps(noted))
         values = read_json(path)
         before = values.get("fingerprint") if isinstance(values, dict) else None
         if before != fingerprint:
@@ -303,6 +306,14 @@ def check_data(folder: Path, fingerprint: str) -> None:
         return None
 
     processes.first_does(check)
+
+
+def demonstrated(folder: Path) -> list[int]:
+    """Level seeds of the demonstrations that a run learned from, where its folder says so."""
+    path = folder / "data.json"
+    values = read_json(path) if path.exists() else {}
+    noted = values.get("seeds", []) if isinstance(values, dict) else []
+    return [seed for seed in noted if isinstance(seed, int)]
 
 
 def reuse(run: Run, checkpoint: Path) -> Pretrained:

@@ -45,8 +45,10 @@ BEST_OF_MANY = Search(
 
 
 def searches(config: AnyConfig) -> list[Mapping[str, Any]]:
-    """Options of every way to plan; methods of one action at a time have one."""
+    """Options of every way to plan that a method can; those of one action at a time have none."""
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
     every = (*SEARCHES, BEST_OF_MANY) if config.method == "rules" else SEARCHES
+    if config.method == "classifier":  # judges no plan in which actions are open
+        every = tuple(search for search in every if "fill" not in search.options)
     return [search.of(config.planner.horizon) for search in every]

@@ -17,9 +17,10 @@ from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
+_COMPLETE = {"fill": "together"}  # it judges no plan in which actions are open
 PRESETS: Presets = {
-    "paper": {"architecture": "paper", "windows": "episode"},
-    "leapjax": {"architecture": "leapjax", "windows": "step", "learning_rate": 1.5e-3},
+    "paper": {"architecture": "paper", "windows": "episode", **_COMPLETE},
+    "leapjax": {"architecture": "leapjax", "windows": "step", "learning_rate": 1.5e-3, **_COMPLETE},
 }
 
 

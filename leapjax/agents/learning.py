@@ -162,12 +162,20 @@ class Setup(NamedTuple):
         Raises:
             UserError: plans are not of one action.
         """
+        self.check_single_action()
+        return PolicyModel(self.model, self.sizes, self.encoder(), heads, conditioned)
+
+    def check_single_action(self) -> None:
+        """Refuses plans of several actions.
+
+        Raises:
+            UserError: plans are not of one action.
+        """
         if self.horizon != 1:
             raise UserError(
                 f"--horizon {self.horizon}: this method chooses one action at a time, so its "
                 "horizon is 1"
             )
-        return PolicyModel(self.model, self.sizes, self.encoder(), heads, conditioned)
 
 
 class Method(NamedTuple):

@@ -22,6 +22,7 @@ class Settings:
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """Uniform random actions as an `Agent`, whose parameters are empty."""
     del mesh
+    setup.check_single_action()
     choices = setup.domain.num_actions - 1
 
     def encode(params: Params, context: Context) -> PyTree:
