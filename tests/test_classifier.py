@@ -23,8 +23,12 @@ SETUP = Setup(toy.DOMAIN, 0, 4, MODEL, TRAINING, classifier.Settings())
 def test_corruption_is_as_many_other_actions_as_it_says():
     actions = jnp.array([0, 2, 2, END])
     keys = jax.random.split(jax.random.key(0), 4000)
-    corrupt = quick_jit(jax.vmap(lambda key: classifier.corrupt(key, actions, NUM_ACTIONS)))
-    corrupted, degrees = corrupt(keys)
+    corrupt = quick_jit(
+        jax.vmap(
+            lambda key, imitated: classifier.corrupt(key, actions, imitated, NUM_ACTIONS), (0, None)
+        )
+    )
+    corrupted, degrees = corrupt(keys, jnp.ones(4, bool))
     assert ((corrupted >= 0) & (corrupted < NUM_ACTIONS)).all()
     np.testing.assert_allclose((corrupted != actions).mean(axis=1), degrees)
     # Every degree is as likely, every position too, and every other action.
@@ -35,6 +39,10 @@ def test_corruption_is_as_many_other_actions_as_it_says():
     shares = np.bincount(changed, minlength=NUM_ACTIONS) / len(changed)
     expected = np.where(np.arange(NUM_ACTIONS) == 2, 0, 1 / (NUM_ACTIONS - 1))
     np.testing.assert_allclose(shares, expected, atol=0.04)
+    # What is not to be imitated is corrupted, replaced or not.
+    imitated = jnp.array([False, True, False, True])
+    corrupted, degrees = corrupt(keys, imitated)
+    np.testing.assert_allclose(((corrupted != actions) | ~imitated).mean(axis=1), degrees)
 
 
 @pytest.fixture(scope="module")

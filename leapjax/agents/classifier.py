@@ -51,7 +51,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Squared error of the degree of corruption of one corrupted window."""
         del extra
-        corrupted, target = corrupt(key, window.actions, sizes.num_actions)
+        corrupted, target = corrupt(key, window.actions, window.imitated, sizes.num_actions)
         memory = module.apply(params, window.context, method="encode")
         found = module.apply(params, memory, corrupted, method="degree")
         assert isinstance(found, jax.Array)
@@ -64,11 +64,13 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return Agent(init, window_batches(setup), update, energy)
 
 
-def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.Array, jax.Array]:
-    """Replaces n of the actions `[T]` by others, n uniform in 0 .. T; and n / T.
+def corrupt(
+    key: jax.Array, actions: jax.Array, imitated: jax.Array, num_actions: int
+) -> tuple[jax.Array, jax.Array]:
+    """Replaces n of the actions `[T]` by others, n uniform in 0 .. T; and how corrupted they are.
 
     The paper says "depending on the degree of randomness": the share of actions that are
-    not the demonstrator's.
+    not the demonstrator's. Nor are those his that are not `imitated [T]`.
     """
     count_key, order_key, action_key = jax.random.split(key, 3)
     horizon = actions.shape[0]
@@ -77,7 +79,8 @@ def corrupt(key: jax.Array, actions: jax.Array, num_actions: int) -> tuple[jax.A
     # A shift by 1 .. A-1 is always another action.
     shift = jax.random.randint(action_key, (horizon,), 1, max(num_actions, 2))
     corrupted = jnp.where(replaced, (actions + shift) % num_actions, actions)
-    return corrupted, count / horizon
+    foreign = ~imitated & ~replaced
+    return corrupted, count / horizon + foreign.sum() / horizon
 
 
 def _encode_and_judge(
