@@ -115,12 +115,15 @@ def test_the_past_is_transformed_with_the_present(name):
     for key in range(6):
         changed = jax.device_get(augment(jax.random.key(key), window, GRID_WORDS, True))
         past = [jax.tree.map(lambda x, i=i: x[i], changed.context.past) for i in range(context)]
-        moments = [*past, changed.context.observation]
-        for (before, after), action in zip(pairwise(moments), changed.context.actions, strict=True):
-            hidden = stepped(before, int(action))
-            np.testing.assert_array_equal(hidden.pose, after.pose)
-            np.testing.assert_array_equal(before.instruction, after.instruction)
-            np.testing.assert_array_equal(before.goal, after.goal)
+        assert_lead_on([*past, changed.context.observation], changed.context.actions)
+
+
+def assert_lead_on(moments: list[Observation], actions: np.ndarray) -> None:
+    """Each action leads from one state to the next, of one world with one instruction."""
+    for (before, after), action in zip(pairwise(moments), actions, strict=True):
+        np.testing.assert_array_equal(stepped(before, int(action)).pose, after.pose)
+        np.testing.assert_array_equal(before.instruction, after.instruction)
+        np.testing.assert_array_equal(before.goal, after.goal)
 
 
 @pytest.mark.parametrize("name", ["GoToLocalS7N5", "GoToObjMazeS4"])
@@ -136,12 +139,8 @@ def test_the_future_of_an_unrolled_window_is_transformed_with_its_past(name, pla
     for key in range(8):
         changed = jax.device_get(augment(jax.random.key(key), window, GRID_WORDS, True))
         past = [jax.tree.map(lambda x, i=i: x[i], changed.context.past) for i in range(horizon - 1)]
-        moments = [*past, changed.context.observation]
-        for (before, after), action in zip(pairwise(moments), changed.actions[:-1], strict=True):
-            np.testing.assert_array_equal(stepped(before, int(action)).pose, after.pose)
-            np.testing.assert_array_equal(before.instruction, after.instruction)
-            np.testing.assert_array_equal(before.goal, after.goal)
-        mirrored[bool((moments[0].pose != window.context.past.pose[0]).any())] += 1
+        assert_lead_on([*past, changed.context.observation], changed.actions[:-1])
+        mirrored[bool((past[0].pose != window.context.past.pose[0]).any())] += 1
     assert min(mirrored[False], mirrored[True]) > 0
 
 

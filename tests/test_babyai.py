@@ -118,6 +118,10 @@ def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_pat
     assert len(noted["seeds"]) > 3
     assert babyai.main([*arguments, "--test-seed", "5"]) == 2
     assert "level seed 7 is both a demonstration and a test episode" in capsys.readouterr().err
+    for other in ("5", '{"seeds": 5}', '{"fingerprint": "0"}'):  # of an earlier version, or damaged
+        (folder / "data.json").write_text(other)
+        assert run.demonstrated(folder) == []
+    assert run.demonstrated(tmp_path / "nowhere") == []
 
 
 def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):

@@ -251,7 +251,7 @@ def check(config: AnyConfig) -> None:
         )
     # An agent costs nothing to make, and says what its method cannot do.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
-    fill = getattr(config.planner, "fill", "from left to right")
+    fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
         raise UserError(
             f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "

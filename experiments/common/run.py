@@ -45,6 +45,7 @@ Watch = Callable[[Energy, Params], dict[str, float]]
 # One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
 # evaluation would rather have smaller ones.
 CHUNK_SIZES = (32,)
+DATA = "data.json"  # in the folder of a run: the demonstrations that it learns from
 
 
 def chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
@@ -292,12 +293,10 @@ def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> No
         )
 
     def check() -> None:
-        path = folder / "data.json"
-        if not path.exists():
+        if not (folder / DATA).exists():
             noted = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
-            return files.write_text(path, json.dumps(noted))
-        values = read_json(path)
-        before = values.get("fingerprint") if isinstance(values, dict) else None
+            return files.write_text(folder / DATA, json.dumps(noted))
+        before = noted_of(folder).get("fingerprint")
         if before != fingerprint:
             raise UserError(
                 f"{folder} was begun on other demonstrations ({before}, now {fingerprint}): "
@@ -310,10 +309,14 @@ def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> No
 
 def demonstrated(folder: Path) -> list[int]:
     """Level seeds of the demonstrations that a run learned from, where its folder says so."""
-    path = folder / "data.json"
-    values = read_json(path) if path.exists() else {}
-    noted = values.get("seeds", []) if isinstance(values, dict) else []
-    return [seed for seed in noted if isinstance(seed, int)]
+    found = noted_of(folder).get("seeds") if (folder / DATA).exists() else None
+    return [seed for seed in found if isinstance(seed, int)] if isinstance(found, list) else []
+
+
+def noted_of(folder: Path) -> dict[str, Any]:
+    """What `check_data` has noted of a run's demonstrations; nothing, where it is no object."""
+    values = read_json(folder / DATA)
+    return values if isinstance(values, dict) else {}
 
 
 def reuse(run: Run, checkpoint: Path) -> Pretrained:
