@@ -11,6 +11,7 @@ from minigrid.core.grid import Grid
 
 from leapjax.babyai import augmentation, demonstrations, levels, vocabulary
 from leapjax.babyai.adapter import END
+from leapjax.babyai.dynamics import FORWARD
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.data import windows
@@ -367,6 +368,17 @@ def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
         longer += moves + 1 > straight
         things += int((state.grid[..., 0] != before.context.observation.grid[..., 0]).sum() > 4)
     assert longer > 10 and things > 10
+
+
+def test_short_windows_get_detours_as_often_where_they_turn_as_where_they_move():
+    change = jax.jit(lambda key, window: augmentation.detour(key, window, 1.0, GRID_WORDS))
+    short, keys = plain_windows(horizon=1), 12
+    found = Counter(
+        int(before.actions[0]) == FORWARD for before, _ in changed_by(change, short, keys)
+    )
+    tried = Counter(int(window.actions[0]) == FORWARD for window in short)
+    turning, moving = (found[moves] / tried[moves] / keys for moves in (False, True))
+    assert turning > 0.8 * moving > 0.5
 
 
 def test_lookalikes_share_kind_or_colour_with_the_target_but_never_both():

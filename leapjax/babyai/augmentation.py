@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.babyai import symmetries, vocabulary
+from leapjax.babyai.adapter import END
 from leapjax.babyai.dynamics import DOOR, FORWARD, passable
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
@@ -288,8 +289,8 @@ def begin_earlier(
 ) -> tuple[Window, jax.Array, jax.Array]:
     """A window with random moves before its own, all of its moves, and whether they are possible.
 
-    They are not where they lead through things, past the goal, or out of a doorway, of which the
-    agent's mark hides the door.
+    Ends follow all of its moves, `[most + horizon]` in all. They are not possible where they lead
+    through things, past the goal, or out of a doorway, of which the agent's mark hides the door.
 
     Args:
         key: chooses the moves.
@@ -332,8 +333,9 @@ def begin_earlier(
     mark = grid[pose[0], pose[1]].at[2].set(start[2].astype(grid.dtype))
     moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
     place = jnp.arange(most + horizon)
-    after = window.actions[jnp.clip(place - count, 0, horizon - 1)]
-    whole = jnp.where(place < count, moves[jnp.minimum(place, most - 1)], after)
+    # Its own moves follow, and then what is not known: an end, for it neither turns nor moves.
+    own = jnp.append(window.actions, END)[jnp.clip(place - count, 0, horizon)]
+    whole = jnp.where(place < count, moves[jnp.minimum(place, most - 1)], own)
     way = window.extras.at[visited[:, 0], visited[:, 1]].set(True)
     began = observation._replace(grid=moved, pose=start)
     longer = window._replace(
