@@ -23,6 +23,7 @@ from leapjax.babyai.constraints import (
     immediate_lava,
     lava,
     left_turns,
+    revisits,
     steps_to_visit,
     told_to_go,
     turns_over,
@@ -42,9 +43,10 @@ Penalty = Callable[[Context, jax.Array], jax.Array]
 # Turns enough to visit a cell of a room, and then to face an object: of the room when empty, and
 # where six more objects are in the way.
 FEW_TURNS, DETOUR_TURNS = 5, 9
-ROOM_STEPS = 64  # of the longest episode in one
+ROOM_STEPS, MAZE_STEPS = 64, 144  # of the longest episode in one
 WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
 LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
+AGAIN = 16.0  # nats for each time that the agent was before where it comes to
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
 FALSE_STARTS = {"leap": {"false_starts": 0.6, "steps": 3000}}
@@ -125,6 +127,17 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[En
 masked = functools.partial(unseen, weight=math.inf)
 
 
+def exploring(
+    minimise: Callable[[Sequence[Energy]], Energy], weight: float = AGAIN
+) -> Callable[[Sequence[Energy]], Energy]:
+    """The same energy, and a little more for each time that the agent comes where it was."""
+
+    def penalty(context: Context, actions: jax.Array) -> jax.Array:
+        return weight * revisits(context, actions)
+
+    return lambda energies: constrain(minimise(energies), penalty, partial=True)
+
+
 def left_to_right(trained: GibbsConfig) -> GibbsConfig:
     """Gibbs sampling that fills a plan from its beginning, which a constraint then judges."""
     return dataclasses.replace(trained, fill="sequential", iterations=trained.horizon, resampled=1)
@@ -167,7 +180,9 @@ def only_pick_up(energies: Sequence[Energy]) -> Energy:
     return fetch(energies, [0.0, 1.0])
 
 
-def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
+def _adaptation(
+    name: str, model: Model, level: str, longest: int, paper: tuple[float, float, float]
+) -> Case:
     leap, dt, iql = paper
     at_once = masked(immediate_lava)
     return Case(
@@ -179,12 +194,18 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
             Way("dt", "dt", at_once, wandering, paper=dt),
             Way("iql", "iql", at_once, wandering, paper=iql),
+            Way(
+                "whole plan, exploring", minimise=exploring(masked(lava)), search=left_to_right,
+                executed=3, remembered=longest,
+            ),
+            Way("dt, exploring", "dt", exploring(at_once), remembered=longest),
+            Way("iql, exploring", "iql", exploring(at_once), remembered=longest),
         ],
         Watched,
-    )
+    )  # fmt: skip
 
 
-def _constraints(name: str, model: Model, level: str) -> Case:
+def _constraints(name: str, model: Model, level: str, longest: int) -> Case:
     both = masked(immediate_lava, left_turns)
     return Case(
         f"constraints-{name}",
@@ -194,9 +215,15 @@ def _constraints(name: str, model: Model, level: str) -> Case:
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
+            Way(
+                "whole plan, exploring", minimise=exploring(masked(lava, left_turns)),
+                search=left_to_right, executed=3, remembered=longest,
+            ),
+            Way("dt, exploring", "dt", exploring(both), remembered=longest),
+            Way("iql, exploring", "iql", exploring(both), remembered=longest),
         ],
         WatchedTurns,
-    )
+    )  # fmt: skip
 
 
 def _errand(name: str, model: Model, level: str, budget: int) -> Case:
@@ -204,20 +231,20 @@ def _errand(name: str, model: Model, level: str, budget: int) -> Case:
     at_once = masked(goal_before_visit, few_turns)
     told = unseen(steps_to_visit, few_turns)
     lightly = unseen(steps_to_visit, few_turns, weight=LIGHT)
+    ways = [
+        Way("whole plan", minimise=told, search=left_to_right, executed=3),
+        Way("whole plan, beam search", minimise=lightly, search=beams, executed=3),
+        Way("dt", "dt", at_once, wandering),
+        Way("iql", "iql", at_once, wandering),
+        Way("dt, told how far", "dt", told),
+        Way("iql, told how far", "iql", told),
+    ]
     return Case(
         f"constraints-{name}",
         [model],
         level,
-        [
-            Way("whole plan", minimise=told, search=left_to_right, executed=3),
-            Way("whole plan, beam search", minimise=lightly, search=beams, executed=3),
-            Way("dt", "dt", at_once, wandering),
-            Way("iql", "iql", at_once, wandering),
-            Way("dt, told how far", "dt", told),
-            Way("iql, told how far", "iql", told),
-        ],
+        [way._replace(remembered=ROOM_STEPS) for way in ways],
         functools.partial(WatchedErrand, budget=budget),
-        remembered=ROOM_STEPS,
     )
 
 
@@ -261,9 +288,9 @@ ROOM, OPEN_MAZE = Model("GoToLocalS8N1", more=BOTH), Model(MAZE, more=FALSE_STAR
 LONGER = {"horizon": 10, "iterations": 10}
 OBJECTS = Model("GoToLocalS8N7", more={"leap": {**LONGER, **FALSE_STARTS["leap"]}})
 CASES = (
-    _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
-    _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
-    _adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
+    _adaptation("easy", ROOM, "GoToLavaEasy", ROOM_STEPS, (92.0, 68.0, 90.5)),
+    _adaptation("medium", ROOM, "GoToLavaMedium", ROOM_STEPS, (64.5, 20.0, 52.0)),
+    _adaptation("hard", OPEN_MAZE, "GoToLavaHard", MAZE_STEPS, (54.5, 48.0, 44.0)),
     Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
@@ -286,8 +313,8 @@ CASES = (
             Way("pick-up alone", minimise=only_pick_up, search=noisily),
         ],
     ),
-    _constraints("room", ROOM, "GoToLavaMedium"),
-    _constraints("maze", OPEN_MAZE, "GoToLavaHard"),
+    _constraints("room", ROOM, "GoToLavaMedium", ROOM_STEPS),
+    _constraints("maze", OPEN_MAZE, "GoToLavaHard", MAZE_STEPS),
     _errand("errand", ROOM, "GoToVia", FEW_TURNS),
     _errand("detour", OBJECTS, "GoToViaDetour", DETOUR_TURNS),
 )  # fmt: skip

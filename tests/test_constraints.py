@@ -12,6 +12,7 @@ from leapjax.babyai.constraints import (
     immediate_lava,
     lava,
     left_turns,
+    revisits,
     steps_to_visit,
     told_to_go,
     turns_over,
@@ -107,6 +108,39 @@ def test_turns_that_are_remembered_and_planned_count_against_a_budget():
     context = context._replace(actions=np.array([LEFT, FORWARD, RIGHT], np.int32))
     assert float(turns_over(context, plan, 3)) == 1
     assert float(turns_over(context, jnp.array([MASK, LEFT, LEFT]), 2)) == 0
+
+
+def test_poses_count_as_often_as_the_agent_has_been_there():
+    """As a list of the poses that it went through says, remembered, now and planned."""
+    adapter, rng = BabyAIAdapter(find_level("GoToLocalS8N1")), np.random.default_rng(0)
+    count, most, revisited = jax.jit(revisits), 6, 0
+    for seed in range(30):
+        history = History(adapter.reset(seed), most, adapter.num_actions)
+        been = [tuple(history.context().observation.pose)]
+        for action in rng.choice([LEFT, RIGHT, FORWARD], rng.integers(1, 12)).tolist():
+            transition = adapter.step(action)
+            history.advance(action, transition.observation, transition.reward)
+            been.append(tuple(transition.observation.pose))
+        been = been[-most - 1 :]
+        plan = rng.choice([LEFT, RIGHT, FORWARD, END], 10, p=[0.3, 0.3, 0.3, 0.1])
+        expected = 0
+        for pose, action in zip(rolled(history.context().observation, plan)[1:], plan, strict=True):
+            if action == END:
+                break
+            expected += been.count(tuple(np.asarray(pose)))
+            been.append(tuple(np.asarray(pose)))
+        assert float(count(history.context(), plan)) == expected
+        revisited += expected
+    assert revisited > 30
+
+
+def test_what_is_not_chosen_yet_is_no_revisit():
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    context = History(adapter.reset(0), 3, adapter.num_actions).context()
+    assert float(revisits(context, jnp.array([MASK, LEFT, RIGHT]))) == 0
+    assert float(revisits(context, jnp.array([LEFT, MASK, RIGHT]))) == 0
+    assert float(revisits(context, jnp.array([LEFT, RIGHT, MASK]))) == 1
+    assert float(revisits(context, jnp.array([LEFT, RIGHT, LEFT]))) == 2
 
 
 def test_steps_to_a_cell_are_the_fewest_turns_and_moves():

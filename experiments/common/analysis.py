@@ -55,6 +55,7 @@ class Way(NamedTuple):
     # (settings that it was trained with) -> settings of how it searches
     executed: int | None = None  # actions before replanning; None: all
     paper: float | None = None  # the paper's success, in percent
+    remembered: int = 0  # past steps that it may look at; a model sees no more than its own
 
 
 class Case(NamedTuple):
@@ -66,7 +67,6 @@ class Case(NamedTuple):
     ways: Sequence[Way]
     adapter: Callable[[str], Adapter] | None = None
     # makes one of a level; its `violations`, a number, are counted over all episodes
-    remembered: int = 0  # past steps that a way may look at; a model sees no more than its own
 
 
 class Analysis(NamedTuple):
@@ -315,11 +315,9 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
         return experiment.train(this, work.options.played, stack, plays=False)[0]
 
 
-def asked(
-    way: Way, models: Sequence[Pretrained], search: PlannerConfig, remembered: int = 0
-) -> Pretrained:
+def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
     """The models of a case as one planner, which minimises what a way says."""
-    specification = models[0].specification
+    specification, remembered = models[0].specification, way.remembered
     energies = [model.energy for model in models]
     if remembered > specification.context:
         recent = functools.partial(windows.recent, length=specification.context)
@@ -353,7 +351,7 @@ def play(
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
-        planner = asked(way, models, config, case.remembered)
+        planner = asked(way, models, config)
         run.warm_up(planner, domain, options.episodes, way.executed)
         adapters.clear()
         return rollouts.evaluate(

@@ -69,6 +69,22 @@ def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
     return jnp.where(marked.any(), far, 0).astype(jnp.float32)
 
 
+def revisits(context: Context, actions: jax.Array) -> jax.Array:
+    """How often the agent has been before where a plan leads, summed over its poses.
+
+    Before is in the past that the context remembers, now, and earlier in the plan. So what leads
+    nowhere costs more each time, until another way is the better one (as Korf's LRTA*, 1990).
+    """
+    steps = actions.shape[0]
+    poses = roll(context.observation, actions)
+    earlier = jnp.concatenate([jnp.asarray(context.past.pose), poses])  # [K + T + 1, 3]
+    same = (poses[1:, None] == earlier).all(axis=-1)  # [T, K + T + 1]; a blank pose is in no cell
+    now = len(earlier) - steps - 1
+    before = jnp.arange(len(earlier)) <= now + jnp.arange(steps)[:, None]
+    times = jnp.sum(same & before, axis=1)
+    return jnp.sum(times * _before_end(actions)).astype(jnp.float32)
+
+
 def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
     """Whether the first action leads to the goal while a coloured cell is left: 1, or 0."""
     observation = context.observation
