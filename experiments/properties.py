@@ -40,10 +40,11 @@ from leapjax.planners import BeamConfig, GibbsConfig
 from leapjax.types import Context, Energy
 
 Penalty = Callable[[Context, jax.Array], jax.Array]
+Minimise = Callable[[Sequence[Energy]], Energy]  # see `Way`
 # Turns enough to visit a cell of a room, and then to face an object: of the room when empty, and
 # where six more objects are in the way.
 FEW_TURNS, DETOUR_TURNS = 5, 9
-ROOM_STEPS, MAZE_STEPS = 64, 144  # of the longest episode in one
+ROOM_STEPS, MAZE_STEPS = 64, 144  # no episode in one is longer
 WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
 LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
 AGAIN = 16.0  # nats for each time that the agent was before where it comes to
@@ -110,7 +111,7 @@ def _is_marked(cell: WorldObj | None) -> bool:
     return cell is not None and cell.type == "floor"
 
 
-def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[Energy]], Energy]:
+def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
     """The energy of a model that sees neither lava nor coloured cells, and penalties that do."""
 
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
@@ -127,13 +128,11 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Callable[[Sequence[En
 masked = functools.partial(unseen, weight=math.inf)
 
 
-def exploring(
-    minimise: Callable[[Sequence[Energy]], Energy], weight: float = AGAIN
-) -> Callable[[Sequence[Energy]], Energy]:
-    """The same energy, and a little more for each time that the agent comes where it was."""
+def exploring(minimise: Minimise) -> Minimise:
+    """The same energy, and more for each time that the agent comes where it was."""
 
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return weight * revisits(context, actions)
+        return AGAIN * revisits(context, actions)
 
     return lambda energies: constrain(minimise(energies), penalty, partial=True)
 
@@ -180,6 +179,28 @@ def only_pick_up(energies: Sequence[Energy]) -> Energy:
     return fetch(energies, [0.0, 1.0])
 
 
+def _explorers(
+    name: str,
+    longest: int,
+    minimise: Minimise,
+    at_once: Minimise | None = None,
+    search: Callable[[GibbsConfig], GibbsConfig] = lambda trained: trained,
+) -> list[Way]:
+    """Every method, where coming back costs: LEAP's plans, three actions of each, and the others.
+
+    Args:
+        name: what LEAP's way is called without that.
+        longest: steps of an episode.
+        minimise: without that.
+        at_once: what methods of one action minimise; None: the same.
+        search: how LEAP plans.
+    """
+    whole, single = exploring(minimise), exploring(at_once or minimise)
+    ways = [Way(f"{name}, exploring", minimise=whole, search=search, executed=3)]
+    ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
+    return [way._replace(remembered=longest) for way in ways]
+
+
 def _adaptation(
     name: str, model: Model, level: str, longest: int, paper: tuple[float, float, float]
 ) -> Case:
@@ -194,15 +215,10 @@ def _adaptation(
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
             Way("dt", "dt", at_once, wandering, paper=dt),
             Way("iql", "iql", at_once, wandering, paper=iql),
-            Way(
-                "whole plan, exploring", minimise=exploring(masked(lava)), search=left_to_right,
-                executed=3, remembered=longest,
-            ),
-            Way("dt, exploring", "dt", exploring(at_once), remembered=longest),
-            Way("iql, exploring", "iql", exploring(at_once), remembered=longest),
+            *_explorers("whole plan", longest, masked(lava), at_once, left_to_right),
         ],
         Watched,
-    )  # fmt: skip
+    )
 
 
 def _constraints(name: str, model: Model, level: str, longest: int) -> Case:
@@ -215,15 +231,10 @@ def _constraints(name: str, model: Model, level: str, longest: int) -> Case:
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
-            Way(
-                "whole plan, exploring", minimise=exploring(masked(lava, left_turns)),
-                search=left_to_right, executed=3, remembered=longest,
-            ),
-            Way("dt, exploring", "dt", exploring(both), remembered=longest),
-            Way("iql, exploring", "iql", exploring(both), remembered=longest),
+            *_explorers("whole plan", longest, masked(lava, left_turns), both, left_to_right),
         ],
         WatchedTurns,
-    )  # fmt: skip
+    )
 
 
 def _errand(name: str, model: Model, level: str, budget: int) -> Case:
@@ -248,25 +259,28 @@ def _errand(name: str, model: Model, level: str, budget: int) -> Case:
     )
 
 
-def _plain(paper: tuple[float, float, float]) -> list[Way]:
+def _plain(longest: int, paper: tuple[float, float, float]) -> list[Way]:
     leap, dt, iql = paper
     return [
         Way("leap", paper=leap),
         Way("leap, three actions of each plan", executed=3, paper=leap),
         Way("dt", "dt", paper=dt),
         Way("iql", "iql", paper=iql),
+        *_explorers("leap", longest, lambda energies: energies[0]),
     ]
 
 
-def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
+def _without_doors(longest: int, paper: tuple[float, float, float]) -> list[Way]:
     """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
 
     def told(energies: Sequence[Energy]) -> Energy:
         return view(energies[0], without_open_doors)
 
-    plain = _plain(paper)
+    plain = _plain(longest, paper)
     views = [
-        way._replace(name=f"{way.name}, open doors seen as empty", minimise=told) for way in plain
+        way._replace(name=f"{way.name}, open doors seen as empty", minimise=told)
+        for way in plain
+        if not way.remembered
     ]
     return [*plain, *views]
 
@@ -291,19 +305,19 @@ CASES = (
     _adaptation("easy", ROOM, "GoToLavaEasy", ROOM_STEPS, (92.0, 68.0, 90.5)),
     _adaptation("medium", ROOM, "GoToLavaMedium", ROOM_STEPS, (64.5, 20.0, 52.0)),
     _adaptation("hard", OPEN_MAZE, "GoToLavaHard", MAZE_STEPS, (54.5, 48.0, 44.0)),
-    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
+    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain(ROOM_STEPS, (77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
         "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28}, DETOURS)],
-        "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
+        "GoToObjMazeS4R2", _without_doors(ROOM_STEPS, (64.0, 37.5, 57.5)),
     ),
     Case(
         "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40}, DETOURS)], MAZE,
-        _without_doors((61.0, 24.5, 65.5)),
+        _without_doors(MAZE_STEPS, (61.0, 24.5, 65.5)),
     ),
     Case(
         "composition-easy", [Model(OBSTACLES, more={"leap": BOTH["leap"]})] * 2, OBSTACLES,
-        _composed(halves, (83.5, 58.0, 42.5)),
+        [*_composed(halves, (83.5, 58.0, 42.5)), *_explorers("sum", MAZE_STEPS, halves)],
     ),
     Case(
         "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", {"sweeps": 40})],
