@@ -128,11 +128,11 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
 masked = functools.partial(unseen, weight=math.inf)
 
 
-def exploring(minimise: Minimise) -> Minimise:
-    """The same energy, and more for each time that the agent comes where it was."""
+def exploring(minimise: Minimise, handling: bool = False) -> Minimise:
+    """The same energy, and more for each time that the agent comes where it was (`revisits`)."""
 
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return AGAIN * revisits(context, actions)
+        return AGAIN * revisits(context, actions, handling)
 
     return lambda energies: constrain(minimise(energies), penalty, partial=True)
 
@@ -185,6 +185,7 @@ def _explorers(
     minimise: Minimise,
     at_once: Minimise | None = None,
     search: Callable[[GibbsConfig], GibbsConfig] = lambda trained: trained,
+    handling: bool = False,
 ) -> list[Way]:
     """Every method, where coming back costs: LEAP's plans, three actions of each, and the others.
 
@@ -194,8 +195,9 @@ def _explorers(
         minimise: without that.
         at_once: what methods of one action minimise; None: the same.
         search: how LEAP plans.
+        handling: see `revisits`.
     """
-    whole, single = exploring(minimise), exploring(at_once or minimise)
+    whole, single = (exploring(m, handling) for m in (minimise, at_once or minimise))
     ways = [Way(f"{name}, exploring", minimise=whole, search=search, executed=3)]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
     return [way._replace(remembered=longest) for way in ways]
@@ -325,6 +327,7 @@ CASES = (
         [
             *_composed(fetch, (43.0, 15.5, 11.5)),
             Way("pick-up alone", minimise=only_pick_up, search=noisily),
+            *_explorers("sum", MAZE_STEPS, fetch, handling=True),
         ],
     ),
     _constraints("room", ROOM, "GoToLavaMedium", ROOM_STEPS),

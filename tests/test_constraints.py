@@ -26,7 +26,7 @@ from leapjax.planners import BeamConfig, GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import mask_token
 
-LEFT, RIGHT, MASK = 0, 1, mask_token(NUM_ACTIONS)
+LEFT, RIGHT, PICKUP, MASK = 0, 1, 3, mask_token(NUM_ACTIONS)
 rolled = jax.jit(roll)
 steps_onto_lava = jax.jit(lava)
 
@@ -141,6 +141,18 @@ def test_what_is_not_chosen_yet_is_no_revisit():
     assert float(revisits(context, jnp.array([LEFT, MASK, RIGHT]))) == 0
     assert float(revisits(context, jnp.array([LEFT, RIGHT, MASK]))) == 1
     assert float(revisits(context, jnp.array([LEFT, RIGHT, LEFT]))) == 2
+
+
+def test_handling_the_thing_in_front_can_be_spared():
+    adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+    observation = adapter.reset(0)
+    x, y, direction = observation.pose
+    dx, dy = [(1, 0), (0, 1), (-1, 0), (0, -1)][direction]
+    grid = observation.grid.copy()
+    grid[x + dx, y + dy] = [5, 0, 0]  # a key
+    context = History(observation._replace(grid=grid), 3, adapter.num_actions).context()
+    plan = jnp.array([PICKUP, FORWARD, LEFT, PICKUP, END])  # the second time nothing is there
+    assert [float(revisits(context, plan, handling)) for handling in (False, True)] == [4, 3]
 
 
 def test_steps_to_a_cell_are_the_fewest_turns_and_moves():

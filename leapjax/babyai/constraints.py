@@ -11,10 +11,10 @@ import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
 from leapjax.babyai.adapter import END, TURNS
-from leapjax.babyai.dynamics import DOOR, FLOOR, LAVA, OPEN, facing, roll, steps_to
+from leapjax.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, facing, roll, steps_to
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
+from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, INTERCHANGEABLE, LEFT
 from leapjax.types import Array, Context
 
 
@@ -69,20 +69,37 @@ def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
     return jnp.where(marked.any(), far, 0).astype(jnp.float32)
 
 
-def revisits(context: Context, actions: jax.Array) -> jax.Array:
+def revisits(context: Context, actions: jax.Array, handling: bool = False) -> jax.Array:
     """How often the agent has been before where a plan leads, summed over its poses.
 
     Before is in the past that the context remembers, now, and earlier in the plan. So what leads
     nowhere costs more each time, until another way is the better one (as Korf's LRTA*, 1990).
+
+    Args:
+        context: whose past poses count.
+        actions: `[T]` a plan, which may hold MASK.
+        handling: whether nothing is said of actions on the thing in front, which may be of use
+            though the agent stays where it is.
     """
     steps = actions.shape[0]
-    poses = roll(context.observation, actions)
+    observation = context.observation
+    poses = roll(observation, actions)
     earlier = jnp.concatenate([jnp.asarray(context.past.pose), poses])  # [K + T + 1, 3]
     same = (poses[1:, None] == earlier).all(axis=-1)  # [T, K + T + 1]; a blank pose is in no cell
     now = len(earlier) - steps - 1
     before = jnp.arange(len(earlier)) <= now + jnp.arange(steps)[:, None]
-    times = jnp.sum(same & before, axis=1)
-    return jnp.sum(times * _before_end(actions)).astype(jnp.float32)
+    times = jnp.sum(same & before, axis=1) * _before_end(actions)
+    if handling:
+        times *= ~((actions > FORWARD) & _before_a_thing(observation, poses[:-1]))
+    return jnp.sum(times).astype(jnp.float32)
+
+
+def _before_a_thing(observation: Observation, poses: jax.Array) -> jax.Array:
+    """`[n]` bool: at which of the poses `[n, 3]` an agent faces a door or an object."""
+    x, y, direction = poses.T
+    front = jnp.asarray(DIRECTION_VECTORS)[direction]
+    kinds = jnp.asarray(observation.grid)[x + front[:, 0], y + front[:, 1], 0]
+    return (kinds >= DOOR) & (kinds <= INTERCHANGEABLE[-1])
 
 
 def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
