@@ -45,9 +45,9 @@ MOST_LEVELS, MOST_PLANS = 200, 30  # to look at, for one; and to draw
 PLANNED = ("GoToObjMazeS4", "GoToSeqS5R2")
 # Cases of the second one, and which of their ways.
 ASKED = (
-    ("adaptation-medium", "whole plan"),
-    ("generalization-hard", "leap, open doors seen as empty"),
-    ("composition-easy", "sum"),
+    ("adaptation-medium", "whole plan, exploring"),
+    ("generalization-hard", "leap, exploring"),
+    ("composition-easy", "sum, exploring"),
 )
 
 
