@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand
+from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand, exploring
 from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -21,8 +21,8 @@ from leapjax.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.vocabulary import decode
 from leapjax.batching import compile_planner
-from leapjax.energy import constrain, pseudo_likelihood
-from leapjax.planners import BeamConfig, GibbsConfig
+from leapjax.energy import constrain, from_total, pseudo_likelihood
+from leapjax.planners import BeamConfig, GibbsConfig, bind
 from leapjax.rollouts import History
 from leapjax.types import mask_token
 
@@ -141,6 +141,26 @@ def test_what_is_not_chosen_yet_is_no_revisit():
     assert float(revisits(context, jnp.array([LEFT, MASK, RIGHT]))) == 0
     assert float(revisits(context, jnp.array([LEFT, RIGHT, MASK]))) == 1
     assert float(revisits(context, jnp.array([LEFT, RIGHT, LEFT]))) == 2
+
+
+def test_who_would_turn_for_ever_explores_where_coming_back_costs():
+    def total(params, memory, actions):  # turns to the left, and gives up never
+        return jnp.where((actions == END).any(), jnp.inf, jnp.sum(actions != LEFT))
+
+    turning = from_total(lambda params, context: context, total, NUM_ACTIONS)
+    steps, poses = 40, []
+    for minimised in (turning, exploring(lambda energies: energies[0])([turning])):
+        plan = jax.jit(bind(minimised, GibbsConfig(1, 2, temperature=0.0)))
+        adapter = BabyAIAdapter(find_level("GoToLocalS8N1"))
+        history = History(adapter.reset(0), steps, adapter.num_actions)
+        seen = set()
+        for step in range(steps):
+            (action,) = plan((), jax.random.key(step), history.context()).actions.tolist()
+            observation = adapter.step(action).observation
+            history.advance(action, observation, 0.0)
+            seen.add(tuple(observation.pose.tolist()))
+        poses.append(len(seen))
+    assert poses[0] == 4 and poses[1] > steps / 2
 
 
 def test_handling_the_thing_in_front_can_be_spared():

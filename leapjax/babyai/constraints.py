@@ -73,7 +73,8 @@ def revisits(context: Context, actions: jax.Array, handling: bool = False) -> ja
     """How often the agent has been before where a plan leads, summed over its poses.
 
     Before is in the past that the context remembers, now, and earlier in the plan. So what leads
-    nowhere costs more each time, until another way is the better one (as Korf's LRTA*, 1990).
+    nowhere costs more each time, until another way is the better one (as Korf's LRTA*, 1990). An
+    end comes back to nothing.
 
     Args:
         context: whose past poses count.
