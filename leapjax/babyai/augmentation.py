@@ -289,7 +289,7 @@ def begin_earlier(
 ) -> tuple[Window, jax.Array, jax.Array]:
     """A window with random moves before its own, all of its moves, and whether they are possible.
 
-    All moves are followed by ends, `[most + horizon]` in all. Moves are not possible where they lead
+    Ends follow all moves, `[most + horizon]` in all. Moves are not possible where they lead
     through things, past the goal, or out of a doorway, of which the agent's mark hides the door.
 
     Args:
