@@ -11,10 +11,10 @@ import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
 from leapjax.babyai.adapter import END, TURNS
-from leapjax.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, facing, roll, steps_to
+from leapjax.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, faced, facing, roll, steps_to
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, INTERCHANGEABLE, LEFT
+from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
 from leapjax.types import Array, Context
 
 
@@ -97,9 +97,8 @@ def revisits(context: Context, actions: jax.Array, handling: bool = False) -> ja
 
 def _before_a_thing(observation: Observation, poses: jax.Array) -> jax.Array:
     """`[n]` bool: at which of the poses `[n, 3]` an agent faces a door or an object."""
-    x, y, direction = poses.T
-    front = jnp.asarray(DIRECTION_VECTORS)[direction]
-    kinds = jnp.asarray(observation.grid)[x + front[:, 0], y + front[:, 1], 0]
+    x, y = faced(poses).T
+    kinds = jnp.asarray(observation.grid)[x, y, 0]
     return (kinds >= DOOR) & (kinds <= INTERCHANGEABLE[-1])
 
 

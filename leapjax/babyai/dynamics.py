@@ -52,10 +52,14 @@ def roll(observation: Observation, actions: jax.Array) -> jax.Array:
     return jnp.concatenate([start[None], poses])
 
 
+def faced(poses: jax.Array) -> jax.Array:
+    """`[n, 2]` int32: the cells in front of an agent at poses `[n, 3]`."""
+    return poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
+
+
 def facing(poses: jax.Array, cell: jax.Array) -> jax.Array:
     """`[n]` bool: at which of the poses `[n, 3]` an agent faces a cell `[2]`."""
-    front = poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
-    return (front == cell).all(axis=1)
+    return (faced(poses) == cell).all(axis=1)
 
 
 def steps_to(pose: jax.Array, cell: jax.Array) -> jax.Array:
