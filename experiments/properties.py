@@ -44,7 +44,6 @@ Minimise = Callable[[Sequence[Energy]], Energy]  # see `Way`
 # Turns enough to visit a cell of a room, and then to face an object: of the room when empty, and
 # where six more objects are in the way.
 FEW_TURNS, DETOUR_TURNS = 5, 9
-ROOM_STEPS, MAZE_STEPS = 64, 144  # no episode in one is longer
 WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
 LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
 AGAIN = 16.0  # nats for each time that the agent was before where it comes to
@@ -181,7 +180,6 @@ def only_pick_up(energies: Sequence[Energy]) -> Energy:
 
 def _explorers(
     name: str,
-    longest: int,
     minimise: Minimise,
     at_once: Minimise | None = None,
     search: Callable[[GibbsConfig], GibbsConfig] = lambda trained: trained,
@@ -191,7 +189,6 @@ def _explorers(
 
     Args:
         name: what LEAP's way is called without that.
-        longest: steps of an episode.
         minimise: without that.
         at_once: what methods of one action minimise; None: the same.
         search: how LEAP plans.
@@ -200,12 +197,10 @@ def _explorers(
     whole, single = (exploring(m, handling) for m in (minimise, at_once or minimise))
     ways = [Way(f"{name}, exploring", minimise=whole, search=search, executed=3)]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
-    return [way._replace(remembered=longest) for way in ways]
+    return [way._replace(remembers=True) for way in ways]
 
 
-def _adaptation(
-    name: str, model: Model, level: str, longest: int, paper: tuple[float, float, float]
-) -> Case:
+def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
     leap, dt, iql = paper
     at_once = masked(immediate_lava)
     return Case(
@@ -217,13 +212,13 @@ def _adaptation(
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
             Way("dt", "dt", at_once, wandering, paper=dt),
             Way("iql", "iql", at_once, wandering, paper=iql),
-            *_explorers("whole plan", longest, masked(lava), at_once, left_to_right),
+            *_explorers("whole plan", masked(lava), at_once, left_to_right),
         ],
         Watched,
     )
 
 
-def _constraints(name: str, model: Model, level: str, longest: int) -> Case:
+def _constraints(name: str, model: Model, level: str) -> Case:
     both = masked(immediate_lava, left_turns)
     return Case(
         f"constraints-{name}",
@@ -233,7 +228,7 @@ def _constraints(name: str, model: Model, level: str, longest: int) -> Case:
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
-            *_explorers("whole plan", longest, masked(lava, left_turns), both, left_to_right),
+            *_explorers("whole plan", masked(lava, left_turns), both, left_to_right),
         ],
         WatchedTurns,
     )
@@ -256,33 +251,33 @@ def _errand(name: str, model: Model, level: str, budget: int) -> Case:
         f"constraints-{name}",
         [model],
         level,
-        [way._replace(remembered=ROOM_STEPS) for way in ways],
+        [way._replace(remembers=True) for way in ways],
         functools.partial(WatchedErrand, budget=budget),
     )
 
 
-def _plain(longest: int, paper: tuple[float, float, float]) -> list[Way]:
+def _plain(paper: tuple[float, float, float]) -> list[Way]:
     leap, dt, iql = paper
     return [
         Way("leap", paper=leap),
         Way("leap, three actions of each plan", executed=3, paper=leap),
         Way("dt", "dt", paper=dt),
         Way("iql", "iql", paper=iql),
-        *_explorers("leap", longest, lambda energies: energies[0]),
+        *_explorers("leap", lambda energies: energies[0]),
     ]
 
 
-def _without_doors(longest: int, paper: tuple[float, float, float]) -> list[Way]:
+def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
     """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
 
     def told(energies: Sequence[Energy]) -> Energy:
         return view(energies[0], without_open_doors)
 
-    plain = _plain(longest, paper)
+    plain = _plain(paper)
     views = [
         way._replace(name=f"{way.name}, open doors seen as empty", minimise=told)
         for way in plain
-        if not way.remembered
+        if not way.remembers
     ]
     return [*plain, *views]
 
@@ -304,22 +299,22 @@ ROOM, OPEN_MAZE = Model("GoToLocalS8N1", more=BOTH), Model(MAZE, more=FALSE_STAR
 LONGER = {"horizon": 10, "iterations": 10}
 OBJECTS = Model("GoToLocalS8N7", more={"leap": {**LONGER, **FALSE_STARTS["leap"]}})
 CASES = (
-    _adaptation("easy", ROOM, "GoToLavaEasy", ROOM_STEPS, (92.0, 68.0, 90.5)),
-    _adaptation("medium", ROOM, "GoToLavaMedium", ROOM_STEPS, (64.5, 20.0, 52.0)),
-    _adaptation("hard", OPEN_MAZE, "GoToLavaHard", MAZE_STEPS, (54.5, 48.0, 44.0)),
-    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain(ROOM_STEPS, (77.5, 36.0, 60.5))),
+    _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
+    _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
+    _adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
+    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
         "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28}, DETOURS)],
-        "GoToObjMazeS4R2", _without_doors(ROOM_STEPS, (64.0, 37.5, 57.5)),
+        "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
     ),
     Case(
         "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40}, DETOURS)], MAZE,
-        _without_doors(MAZE_STEPS, (61.0, 24.5, 65.5)),
+        _without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
         "composition-easy", [Model(OBSTACLES, more={"leap": BOTH["leap"]})] * 2, OBSTACLES,
-        [*_composed(halves, (83.5, 58.0, 42.5)), *_explorers("sum", MAZE_STEPS, halves)],
+        [*_composed(halves, (83.5, 58.0, 42.5)), *_explorers("sum", halves)],
     ),
     Case(
         "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", {"sweeps": 40})],
@@ -327,11 +322,11 @@ CASES = (
         [
             *_composed(fetch, (43.0, 15.5, 11.5)),
             Way("pick-up alone", minimise=only_pick_up, search=noisily),
-            *_explorers("sum", MAZE_STEPS, fetch, handling=True),
+            *_explorers("sum", fetch, handling=True),
         ],
     ),
-    _constraints("room", ROOM, "GoToLavaMedium", ROOM_STEPS),
-    _constraints("maze", OPEN_MAZE, "GoToLavaHard", MAZE_STEPS),
+    _constraints("room", ROOM, "GoToLavaMedium"),
+    _constraints("maze", OPEN_MAZE, "GoToLavaHard"),
     _errand("errand", ROOM, "GoToVia", FEW_TURNS),
     _errand("detour", OBJECTS, "GoToViaDetour", DETOUR_TURNS),
 )  # fmt: skip

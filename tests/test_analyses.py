@@ -69,7 +69,8 @@ def test_constraints_remember_what_models_do_not_see(place):
     of = small(case._replace(ways=[way]), way.name)
     assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
     (row,) = rows(place, "properties")
-    assert set(lengths) == {properties.ROOM_STEPS} and row["violations"] >= 0
+    assert set(lengths) == {64}  # as many as an episode in that room has steps
+    assert row["violations"] >= 0
 
 
 def test_two_models_are_composed(place):

@@ -27,6 +27,7 @@ from leapjax import pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
+from leapjax.domain import Domain
 from leapjax.energy import view
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
@@ -55,7 +56,7 @@ class Way(NamedTuple):
     # (settings that it was trained with) -> settings of how it searches
     executed: int | None = None  # actions before replanning; None: all
     paper: float | None = None  # the paper's success, in percent
-    remembered: int = 0  # past steps that it may look at; a model sees no more than its own
+    remembers: bool = False  # may look at the whole episode; its models see no more than they do
 
 
 class Case(NamedTuple):
@@ -315,14 +316,22 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
         return experiment.train(this, work.options.played, stack, plays=False)[0]
 
 
-def asked(way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
-    """The models of a case as one planner, which minimises what a way says."""
-    specification, remembered = models[0].specification, way.remembered
+def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
+    """A level that models are asked to plan on."""
+    specification = models[0].specification
+    return configs.find_domain(specification.domain).make(level, specification.domain_settings)
+
+
+def asked(level: str, way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
+    """The models of a case as one planner for a level, which minimises what a way says."""
+    specification = models[0].specification
     energies = [model.energy for model in models]
-    if remembered > specification.context:
+    if way.remembers:
         recent = functools.partial(windows.recent, length=specification.context)
         energies = [view(energy, recent) for energy in energies]
-        specification = dataclasses.replace(specification, context=remembered)
+        specification = dataclasses.replace(
+            specification, context=domain_of(level, models).max_steps
+        )
     energy = way.minimise(energies)
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     # What weighs many plans of a context at once has a full batch with few contexts.
@@ -342,8 +351,7 @@ def play(
     """What one way of asking gives, and its episodes."""
     specification = models[0].specification
     search = way.search(specification.planner)
-    kind = configs.find_domain(specification.domain)
-    domain = kind.make(case.level, specification.domain_settings)
+    domain = domain_of(case.level, models)
     adapters: list[Adapter] = []
 
     def make_adapter() -> Adapter:
@@ -351,7 +359,7 @@ def play(
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
-        planner = asked(way, models, config)
+        planner = asked(case.level, way, models, config)
         run.warm_up(planner, domain, options.episodes, way.executed)
         adapters.clear()
         return rollouts.evaluate(
