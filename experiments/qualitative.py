@@ -121,7 +121,8 @@ def refinement(level: str, first: int) -> list[Image.Image]:
     def refined(found: Drawn) -> bool:
         return all(before != after for before, after in pairwise(plans_of(found)[1]))
 
-    asked = analysis.asked(level, Way("refined"), [planner], search)
+    domain = analysis.domain_of(level, [planner])
+    asked = analysis.asked(domain, Way("refined"), [planner], search)
     found = episode(level, asked, None, first, refined)
     start, ways = plans_of(found)
     plans = [
@@ -137,7 +138,7 @@ def unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Im
     (way,) = (way for way in case.ways if way.name == way_name)
     models = analysis.models_of(work, case, way.method, options.seed)
     search = way.search(models[0].specification.planner)
-    planner = analysis.asked(case.level, way, models, search)
+    planner = analysis.asked(analysis.domain_of(case.level, models), way, models, search)
     found = episode(case.level, planner, way.executed, options.test_seed)
     halves: list[tuple[list[Cell], Colour]] = []
     if case_name.startswith("composition"):  # who sees which obstacles

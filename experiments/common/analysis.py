@@ -322,16 +322,16 @@ def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
     return configs.find_domain(specification.domain).make(level, specification.domain_settings)
 
 
-def asked(level: str, way: Way, models: Sequence[Pretrained], search: PlannerConfig) -> Pretrained:
+def asked(
+    domain: Domain, way: Way, models: Sequence[Pretrained], search: PlannerConfig
+) -> Pretrained:
     """The models of a case as one planner for a level, which minimises what a way says."""
     specification = models[0].specification
     energies = [model.energy for model in models]
     if way.remembers:
         recent = functools.partial(windows.recent, length=specification.context)
         energies = [view(energy, recent) for energy in energies]
-        specification = dataclasses.replace(
-            specification, context=domain_of(level, models).max_steps
-        )
+        specification = dataclasses.replace(specification, context=domain.max_steps)
     energy = way.minimise(energies)
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     # What weighs many plans of a context at once has a full batch with few contexts.
@@ -359,7 +359,7 @@ def play(
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
-        planner = asked(case.level, way, models, config)
+        planner = asked(domain, way, models, config)
         run.warm_up(planner, domain, options.episodes, way.executed)
         adapters.clear()
         return rollouts.evaluate(
