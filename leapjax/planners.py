@@ -20,6 +20,16 @@ FILLS = ("together", "confident", "margin", "sequential", "random")
 ORDERS = ("random", "sequential", "uncertain")
 
 
+def check_temperature(temperature: float) -> None:
+    """Refuses what is no temperature.
+
+    Raises:
+        ValueError: it is out of range.
+    """
+    if not 0 <= temperature <= HOTTEST:  # false for NaN too
+        raise ValueError(f"a temperature must be in 0 .. {HOTTEST}, got {temperature}")
+
+
 @dataclasses.dataclass(frozen=True)
 class GibbsConfig:
     """Iterative planning through energy minimisation (paper, algorithm 1).
@@ -49,8 +59,7 @@ class GibbsConfig:
             raise ValueError(
                 f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
             )
-        if not 0 <= self.temperature <= HOTTEST:  # false for NaN too
-            raise ValueError(f"a temperature must be in 0 .. {HOTTEST}, got {self.temperature}")
+        check_temperature(self.temperature)
         for name, known in {"fill": FILLS, "order": ORDERS}.items():
             value = getattr(self, name)
             if value not in known:
@@ -102,10 +111,12 @@ class BeamConfig:
 
     horizon: int = 5  # T
     beams: int = 10  # W, partial plans that are kept
+    temperature: float = 0.0  # 0 keeps the best; above it beams are drawn, all different
     score: bool = False  # also return the energy of the plan
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "horizon", "beams")
+        check_temperature(self.temperature)
 
     @property
     def iterations(self) -> int:
@@ -381,20 +392,31 @@ def cross_entropy_method(
     return plan._replace(energy=energies[best]) if config.score else plan
 
 
+class _Beams(NamedTuple):
+    """W plans that have begun."""
+
+    plans: jax.Array  # [W, T] int32; MASK where nothing is chosen yet
+    sums: jax.Array  # [W] of the energies of what is chosen; +inf where there is no plan yet
+    likelihoods: jax.Array  # [W] log-probability of being drawn, at the temperature
+    ranks: jax.Array  # [W] the same and noise: those that are highest go on
+
+
 def beam_search(
     energy: Energy, params: Params, key: jax.Array, context: PyTree, config: BeamConfig
 ) -> Plan:
-    """The plan of least summed conditional energy among the W that began best, T passes in all.
+    """The plan of least summed conditional energy among W that began well, T passes in all.
 
     A position is chosen while those after it are still MASK. Where the conditionals are
     `-log p(a_t | those before)`, as of an autoregressive model, the sum is the negative log
-    likelihood of the plan, and A^(T - 1) beams find the likeliest of all. Nothing is
-    drawn. The trace is the best beam after every pass; what is not chosen yet is MASK there.
+    likelihood of the plan. At temperature 0 the W best go on, and A^(T - 1) of them find the
+    likeliest plan of all. Above it they are drawn: W plans without replacement, each action with
+    probability proportional to `exp(-energy / temperature)` (stochastic beam search, Kool et al.,
+    2019); of one beam that is a plan drawn action by action. The trace is the first beam after
+    every pass; what is not chosen yet is MASK there.
 
     Raises:
         ValueError: the energy does not accept MASK, so that no plan can be begun.
     """
-    del key
     if not energy.accepts_mask:
         raise ValueError(
             "beam search begins plans that it ends later, and this energy scores complete plans "
@@ -404,29 +426,65 @@ def beam_search(
     actions = energy.num_actions
 
     def extend(
-        carry: tuple[jax.Array, jax.Array], position: jax.Array
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-        beams, sums = carry  # [W, T], [W]
-        each = jax.vmap(lambda beam: energy.conditional(params, memory, beam, position[None])[0])
-        energies = each(beams)  # [W, A]
-        least, chosen = jax.lax.top_k(-(sums[:, None] + energies).reshape(-1), config.beams)
-        beams = beams[chosen // actions].at[:, position].set(chosen % actions)
-        return (beams, -least), (beams[0], undefined(energies).any())
+        beams: _Beams, inputs: tuple[jax.Array, jax.Array]
+    ) -> tuple[_Beams, tuple[jax.Array, jax.Array]]:
+        position, draw_key = inputs
+        asked = jax.vmap(lambda beam: energy.conditional(params, memory, beam, position[None])[0])
+        energies = asked(beams.plans)  # [W, A]
+        sums = beams.sums[:, None] + energies
+        likelihoods = ranks = -sums
+        if config.temperature:
+            likelihoods, ranks = _drawn(draw_key, beams, energies, config.temperature)
+        _, chosen = jax.lax.top_k(ranks.reshape(-1), config.beams)
+        plans = beams.plans[chosen // actions].at[:, position].set(chosen % actions)
+        kept = (each.reshape(-1)[chosen] for each in (sums, likelihoods, ranks))
+        return _Beams(plans, *kept), (plans[0], undefined(energies).any())
 
     blank = jnp.full((config.beams, config.horizon), mask_token(actions), jnp.int32)
     # One plan is blank, not W: the others would only repeat it.
     sums = jnp.full(config.beams, jnp.inf).at[0].set(0.0)
-    positions = jnp.arange(config.horizon)
-    (beams, sums), (trace, invalid) = jax.lax.scan(extend, (blank, sums), positions)
+    inputs = jnp.arange(config.horizon), jax.random.split(key, config.horizon)
+    beams, (trace, invalid) = jax.lax.scan(extend, _Beams(blank, sums, -sums, -sums), inputs)
     # In a dead end a constraint says nothing, so what it forbids may have the least sum.
-    violations = jax.vmap(lambda beam: energy.violation(params, memory, beam))(beams)
-    found = jnp.argmin(jnp.where(jnp.isposinf(violations), jnp.inf, sums))
-    best, satisfied = beams[found], violations[found] <= 0
+    violations = jax.vmap(lambda beam: energy.violation(params, memory, beam))(beams.plans)
+    found = jnp.argmin(jnp.where(jnp.isposinf(violations), jnp.inf, beams.sums))
+    best, satisfied = beams.plans[found], violations[found] <= 0
     plan = Plan(best, trace.at[-1].set(best), satisfied, ~invalid.any())
     if config.score:
         total = energy.total(params, memory, best)
         plan = plan._replace(energy=total, valid=plan.valid & ~undefined(total))
     return plan
+
+
+def _drawn(
+    key: jax.Array, beams: _Beams, energies: jax.Array, temperature: float
+) -> tuple[jax.Array, jax.Array]:
+    """`likelihoods` and `ranks` `[W, A]` of plans that are one action longer.
+
+    The highest rank of what a plan becomes is the plan's own (Kool et al., 2019, algorithm 1):
+    so complete plans have ranks as if noise had been added to each of all that are possible.
+
+    Args:
+        key: of the noise.
+        beams: that are made longer.
+        energies: `[W, A]` of every action.
+        temperature: of the draw, positive.
+    """
+    # Measured from the least first, so that the lowest temperature is a greedy choice.
+    least = energies.min(axis=1, keepdims=True)
+    hopeless = jnp.isinf(least) | jnp.isinf(beams.likelihoods)[:, None]  # nothing, or no plan
+    likelihoods = jnp.where(hopeless, 0, jax.nn.log_softmax((least - energies) / temperature))
+    noisy = likelihoods + jax.random.gumbel(key, energies.shape)
+    highest = noisy.max(axis=1, keepdims=True)
+    wanted = jnp.where(hopeless, 0, (beams.ranks - beams.likelihoods)[:, None])
+    # -log(exp(-wanted) - exp(-highest) + exp(-noisy)), in a form that overflows nowhere.
+    excess = wanted - noisy + jnp.log1p(-jnp.exp(noisy - highest))
+    ranks = wanted - jnp.maximum(excess, 0) - jnp.log1p(jnp.exp(-jnp.abs(excess)))
+
+    def after(each: jax.Array) -> jax.Array:
+        return jnp.where(hopeless, -jnp.inf, each + beams.likelihoods[:, None])
+
+    return after(likelihoods), after(ranks)
 
 
 def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:

@@ -661,6 +661,62 @@ def test_beam_search_keeps_no_plan_that_is_forbidden_while_another_is_allowed():
         assert np.isfinite(plan.energy).all()
 
 
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 2.0])
+def test_one_beam_that_is_drawn_samples_action_by_action(temperature):
+    """At temperature 1 from the joint; else each action is more, or less, certain."""
+    found = plans_of(ENUMERABLE, BeamConfig(HORIZON, 1, temperature)).actions
+    exact = np.ones(len(PLANS))
+    for row, plan in enumerate(PLANS):
+        for t, action in enumerate(plan):
+            tokens = np.array([*plan[:t], *[ACTIONS] * (HORIZON - t)])
+            p = conditional_by_counting(JOINT, tokens, t) ** (1 / temperature)
+            exact[row] *= p[action] / p.sum()
+    assert fit_p_value(plan_counts(found, ACTIONS), exact) > ACCEPTED
+    if temperature == 1:
+        np.testing.assert_allclose(exact, JOINT.reshape(-1), rtol=1e-6)
+    else:
+        assert fit_p_value(plan_counts(found, ACTIONS), JOINT) < REJECTED
+
+
+def test_two_beams_that_are_drawn_are_the_better_of_two_different_plans():
+    """Drawn without replacement: {a, b} with probability p_a p_b / (1 - p_a) and the reverse."""
+    table = 6 * TABLE  # where what was drawn before matters: the likeliest plan has 0.6
+    p = joint_probabilities(table).reshape(-1)
+    pairs = np.outer(p, p) / (1 - p)[:, None]
+    np.fill_diagonal(pairs, 0)
+    rank = np.argsort(np.argsort(-p))
+    better = np.where(rank[:, None] < rank, np.arange(len(p))[:, None], np.arange(len(p)))
+    exact = np.bincount(better.reshape(-1), pairs.reshape(-1), len(p))
+    found = plans_of(ENUMERABLE, BeamConfig(HORIZON, 2, 1.0), table).actions
+    assert fit_p_value(plan_counts(found, ACTIONS), exact) > ACCEPTED
+    # The same with replacement is another distribution, and would be noticed.
+    repeated = np.bincount(better.reshape(-1), np.outer(p, p).reshape(-1), len(p))
+    assert fit_p_value(plan_counts(found, ACTIONS), repeated) < REJECTED
+
+
+@pytest.mark.parametrize("temperature", [1e-30, 1e30])
+def test_beams_are_drawn_at_any_temperature(temperature):
+    plan = plans_of(ENUMERABLE, BeamConfig(HORIZON, 40, temperature), chains=20)
+    if temperature < 1:
+        greedy = plans_of(ENUMERABLE, BeamConfig(HORIZON, 1), chains=1)
+        cold = plans_of(ENUMERABLE, BeamConfig(HORIZON, 1, temperature), chains=20)
+        np.testing.assert_array_equal(cold.actions, np.repeat(greedy.actions, 20, axis=0))
+    # As many beams as plans: all are drawn, in whatever order, and the likeliest is kept.
+    assert plan.valid.all()
+    if temperature > 1:
+        assert (plan.actions == PLANS[JOINT.argmax()]).all()
+
+
+@pytest.mark.parametrize("beams", [1, 40])
+def test_no_beam_that_is_drawn_is_forbidden(beams):
+    def no_first(context, actions):
+        return jnp.where(actions[0] == 0, jnp.inf, 0.0)
+
+    safe = constrain(ENUMERABLE, no_first, partial=True)
+    plan = plans_of(safe, BeamConfig(HORIZON, beams, 1.0), chains=500)
+    assert plan.satisfied.all() and plan.valid.all() and (plan.actions[:, 0] != 0).all()
+
+
 def test_beam_search_needs_an_energy_of_plans_that_are_begun():
     with pytest.raises(ValueError, match="accepts_mask is False"):
         bind(FROM_TOTAL, BeamConfig(HORIZON))(TABLE, jax.random.key(0), NO_TILT)
@@ -1077,6 +1133,7 @@ def test_impossible_chunk_sizes_are_refused(chunk_sizes):
         (CrossEntropyConfig, {"candidates": 2, "elites": 3}, "3 elites out of 2 candidates"),
         (BeamConfig, {"horizon": 0}, "horizon must be at least 1"),
         (BeamConfig, {"beams": 0}, "beams must be at least 1"),
+        (BeamConfig, {"temperature": -1.0}, "a temperature must be in"),
     ],
 )
 def test_impossible_configurations_are_refused(make, options, message):

@@ -25,6 +25,7 @@ from experiments.common.interruption import Interruption
 from experiments.common.results import Row
 from leapjax import pretrained, rollouts
 from leapjax.batching import compile_planner
+from leapjax.checkpoints import differences
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -271,12 +272,18 @@ def row_name(
     seed: int,
     options: Options,
 ) -> str:
-    """Twelve hexadecimal digits that name a row: what was trained, how it plans, and where."""
+    """Twelve hexadecimal digits that name a row: what was trained, how it plans, and where.
+
+    Of the planner what differs from its defaults alone, so that a setting that is added later
+    changes no name.
+    """
+    search = way.search(settings[0].planner)
+    planner = differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
     described = {
         "experiment": analysis.name, "case": case.name, "way": way.name, "method": way.method,
         "level": case.level, "seed": seed, "executed": way.executed,
         "episodes": options.episodes, "first": options.played[0],
-        "planner": dataclasses.asdict(way.search(settings[0].planner)),
+        "planner": {"kind": type(search).__name__, **planner},
         "trained": [configuration_hash(each, seed) for each in settings],
     }  # fmt: skip
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
