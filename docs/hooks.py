@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 LINK = r"\[([^\]]+)\]\(([^)#\s]+)(#[^)]*)?\)"
@@ -32,3 +33,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return text if elsewhere else found.group()
 
     return re.sub(LINK, mended, markdown)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Refuses a page that shows the name of a file instead of what is in it."""
+    del config, files
+    if re.search(r"8\s*&lt;", re.sub("<[^>]*>", "", html)):  # highlighting has put tags between
+        raise PluginError(f'{page.file.src_uri}: --8<-- "FILE" was not followed')
+    return html

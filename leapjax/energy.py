@@ -18,6 +18,7 @@ from leapjax.types import Energy, Params, PyTree, mask_token, no_violation, noth
 EncodeFn = Callable[[Params, PyTree], PyTree]
 LogitsFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
 TotalFn = Callable[[Params, PyTree, jax.Array], jax.Array]
+ConditionalFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
 
 
 def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Energy:
@@ -46,16 +47,7 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
         chex.assert_shape(scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
-    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-        actions = jnp.asarray(actions)
-
-        def term(position: jax.Array) -> jax.Array:
-            energies = conditional(params, memory, actions, position[None])[0]
-            return energies[jnp.minimum(actions[position], num_actions - 1)]
-
-        terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
-        return _infinite_if_incomplete(_check_total(jnp.sum(terms)), actions, num_actions)
-
+    total = _sum_of_conditionals(conditional, num_actions)
     return Energy(encode, conditional, total, _checked(num_actions))
 
 
@@ -347,17 +339,24 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
         best = jnp.min(jnp.where(unknown, jnp.inf, energies), axis=-1, keepdims=True)
         return jnp.where(unknown, best, energies)
 
+    total = _sum_of_conditionals(conditional, energy.num_actions)
+    return energy._replace(conditional=conditional, total=total)
+
+
+def _sum_of_conditionals(conditional: ConditionalFn, num_actions: int) -> TotalFn:
+    """The total of a plan: at every position the energy of its action, given all others."""
+
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         actions = jnp.asarray(actions)
 
         def term(position: jax.Array) -> jax.Array:
             energies = conditional(params, memory, actions, position[None])[0]
-            return energies[jnp.minimum(actions[position], energy.num_actions - 1)]
+            return energies[jnp.minimum(actions[position], num_actions - 1)]
 
         terms = jax.vmap(term)(jnp.arange(actions.shape[0]))
-        return _infinite_if_incomplete(_check_total(jnp.sum(terms)), actions, energy.num_actions)
+        return _infinite_if_incomplete(_check_total(jnp.sum(terms)), actions, num_actions)
 
-    return energy._replace(conditional=conditional, total=total)
+    return total
 
 
 def _try_every_action(

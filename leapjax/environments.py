@@ -51,17 +51,26 @@ class Eager(Protocol):
 
 
 class GymnasiumAdapter:
-    """Any Gymnasium environment with discrete actions; success is a positive reward."""
+    """Any Gymnasium environment with discrete actions.
 
-    def __init__(self, env: gym.Env) -> None:
+    An episode succeeds when its return reaches `success_return`; where that is None, what its
+    authors ask for (`reward_threshold`); where they ask for nothing, when it terminates with a
+    positive reward.
+    """
+
+    def __init__(self, env: gym.Env, success_return: float | None = None) -> None:
         if not isinstance(env.action_space, gym.spaces.Discrete):
             raise ValueError(f"a Discrete action space is needed, got {env.action_space}")
         self.env = env
         self.num_actions = int(env.action_space.n) + 1
         self._first_action = int(env.action_space.start)
+        asked = env.spec.reward_threshold if env.spec is not None else None
+        self._threshold = asked if success_return is None else success_return
+        self._return = 0.0
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed."""
+        self._return = 0.0
         found = self.env.reset(seed=seed)
         if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], dict)):
             raise TypeError(
@@ -73,5 +82,10 @@ class GymnasiumAdapter:
     def step(self, action: int) -> Transition:
         """Takes one action."""
         observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
-        success = bool(terminated and float(reward) > 0)
-        return Transition(observation, float(reward), terminated, truncated, success)
+        reward = float(reward)
+        self._return += reward
+        if self._threshold is None:
+            success = terminated and reward > 0
+        else:
+            success = (terminated or truncated) and self._return >= self._threshold
+        return Transition(observation, reward, terminated, truncated, bool(success))

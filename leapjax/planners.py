@@ -138,9 +138,9 @@ def gibbs(
     """Gibbs sampling over action tokens (paper, algorithm 1): N passes in all.
 
     The first iterations fill every position (see `GibbsConfig.fill`; for an energy that does not
-    accept MASK the first plan is uniform); each later one masks P positions, reads the energy
-    of every action there, and draws actions with probability proportional to
-    `exp(-energy / temperature)`.
+    accept MASK the first plan is uniform, of plans whose first action is possible); each later
+    one masks P positions, reads the energy of every action there, and draws actions with
+    probability proportional to `exp(-energy / temperature)`.
 
     Filling one position at a time, at temperature 1 and with the conditionals of a joint
     distribution, draws from that joint: it is the chain rule, and which position comes next may
@@ -250,8 +250,8 @@ def _gibbs_chain(
     blank = jnp.full((horizon,), mask, jnp.int32)
     chain = _Chain(blank, jnp.zeros(horizon) if config.order == "uncertain" else None)
     if not energy.accepts_mask:
-        uniform = jax.random.randint(start_key, (horizon,), 0, energy.num_actions)
-        chain, begun, begun_valid = chain._replace(actions=uniform), uniform[None], jnp.bool_(True)
+        uniform, begun_valid = _uniform_plan(energy, params, memory, start_key, horizon)
+        chain, begun = chain._replace(actions=uniform), uniform[None]
     elif config.fill == "together":
         chain, begun_valid = draw(
             chain, everywhere, energies_at(blank, everywhere), noise(start_key, horizon)
@@ -267,6 +267,23 @@ def _gibbs_chain(
     gumbel = noise(noise_key, later, config.resampled)  # [N - F, P, A]
     chain, (trace, valid) = jax.lax.scan(resample, chain, (positions, gumbel))
     return chain.actions, jnp.concatenate([begun, trace]), jnp.all(begun_valid) & valid.all()
+
+
+def _uniform_plan(
+    energy: Energy, params: Params, memory: PyTree, key: jax.Array, horizon: int
+) -> tuple[jax.Array, jax.Array]:
+    """A plan `[T]` of uniform actions, the first among those that can be; whether none was NaN.
+
+    A plan that begins with its end has an infinite energy whatever follows, so that no later
+    position would ever be changed.
+    """
+    plan_key, first_key = jax.random.split(key)
+    plan = jax.random.randint(plan_key, (horizon,), 0, energy.num_actions)
+    energies = energy.conditional(params, memory, plan, jnp.zeros(1, jnp.int32))[0]  # [A]
+    impossible = jnp.isposinf(energies)
+    first = jax.random.categorical(first_key, jnp.where(impossible, -jnp.inf, 0.0))
+    first = jnp.where(jnp.all(impossible), plan[0], first).astype(jnp.int32)
+    return plan.at[0].set(first), ~jnp.any(undefined(energies))
 
 
 def _probabilities(energies: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ from leapjax.errors import UserError, check_at_least
 from leapjax.files import write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
-from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
+from leapjax.planners import PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
@@ -49,7 +49,7 @@ class Specification:
     context: int  # K
     model: ModelConfig
     training: TrainingConfig
-    planner: GibbsConfig | BeamConfig  # its horizon is the network's too
+    planner: PlannerConfig  # its horizon is the network's too
     method_settings: Any
     domain_settings: Any
     signature: dict  # of the domain, when it was trained
@@ -236,5 +236,8 @@ def load(
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
         params = checkpoints.restore_params(folder / CHECKPOINTS, like, whose)
-    plan = compile_planner(agent.energy, planner or specification.planner, chunk_sizes)
+    specification = dataclasses.replace(
+        specification, planner=planner or specification.planner, level=level or specification.level
+    )
+    plan = compile_planner(agent.energy, specification.planner, chunk_sizes)
     return Pretrained(specification, agent.energy, params, plan)

@@ -139,6 +139,21 @@ def test_without_mask_the_first_plan_is_uniform():
     assert fit_p_value(plan_counts(plan.trace[:, 0], ACTIONS), uniform) > ACCEPTED
 
 
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_without_mask_no_plan_begins_with_what_cannot_come_first(iterations):
+    """As an end action cannot: with it every plan is as bad, so none of them would be left."""
+
+    def total(params, memory, actions):
+        energy = ENUMERABLE.total(params, memory, actions)
+        return jnp.where(actions[0] == ACTIONS - 1, jnp.inf, energy)
+
+    guarded = from_total(ENUMERABLE.encode, total, ACTIONS)
+    plan = plans_of(guarded, GibbsConfig(HORIZON, iterations, temperature=1.0, score=True))
+    assert np.isfinite(plan.energy).all() and plan.valid.all()
+    counts = plan_counts(plan.trace[:, 0], ACTIONS)
+    assert fit_p_value(counts, (PLANS[:, 0] != ACTIONS - 1) / 18) > ACCEPTED
+
+
 @functools.cache
 def greedy_traces(order, fill="together"):
     """Traces `[tables, N, T]` at temperature 0, each on a joint of its own, and the joints."""
@@ -911,6 +926,20 @@ def test_chunks_cover_every_row_exactly_once(batch, sizes):
     assert all(size == used for _, size, used in chunks[:-1])
     _, size, used = chunks[-1]
     assert 1 <= used <= size
+
+
+@pytest.mark.parametrize(
+    ("batch", "sizes", "chunks"),
+    [
+        (64, (32, 128), [32, 32]),
+        (40, (16, 128), [16, 16, 16]),
+        (4, (1, 16), [1, 1, 1, 1]),
+        (5, (1, 16), [16]),
+        (110, (32, 128), [128]),
+    ],
+)
+def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunks):
+    assert [size for _, size, _ in split_batch(batch, sizes)] == chunks
 
 
 @settings(max_examples=30, deadline=None)

@@ -1,5 +1,7 @@
 """Planners that were trained before, asked for something else."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -42,6 +44,15 @@ def test_who_has_not_learned_returns_cannot_be_asked_for_one(tmp_path, method):
     folder = untrained_run(tmp_path, "--method", method)
     with pytest.raises(UserError, match=f"this {method} has not learned"):
         pretrained.load(folder, target_return=0.5)
+
+
+def test_a_planner_says_how_it_searches_and_what_it_plays(tmp_path):
+    folder = untrained_run(tmp_path, "--level", "GoToLocalS7N1")
+    trained = pretrained.load(folder).specification
+    search = dataclasses.replace(trained.planner, iterations=77, fill="confident")
+    asked = pretrained.load(folder, search, level="GoToObjMazeS4R2").specification
+    assert (asked.planner, asked.level) == (search, "GoToObjMazeS4R2")
+    assert dataclasses.replace(asked, planner=trained.planner, level=trained.level) == trained
 
 
 def test_it_plays_a_level_of_longer_episodes(tmp_path):

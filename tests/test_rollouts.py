@@ -488,6 +488,18 @@ def test_any_gymnasium_environment_with_discrete_actions():
     assert late.truncated and not late.terminated and not late.success
 
 
+def test_success_is_a_return_where_one_is_asked_for():
+    """In CartPole every step is rewarded, the one with which the pole falls too."""
+    for asked, succeeds in ((None, False), (8.0, True), (100.0, False)):
+        adapter = GymnasiumAdapter(gym.make("CartPole-v1"), asked)
+        adapter.reset(0)
+        steps = [adapter.step(0)]
+        while not steps[-1].terminated:
+            steps.append(adapter.step(0))
+        assert 8 <= len(steps) < 100 and steps[-1].reward > 0
+        assert steps[-1].success == succeeds and not any(step.success for step in steps[:-1])
+
+
 def test_evaluation_in_a_gymnasium_environment():
     made = []
 

@@ -448,6 +448,7 @@ def test_gradients_are_clipped_by_their_global_norm():
     ("kind", "setting", "says"),
     [
         (TrainingConfig, {"steps": -1}, "steps must be at least 0"),
+        (TrainingConfig, {"clip": 0.0}, "clip must be positive, got 0"),
         (TrainingConfig, {"batch": 0}, "batch must be at least 1"),
         (TrainingConfig, {"windows": "window"}, "unknown windows 'window'"),
         (leap.Settings, {"masking": "none"}, "unknown masking 'none'"),

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -360,14 +361,18 @@ def play(
     search = way.search(specification.planner)
     domain = domain_of(case.level, models)
     adapters: list[Adapter] = []
+    compile_seconds = 0.0
 
     def make_adapter() -> Adapter:
         adapters.append(case.adapter(case.level) if case.adapter else domain.make_adapter())
         return adapters[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
+        nonlocal compile_seconds
         planner = asked(domain, way, models, config)
+        begun = time.perf_counter()
         run.warm_up(planner, domain, options.episodes, way.executed)
+        compile_seconds += time.perf_counter() - begun
         adapters.clear()
         return rollouts.evaluate(
             make_adapter, options.played, planner.plan, planner.params,
@@ -400,8 +405,7 @@ def play(
         "mean_success_length": float(good.mean()) if len(good) else None,
         "planner": {"kind": type(search).__name__, **dataclasses.asdict(search)},
         "executed": way.executed or search.horizon,
-        "demos_seconds": 0.0,
-        "compile_seconds": 0.0,
+        "compile_seconds": round(compile_seconds, 3),
         "eval_seconds": round(found.seconds, 3),
         "plans": found.plans,
         "plans_per_second": found.plans / found.planning_seconds,

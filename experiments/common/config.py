@@ -66,7 +66,8 @@ class Config(Generic[M, D, P]):
     rules: float = 0.0
     """Weight of the domain's rules, which are added to what was learned while planning."""
     checkpoint: Path | None = None
-    """Folder of an earlier run to evaluate instead of training; brings its settings along."""
+    """Folder of an earlier run to evaluate instead of training; brings its settings along, but
+    --executed and --rules."""
     play: str | None = None
     """Another level to play with a checkpoint than the one that it was trained on."""
     pretrained: bool = False

@@ -21,8 +21,8 @@ Row = dict[str, Any]
 FIELDS = {
     "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
     "seed": int, "episodes": int, "successes": int, "mean_length": float,
-    "demos_seconds": float, "compile_seconds": float, "train_seconds": float,
-    "eval_seconds": float, "plans_per_second": float,
+    "compile_seconds": float, "train_seconds": float, "eval_seconds": float,
+    "plans_per_second": float,
 }  # fmt: skip
 
 
@@ -177,6 +177,6 @@ def time_table(rows: Sequence[Row]) -> Table:
     parts = ("demos", "compile", "train", "eval")
     result = Table("level", "seed", *(f"{part} (s)" for part in parts), "plans/s")
     for row in rows:
-        seconds = (f"{row[f'{part}_seconds']:.1f}" for part in parts)
+        seconds = (f"{row.get(f'{part}_seconds', 0):.1f}" for part in parts)
         result.add_row(row["level"], str(row["seed"]), *seconds, f"{row['plans_per_second']:.0f}")
     return result

@@ -106,6 +106,7 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
         plays: whether the planner will be needed; if not, it compiles at its first use.
     """
     config, domain = run.config, run.domain
+    plays = plays and not config.rules  # which `with_rules` makes another one of
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
     like = learning.blank_steps(domain) if config.demos else ()
@@ -390,7 +391,7 @@ def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
             run.interruption.check()
             meter.update(over, f"success {good}/{over}")
 
-        part = play(mine, progress=progress)
+        part = processes.together(lambda: play(mine, progress=progress))
     arrays = [x.tolist() for x in part[:4]]
     parts = [
         Episodes(*(np.array(x) for x in lists), *counts)  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.agents.q_learning import look_around, seen_around
-from leapjax.models.policy import PolicyModel, Said
+from leapjax.models.policy import Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
@@ -66,7 +66,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         loss = losses.mean_where(errors + settings.logit_penalty * squares, known) + cloning
         return loss, {"accuracy": accuracy, "value": losses.mean_where(estimates, known)}
 
-    init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
+    init = learning.make_init(
+        setup, module, learning.say_all, optimizer, target=lambda params: params
+    )
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
         setup.training.microbatch, setup.seen_at_once(seen_around(module)),
@@ -80,12 +82,6 @@ def likely_values(said: Said, threshold: float) -> jax.Array:
     likelihoods = jax.nn.softmax(said["behaviour"])
     likely = likelihoods >= threshold * likelihoods.max(axis=1, keepdims=True)
     return jnp.where(likely, said["q"], -jnp.inf)
-
-
-def _say(module: PolicyModel, context: Context, actions: jax.Array) -> Said:
-    """Touches every parameter, to initialise them."""
-    del actions
-    return module(context)
 
 
 BCQ = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)

@@ -116,7 +116,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             "advantage": losses.mean_where(least - value, known),
         }
 
-    init = learning.make_init(setup, module, _say, optimizer, target=_critic)
+    init = learning.make_init(setup, module, learning.say_all, optimizer, target=_critic)
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic),
         setup.training.microbatch, setup.seen_at_once(see),
@@ -156,12 +156,6 @@ def loss(
 def _critic(params: Params) -> Params:
     """The critic's own parameters, as its network has them."""
     return {"params": params["params"]["critic"]}
-
-
-def _say(module: Networks, context: Context, actions: jax.Array) -> tuple[Said, Said]:
-    """Touches every parameter, to initialise them."""
-    del actions
-    return module(context)
 
 
 IQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)

@@ -57,7 +57,7 @@ class TrainingConfig:
     steps: int = 1600  # 200 epochs of one window per demonstration, 500 demonstrations
     batch: int = 64
     learning_rate: float = 6e-4
-    warmup: int = 100  # steps of linear warm-up, then cosine decay
+    warmup: int = 100  # steps of linear warm-up, at most a tenth of all; then cosine decay
     final_fraction: float = 0.1  # of the learning rate that is left at the end
     betas: tuple[float, float] = (0.9, 0.95)
     weight_decay: float = 0.1  # not on embeddings, norms and biases
@@ -73,6 +73,8 @@ class TrainingConfig:
             "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
             "warmup": (0, math.inf), "clip": (0, math.inf),
         }  # fmt: skip
+        if self.clip == 0:
+            raise ValueError("clip must be positive, got 0: nothing would be learned")
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:  # false for NaN too
                 raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
@@ -326,6 +328,12 @@ def _in_parts(differentiate: Callable[..., PyTree], rows: int) -> Callable[..., 
         return means, (gradients, jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), each))
 
     return accumulated
+
+
+def say_all(module: nn.Module, context: Context, actions: jax.Array) -> PyTree:
+    """Touches every parameter of a network that is asked about a context alone: see `make_init`."""
+    del actions
+    return module(context)
 
 
 def make_init(

@@ -230,9 +230,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         }
 
     init = learning.make_init(
-        setup, module, lambda module, context, actions: module(context), optimizer,
-        target=lambda params: params,
-    )  # fmt: skip
+        setup, module, learning.say_all, optimizer, target=lambda params: params
+    )
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
         setup.training.microbatch, setup.seen_at_once(learning.both_see(module)),

@@ -121,16 +121,12 @@ def make_agent(
             "value": losses.mean_where(losses.of_action(q, taken), known),
         }
 
-    init = learning.make_init(setup, module, _say, optimizer, target=lambda params: params)
+    init = learning.make_init(
+        setup, module, learning.say_all, optimizer, target=lambda params: params
+    )
     update = learning.make_update(
         transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
         setup.training.microbatch, setup.seen_at_once(seen_around(module)),
     )  # fmt: skip
     energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
     return Agent(init, transition_batches(setup), update, energy)
-
-
-def _say(module: PolicyModel, context: Context, actions: jax.Array) -> Said:
-    """Touches every parameter, to initialise them."""
-    del actions
-    return module(context)

@@ -37,15 +37,15 @@ class Settings:
 class CheckedAdapter(GymnasiumAdapter):
     """Anybody's environment: what goes wrong in it is said in one line."""
 
-    def __init__(self, env: gym.Env, name: str, blank: PyTree, threshold: float | None) -> None:
-        super().__init__(env)
-        self._name, self._blank, self._threshold = name, blank, threshold
+    def __init__(
+        self, env: gym.Env, name: str, blank: PyTree, success_return: float | None
+    ) -> None:
+        super().__init__(env, success_return)
+        self._name, self._blank = name, blank
         self._shapes = jax.tree.map(np.shape, blank)
-        self._return = 0.0
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed."""
-        self._return = 0.0
         return self._checked(
             self._guarded("reset", lambda: super(CheckedAdapter, self).reset(seed))
         )
@@ -53,12 +53,7 @@ class CheckedAdapter(GymnasiumAdapter):
     def step(self, action: int) -> Transition:
         """Takes one action."""
         found = self._guarded("step", lambda: super(CheckedAdapter, self).step(action))
-        self._return += found.reward
-        success = found.success
-        if self._threshold is not None:
-            over = found.terminated or found.truncated
-            success = over and self._return >= self._threshold
-        return found._replace(observation=self._checked(found.observation), success=success)
+        return found._replace(observation=self._checked(found.observation))
 
     def _guarded(self, what: str, work: Callable[[], R]) -> R:
         try:
@@ -117,9 +112,6 @@ def make(name: str, options: Settings) -> Domain:
         raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
     space = env.observation_space
     blank, parts = blank_of(space, f"the observation of {name}"), parts_of(space)
-    threshold = options.success_return
-    if threshold is None and env.spec is not None:
-        threshold = env.spec.reward_threshold
 
     def tokens(num_actions: int, model: ModelConfig, context: int) -> nn.Module:
         del context
@@ -128,7 +120,7 @@ def make(name: str, options: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=lambda: CheckedAdapter(
-            make_environment(name, options), name, blank, threshold
+            make_environment(name, options), name, blank, options.success_return
         ),
         collect=functools.partial(collect, name),
         actions=(*(str(action) for action in range(actions.n)), "end"),

@@ -166,7 +166,7 @@ class Transformer(nn.Module):
 
     def nothing_yet(self, tokens: int) -> list[KeysValues]:
         """Room for the keys and values of so many tokens, per layer, for `extend`."""
-        empty = jnp.zeros((tokens, self.heads, self.width // self.heads))
+        empty = jnp.zeros((tokens, self.heads, self.width // self.heads), self.dtype)
         return [KeysValues(empty, empty)] * self.layers
 
     def extend(
