@@ -142,6 +142,7 @@ def test_the_readme_snippets_run():
     assert names["plans"].actions.shape == (7, 8)
     assert bool(names["plans"].satisfied.all())
     assert not (names["plans"].actions == 0).any()
+    assert names["episodes"].successes.mean() >= 0.9
 
 
 def test_the_tables_are_what_the_rows_say():
