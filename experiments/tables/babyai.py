@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -26,22 +25,9 @@ WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fiel
 # The methods of the paper's table, beside the floor, with both presets.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
-# Noise with preset `paper`, which has none of its own. Of five settings of each method the one
-# with the highest mean success over validation levels: docs/tried.md.
-NOISE: Mapping[str, Mapping[str, Any]] = {
-    "bc": {"temperature": 2.0},
-    "bcq": {"temperature": 0.01},
-    "iql": {"temperature": 2.0},
-    "dt": {"temperature": 2.0},
-    "plate": {"beams": 1, "temperature": 1.0},
-    "mopo": {"temperature": 2.0},
-    "leap": {"temperature": 1.0},
-}
-NOISY = "preset paper, noise"
 BY_METHOD = {
-    "preset paper": {method: Setting(method, "paper", method) for method in COMPARED},
-    NOISY: {method: Setting(method, "paper", method, noise) for method, noise in NOISE.items()},
-    "preset leapjax": {method: Setting(method, "leapjax", method) for method in COMPARED},
+    preset: {method: Setting(method, preset, method) for method in COMPARED}
+    for preset in ("paper", "leapjax")
 }
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30)  # T and N of every level, and fewer
@@ -79,8 +65,8 @@ def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     """The interquartile means of the paper's LEAP, and of what has rows on every level."""
     paper = middle_of_paper()
     methods = [
-        dataclasses.replace(by_method[method], title=f"{method}, {title.removeprefix('preset ')}")
-        for title, by_method in BY_METHOD.items()
+        dataclasses.replace(by_method[method], title=f"{method}, {preset}")
+        for preset, by_method in BY_METHOD.items()
         for method in BASELINES
     ]
     found = {setting.title: middle(rows, setting) for setting in (*SETTINGS, *methods)}
@@ -149,17 +135,16 @@ def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, 
 
 
 def methods(rows: Sequence[Row]) -> str:
-    """Success rates of every method: the paper's, and ours; the best of a line in bold."""
+    """Success rates of every method: the paper's, and those of both presets; the best in bold."""
     lines = []
-    for level, by_title in rows_by_method(rows).items():
+    for level, by_preset in rows_by_method(rows).items():
         theirs = paper_success(level)
         cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
         lines.append([level, "the paper", *_compared(theirs, cells)])
-        for title, by_method in by_title.items():
+        for preset, by_method in by_preset.items():
             ours = {name: mean_rate(of) for name, of in by_method.items() if of}
             cells = {name: rate(by_method[name]) for name in ours}
-            if ours:
-                lines.append([level, title, *_compared(ours, cells)])
+            lines.append([level, f"preset {preset}", *_compared(ours, cells)])
     return table("level | | " + " | ".join(COMPARED), lines)
 
 
@@ -171,16 +156,16 @@ def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]
 
 
 def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
-    """Rows by level, line of the table and method, of levels where there are some of a baseline."""
+    """Rows by level, preset and method, of levels where there are some of a baseline."""
     found = {}
     for level in LEVELS:
         mine = [row for row in rows if row["level"] == level]
-        by_title = {
-            title: {method: of_setting(mine, setting) for method, setting in settings.items()}
-            for title, settings in BY_METHOD.items()
+        by_preset = {
+            preset: {method: of_setting(mine, setting) for method, setting in settings.items()}
+            for preset, settings in BY_METHOD.items()
         }
-        if any(by_method[name] for by_method in by_title.values() for name in BASELINES):
-            found[level] = by_title
+        if any(by_method[name] for by_method in by_preset.values() for name in BASELINES):
+            found[level] = by_preset
     return found
 
 
@@ -190,12 +175,11 @@ def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, floa
         level: {
             "the paper": paper_success(level),
             **{
-                title: {name: mean_rate(of) for name, of in by_method.items() if of}
-                for title, by_method in by_title.items()
-                if title != NOISY  # of some levels only
+                f"preset {preset}": {name: mean_rate(of) for name, of in by_method.items() if of}
+                for preset, by_method in by_preset.items()
             },
         }
-        for level, by_title in rows_by_method(rows).items()
+        for level, by_preset in rows_by_method(rows).items()
     }
 
 
@@ -224,10 +208,10 @@ def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
     """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
     methods = [name for name in COMPARED if name != "random"]
     lines = []
-    for level, by_title in rows_by_method(rows).items():
+    for level, by_preset in rows_by_method(rows).items():
         first = {
             name: cell(row)
-            for name, every in by_title["preset leapjax"].items()
+            for name, every in by_preset["leapjax"].items()
             for row in every
             if row["seed"] == 0
         }

@@ -36,7 +36,12 @@ class Settings:
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place
 
 
-SAMPLED = ("leap", "bc", "dt", "iql", "mopo")  # they draw actions where there is much to do
+# By method, how actions are drawn where there is much to do: noise leads out of dead ends. In the
+# units of its energies: nats, or Q-values.
+SEQUENCE_NOISE: Mapping[str, Mapping[str, Any]] = {
+    **dict.fromkeys(("leap", "bc", "dt", "iql", "mopo"), {"temperature": 1.0}),
+    "bcq": {"temperature": 0.1},
+}
 
 
 def preset(name: str, preset: str) -> Mapping[str, Any]:
@@ -89,9 +94,7 @@ def _tuned_paper(level: Level, method: str) -> Mapping[str, Any]:
 
 def _tuned_leapjax(level: Level, method: str) -> Mapping[str, Any]:
     """What validation levels say (docs/tried.md)."""
-    options: dict[str, Any] = {}
-    if level.sequence and method in SAMPLED:  # much to do: noise leads out of dead ends
-        options["temperature"] = 1.0
+    options = dict(SEQUENCE_NOISE.get(method, {})) if level.sequence else {}
     if _is_large(level) and method == "leap":  # 3e-3 is too high here
         options["learning_rate"] = 1.5e-3
     return options
