@@ -41,6 +41,7 @@ _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, 
 SEQUENCE_NOISE: Mapping[str, Mapping[str, Any]] = {
     **dict.fromkeys(("leap", "bc", "dt", "iql", "mopo"), {"temperature": 1.0}),
     "bcq": {"temperature": 0.1},
+    "plate": {"beams": 1, "temperature": 2.0},
 }
 
 
