@@ -39,7 +39,7 @@ _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, 
 # By method, how actions are drawn where there is much to do: noise leads out of dead ends. In the
 # units of its energies: nats, or Q-values.
 SEQUENCE_NOISE: Mapping[str, Mapping[str, Any]] = {
-    **dict.fromkeys(("leap", "bc", "dt", "iql", "mopo"), {"temperature": 1.0}),
+    **{name: {"temperature": 1.0} for name in ("leap", "bc", "dt", "iql", "mopo")},
     "bcq": {"temperature": 0.1},
     "plate": {"beams": 1, "temperature": 2.0},
 }
