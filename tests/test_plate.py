@@ -108,21 +108,23 @@ def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
 
 def test_it_plans_in_bfloat16():
     """What is kept of earlier tokens has the precision of the tokens."""
-    programs = {}
-    for dtype in ("float32", "bfloat16"):
+    _, params, batch = untrained("leapjax", 0)
+    context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, 0)
+
+    def energies_in(dtype):
         setup = setup_of("leapjax", 0)
         setup = setup._replace(model=dataclasses.replace(setup.model, dtype=dtype))
-        agent = plate.make_agent(setup)
-        _, params, batch = untrained("leapjax", 0)
-        context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, 0)
+        energy = plate.make_agent(setup).energy
 
-        def energies(params, context, energy=agent.energy):
-            memory = energy.encode(params, context)
+        def energies(params, context):
             plan = jnp.array([0, 1, 2, 0])
-            return energy.conditional(params, memory, plan, jnp.arange(HORIZON))
+            return energy.conditional(
+                params, energy.encode(params, context), plan, jnp.arange(HORIZON)
+            )
 
-        programs[dtype] = np.asarray(quick_jit(energies)(params, context))[:, :-1]
-    low, high = programs["bfloat16"], programs["float32"]
+        return np.asarray(quick_jit(energies)(params, context))[:, :-1]
+
+    low, high = energies_in("bfloat16"), energies_in("float32")
     assert 0 < np.abs(low - high).max() < 0.05 * np.abs(high).max()
 
 

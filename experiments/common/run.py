@@ -106,7 +106,7 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
         plays: whether the planner will be needed; if not, it compiles at its first use.
     """
     config, domain = run.config, run.domain
-    plays = plays and not config.rules  # which `with_rules` makes another one of
+    plays = plays and not config.rules  # with rules another planner plays: see `with_rules`
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
     like = learning.blank_steps(domain) if config.demos else ()
