@@ -103,6 +103,8 @@ class Domain(NamedTuple):
     # what an episode of other observations is as a demonstration; or why it is none; or None,
     # where nothing is known of such observations
     source: Source | None = None  # of demonstrations; None: `collect`, kept by leapjax.data.storage
+    arguments: Mapping[str, Any] | None = None  # JSON values that its environment is made with, and
+    # that of data must agree with; None: theirs do not matter
     rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on

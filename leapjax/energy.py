@@ -270,10 +270,11 @@ def constrain(
         extra = _try_every_action(
             lambda plan: known(context, plan), actions, positions, energy.num_actions
         )
-        # Where no action at a position makes the plan allowed, another position has to
-        # change: the constraint then says nothing about this one.
-        hopeless = jnp.all(jnp.isinf(extra), axis=-1, keepdims=True)
-        return _check_energies(base + jnp.where(hopeless, 0.0, extra), positions)
+        # Where no action that is possible at a position makes the plan allowed, another position
+        # has to change: the constraint then says nothing about this one.
+        both = base + extra
+        hopeless = jnp.all(jnp.isinf(both), axis=-1, keepdims=True)
+        return _check_energies(jnp.where(hopeless, base, both), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory

@@ -13,7 +13,7 @@ from benchmarks import quality
 from experiments import babyai
 from experiments.common import results, run
 from experiments.common.config import parse, preset
-from leapjax import UserError, files, load, plan_keys, rollouts
+from leapjax import UserError, files, load, plan_keys, pretrained, rollouts
 from leapjax.agents import leap
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.domain import BABYAI
@@ -325,6 +325,18 @@ def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_
     assert "was begun on other demonstrations (0123456789abcdef" in capsys.readouterr().err
 
 
+def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, capsys):
+    """Of another version of the library, which called what it learned by another name."""
+    arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", str(tmp_path / "runs")]
+    assert babyai.main(arguments) == 0
+    specification = only_folder(tmp_path / "runs") / "specification.json"
+    specification.write_text(before := specification.read_text() + "\n")
+    monkeypatch.setattr(pretrained, "identity", lambda specification: "of another version")
+    assert babyai.main(arguments) == 2
+    assert "is of another configuration" in capsys.readouterr().err
+    assert specification.read_text() == before
+
+
 def test_a_folder_in_use_is_refused(workplace, capsys):
     with files.only_process_in(run_folder(workplace)):
         assert babyai.main(TOY_RUN) == 2
@@ -346,7 +358,7 @@ def test_a_data_set_of_the_users_own_is_trained_on(workplace):
 def test_too_few_demonstrations_in_a_data_set(workplace, capsys):
     mine = storage.dataset_id(DOMAIN, 6, 0)
     assert babyai.main([*TOY_RUN, "--demonstrations", mine, "--demos", "7"]) == 2
-    assert "fewer than --demos 7" in capsys.readouterr().err
+    assert "fewer than --demos 7: use --demos 6" in capsys.readouterr().err
 
 
 def test_evaluation_does_not_depend_on_the_batch(planner):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from leapjax.batching import compile_planner
 from leapjax.energy import (
     autoregressive,
     compose,
@@ -15,7 +16,7 @@ from leapjax.energy import (
     single_action,
     view,
 )
-from leapjax.planners import GibbsConfig, bind, gibbs
+from leapjax.planners import BeamConfig, GibbsConfig, bind, gibbs
 from leapjax.types import Energy, mask_token, pad_token
 from tests.enumerable import (
     all_plans,
@@ -407,6 +408,16 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
         rtol=1e-5,
     )  # fmt: skip
     np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
+
+
+def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
+    """The model's best action is taken, and the plan says that it is not as it should be."""
+    rows = jnp.array([[3.0, -jnp.inf, 1.0, -jnp.inf], [2.0, -jnp.inf, 3.0, -jnp.inf]])
+    only = pseudo_likelihood(lambda params, context: (), lambda p, m, a, at: rows[at], 4)
+    asked = constrain(only, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
+    for config in (GibbsConfig(2, 2), BeamConfig(2, beams=2)):
+        plan = compile_planner(asked, config)((), jax.random.split(jax.random.key(0), 1), {})
+        assert plan.actions.tolist() == [[0, 2]] and not plan.satisfied[0]
 
 
 def test_constraint_waits_for_a_complete_plan():

@@ -15,7 +15,7 @@ from leapjax import domains
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
-from leapjax.gymnasium.observations import Part, StateTokens, blank_of, parts_of
+from leapjax.gymnasium.observations import Part, StateTokens, blank_of, check_choices, parts_of
 from tests.parameters import random_like
 from tests.programs import SMALL
 
@@ -73,9 +73,10 @@ def registered():
         del gym.registry[f"{name}-v0"]
 
 
-def recorded(name, level, policy, episodes):
+def recorded(name, level, policy, episodes, **arguments):
     """A data set of a policy, as Minari's collector writes it."""
-    env = DataCollector(gym.make(level, disable_env_checker=True), jpeg_encoding=False)
+    made = gym.make(level, disable_env_checker=True, **arguments)
+    env = DataCollector(made, jpeg_encoding=False)
     for seed in range(episodes):
         seen, _ = env.reset(seed=seed)
         over = False
@@ -188,3 +189,46 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
     assert domains.find_domain("gymnasium") is GYMNASIUM
+
+
+def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch):
+    """Data know the environment by its id, without the module."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    register = 'gym.register("Theirs-v0", "tests.test_gymnasium:Corridor", max_episode_steps=12)'
+    (tmp_path / "their_corridor.py").write_text(f"import gymnasium as gym\n{register}\n")
+    try:
+        name = recorded("my/theirs-v0", "their_corridor:Theirs-v0", lambda seen: 1, 2)
+        options = [*SMALL, "--horizon", "3", "--steps", "2"]
+        assert program.main(["--env", "their_corridor:Theirs-v0", "--dataset", name, *options]) == 0
+    finally:
+        gym.registry.pop("Theirs-v0", None)
+
+
+def test_data_of_other_arguments_are_refused_until_they_are_given(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    large = {"map_name": "8x8", "is_slippery": False}
+    name = recorded("my/lake-v0", "FrozenLake-v1", lambda seen: 2, 2, **large)
+    options = ["--dataset", name, *SMALL, "--horizon", "3", "--steps", "2"]
+    assert program.main(options) == 2
+    said = capsys.readouterr().err
+    asked = '{"map_name": "8x8", "is_slippery": false}'
+    assert "recorded in FrozenLake-v1 with other arguments" in said
+    assert f"--arguments '{asked}'" in said and said.count("\n") == 1
+    assert program.main([*options, "--arguments", asked]) == 0
+    assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [["choices", 64]]
+    for wrong in ("[]", "{", "8x8"):
+        with pytest.raises(ValueError, match="arguments must be a JSON object like"):
+            Settings(arguments=wrong)
+
+
+def test_choices_that_there_are_not_are_refused():
+    several = spaces.Dict(one=spaces.Discrete(3, start=2), more=spaces.MultiDiscrete([2, 4]))
+    good = {"one": np.array([2, 4]), "more": np.array([[0, 0], [1, 3]])}
+    check_choices(several, good, "episode 0")
+    with pytest.raises(UserError, match="episode 0: one: choices from 1 to 4, expected 2 to 4"):
+        check_choices(several, {**good, "one": np.array([1, 4])}, "episode 0")
+    with pytest.raises(UserError, match="more: choices from 0 to 3"):
+        check_choices(several, {**good, "more": np.array([[0, 0], [2, 3]])}, "episode 0")
+    with pytest.raises(UserError, match="choices from 16 to 16, expected 0 to 15"):
+        make("FrozenLake-v1", Settings()).check(np.array([16]), "episode 0")

@@ -106,6 +106,22 @@ def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
     np.testing.assert_allclose(found[1:], expected[1:], rtol=1e-3, atol=1e-3)
 
 
+def test_nothing_follows_an_end():
+    """Past it nothing is learned, so nothing is asked: a plan that ended costs no more."""
+    agent, params, batch = untrained("leapjax", 0)
+    context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, 0)
+    memory = quick_jit(agent.energy.encode)(params, context)
+    energies = quick_jit(agent.energy.conditional)
+    plan = np.array([0, toy.END, 1, toy.END], np.int32)
+    found = np.asarray(energies(params, memory, plan, np.arange(HORIZON)))
+    assert np.isfinite(found[0, : toy.END]).all() and np.isfinite(found[1]).all()
+    expected = np.where(np.arange(toy.END + 1) == toy.END, 0.0, np.inf)
+    np.testing.assert_array_equal(found[2:], np.stack([expected, expected]))
+    ended = jnp.array([0, toy.END, toy.END, toy.END])
+    first = found[0, 0] + found[1, toy.END]
+    assert agent.energy.total(params, memory, ended) == pytest.approx(first, rel=1e-5)
+
+
 def test_it_plans_in_bfloat16():
     """What is kept of earlier tokens has the precision of the tokens."""
     _, params, batch = untrained("leapjax", 0)

@@ -279,7 +279,16 @@ def test_a_missing_data_set(name):
 
 
 def test_a_namespace_is_not_a_data_set(saved):
-    refused("leapjax/GoToLocalS7N5")
+    assert "no Minari data set" in refused("leapjax/GoToLocalS7N5")
+
+
+def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
+    ours, theirs = storage.dataset_id(LEVEL, 1, 0), "my/own-v0"
+    for name in (ours, theirs):
+        (minari_folder / name / "data").mkdir(parents=True)
+        assert "cannot be read" in refused(name)
+    assert refused(ours).endswith("delete it and it is made again, or restore it")
+    assert refused(theirs).endswith("): restore it")
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
@@ -309,7 +318,7 @@ def test_a_missing_file(saved, minari_folder, name):
 
 def test_an_empty_folder(saved, minari_folder):
     shutil.rmtree(minari_folder / NAME / "data")
-    assert "cannot be read" in refused()
+    assert "no Minari data set" in refused()
 
 
 def test_a_missing_episode(saved, minari_folder):

@@ -234,7 +234,8 @@ def check(config: AnyConfig) -> None:
     if config.play is not None and config.checkpoint is None:
         raise UserError("--play: another level is played with a --checkpoint, and there is none")
     recorded = storage.described(config.demonstrations).level if config.demonstrations else None
-    if recorded is not None and recorded != config.level:
+    # `module:id` is an environment that a module registers; data know it by its id.
+    if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
             f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "
             f"use --level {recorded}"

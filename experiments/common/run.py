@@ -213,7 +213,6 @@ def fit(
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
     check_data(folder, windows.fingerprint(examples), [each.seed for each in data])
-    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
@@ -225,6 +224,8 @@ def fit(
     processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
+    # Not before: what does not fit the run that is there leaves it as it is.
+    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
     metrics: Metrics = []
     if restored is not None:
         state = restored

@@ -25,9 +25,16 @@ WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fiel
 # The methods of the paper's table, beside the floor, with both presets.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
+# What methods of preset `paper` do, drawn: chosen on validation levels (docs/tried.md).
+NOISE = {
+    **{method: {"temperature": 2.0} for method in ("bc", "iql", "dt", "mopo")},
+}
 BY_METHOD = {
-    preset: {method: Setting(method, preset, method) for method in COMPARED}
-    for preset in ("paper", "leapjax")
+    "preset paper": {method: Setting(method, "paper", method) for method in COMPARED},
+    "preset paper, noise": {
+        method: Setting(method, "paper", method, options) for method, options in NOISE.items()
+    },
+    "preset leapjax": {method: Setting(method, "leapjax", method) for method in COMPARED},
 }
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30)  # T and N of every level, and fewer
@@ -65,9 +72,10 @@ def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     """The interquartile means of the paper's LEAP, and of what has rows on every level."""
     paper = middle_of_paper()
     methods = [
-        dataclasses.replace(by_method[method], title=f"{method}, {preset}")
-        for preset, by_method in BY_METHOD.items()
+        dataclasses.replace(by_method[method], title=f"{method}, {of.removeprefix('preset ')}")
+        for of, by_method in BY_METHOD.items()
         for method in BASELINES
+        if method in by_method
     ]
     found = {setting.title: middle(rows, setting) for setting in (*SETTINGS, *methods)}
     known = {title: each for title, each in found.items() if each is not None}
@@ -142,9 +150,9 @@ def methods(rows: Sequence[Row]) -> str:
         cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
         lines.append([level, "the paper", *_compared(theirs, cells)])
         for preset, by_method in by_preset.items():
-            ours = {name: mean_rate(of) for name, of in by_method.items() if of}
-            cells = {name: rate(by_method[name]) for name in ours}
-            lines.append([level, f"preset {preset}", *_compared(ours, cells)])
+            ours = {name: mean_rate(of) for name, of in by_method.items()}
+            cells = {name: rate(of) for name, of in by_method.items()}
+            lines.append([level, preset, *_compared(ours, cells)])
     return table("level | | " + " | ".join(COMPARED), lines)
 
 
@@ -161,11 +169,15 @@ def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Ro
     for level in LEVELS:
         mine = [row for row in rows if row["level"] == level]
         by_preset = {
-            preset: {method: of_setting(mine, setting) for method, setting in settings.items()}
+            preset: {
+                method: of
+                for method, setting in settings.items()
+                if (of := of_setting(mine, setting))
+            }
             for preset, settings in BY_METHOD.items()
         }
-        if any(by_method[name] for by_method in by_preset.values() for name in BASELINES):
-            found[level] = by_preset
+        if any(name in by_method for by_method in by_preset.values() for name in BASELINES):
+            found[level] = {preset: of for preset, of in by_preset.items() if of}
     return found
 
 
@@ -175,7 +187,7 @@ def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, floa
         level: {
             "the paper": paper_success(level),
             **{
-                f"preset {preset}": {name: mean_rate(of) for name, of in by_method.items() if of}
+                preset: {name: mean_rate(of) for name, of in by_method.items()}
                 for preset, by_method in by_preset.items()
             },
         }
@@ -211,7 +223,7 @@ def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
     for level, by_preset in rows_by_method(rows).items():
         first = {
             name: cell(row)
-            for name, every in by_preset["leapjax"].items()
+            for name, every in by_preset.get("preset leapjax", {}).items()
             for row in every
             if row["seed"] == 0
         }

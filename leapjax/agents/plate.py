@@ -42,7 +42,10 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> jax.Array:
         result = module.apply(params, memory, actions, positions, method="logits")
         assert isinstance(result, jax.Array)
-        return result
+        # Past an end nothing is chosen, and nothing was learned: the end goes on.
+        ended = jnp.cumsum(actions == last) - (actions == last) > 0
+        goes_on = jnp.where(jnp.arange(sizes.num_actions) == last, 0.0, -jnp.inf)
+        return jnp.where(ended[positions, None], goes_on, result)
 
     energy = autoregressive(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 

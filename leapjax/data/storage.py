@@ -12,7 +12,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +60,10 @@ def source(domain: Domain, count: int, seed: int) -> Source:
         found, dropped = len(loaded.demonstrations), reasons(loaded)
         if found < count:
             also = f" that can be used ({dropped})" if dropped else ""
-            raise UserError(f"{name} has {found} episodes{also}, fewer than --demos {count}")
+            raise UserError(
+                f"{name} has {found} episodes{also}, fewer than --demos {count}: "
+                f"use --demos {found}"
+            )
         return loaded
 
     default = dataset_id(domain, count, seed)
@@ -203,12 +206,13 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
             f"no Minari data set {name!r} in {datasets_folder()}: "
             "check the id with `minari list local`"
         )
-    version = re.fullmatch(r"leapjax/.*/bot-.*-v(\d+)", name)
-    if version and int(version[1]) < FORMAT:
+    version = _version(name)
+    if version is not None and version < FORMAT:
         raise UserError(
             f"the data set {name!r} is of an earlier version, which kept no rewards: without "
             "--demonstrations it is made anew"
         )
+    _check_arguments(name, domain)
     found: list[Demonstration] = []
     dropped: Counter[str] = Counter()
     for episode, seed in _episodes(name):
@@ -225,6 +229,30 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         only = f" that can be used, only {reasons(collection)}" if dropped else ""
         raise UserError(f"the Minari data set {name!r} has no episodes{only}")
     return collection
+
+
+def _version(name: str) -> int | None:
+    """Of a data set that was made here, by its id; None: it is somebody else's."""
+    found = re.fullmatch(r"leapjax/.*/bot-.*-v(\d+)", name)
+    return int(found[1]) if found else None
+
+
+def _check_arguments(name: str, domain: Domain) -> None:
+    """Refuses data that were recorded in an environment of other arguments than is played.
+
+    Raises:
+        UserError: says which, and how to have them.
+    """
+    if domain.arguments is None:
+        return
+    played = {"render_mode": None, **domain.arguments}  # how it is looked at changes nothing
+    recorded = {**(described(name).arguments or {}), "render_mode": played["render_mode"]}
+    others = {key: value for key, value in recorded.items() if played.get(key) != value}
+    if others:
+        raise UserError(
+            f"{name} was recorded in {domain.level} with other arguments than it is played with: "
+            f"add --arguments '{json.dumps(others)}'"
+        )
 
 
 def reasons(collection: Collection) -> str:
@@ -245,9 +273,9 @@ def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
         for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
             yield episode, int(details.get("seed", UNKNOWN_SEED))
     except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
+        again = "delete it and it is made again, or " if _version(name) is not None else ""
         raise UserError(
-            f"the Minari data set {name!r} cannot be read ({first_line(error)}): "
-            "delete it and it is made again, or restore it"
+            f"the Minari data set {name!r} cannot be read ({first_line(error)}): {again}restore it"
         ) from None
 
 
@@ -285,6 +313,7 @@ class Described(NamedTuple):
 
     level: str | None = None  # the id of the environment that it was recorded in
     episodes: int | None = None
+    arguments: Mapping[str, Any] | None = None  # of that environment
 
 
 def described(name: str) -> Described:
@@ -297,10 +326,12 @@ def described(name: str) -> Described:
         return Described()
     count = count if isinstance(count, int) and count > 0 else None
     try:
-        level = json.loads(metadata["env_spec"])["id"]
-    except (ValueError, KeyError, TypeError):
-        level = None
-    return Described(level if isinstance(level, str) else None, count)
+        spec = json.loads(metadata["env_spec"])
+        level, arguments = spec["id"], spec.get("kwargs")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return Described(episodes=count)
+    arguments = arguments if isinstance(arguments, dict) else None
+    return Described(level if isinstance(level, str) else None, count, arguments)
 
 
 def _inspect(folder: Path) -> None:
@@ -397,6 +428,10 @@ def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") ->
 
 def _numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
     array = np.asarray(values)
+    if blank.dtype == bool:
+        if array.dtype != bool:
+            raise UserError(f"{what} must be true or false, got {array.dtype}")
+        return array
     if np.issubdtype(blank.dtype, np.integer):
         if not np.issubdtype(array.dtype, np.integer):
             raise UserError(f"{what} must be integers, got {array.dtype}")
@@ -421,12 +456,13 @@ def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
     """An array in the type of `blank`, if it fits."""
     with np.errstate(over="ignore"):
         narrow = array.astype(blank.dtype)
-    whole = np.issubdtype(blank.dtype, np.integer)
-    if not (np.array_equal(narrow, array) if whole else np.isfinite(narrow).all()):
+    exact = not np.issubdtype(blank.dtype, np.floating)
+    if not (np.array_equal(narrow, array) if exact else np.isfinite(narrow).all()):
         raise UserError(f"{where}: numbers that do not fit {blank.dtype}, or are not finite")
     return narrow
 
 
 def exists(name: str) -> bool:
     """Whether a data set of that id is in the local Minari folder."""
-    return (datasets_folder() / name).exists()
+    # A folder without data is a namespace: others may be below it.
+    return (datasets_folder() / name / "data").exists()

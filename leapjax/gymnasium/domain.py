@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -13,7 +14,7 @@ import numpy as np
 from leapjax.domain import Collection, Domain, DomainType
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError, check_at_least, did_you_mean, first_line
-from leapjax.gymnasium.observations import StateTokens, blank_of, parts_of
+from leapjax.gymnasium.observations import StateTokens, blank_of, check_choices, parts_of
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
@@ -28,10 +29,18 @@ class Settings:
     success_return: float | None = None  # of an episode that succeeds; None: what its authors
     # say, or a positive reward at its end where they say nothing
     max_steps: int | None = None  # of an episode; None: what its authors say
+    arguments: str = "{}"  # that it is made with, as a JSON object
 
     def __post_init__(self) -> None:
         if self.max_steps is not None:
             check_at_least(self, 1, "max_steps")
+        try:
+            wrong = not isinstance(json.loads(self.arguments), dict)
+        except ValueError:
+            wrong = True
+        if wrong:
+            like = '{"size": 8}'
+            raise ValueError(f"arguments must be a JSON object like {like}, got {self.arguments}")
 
 
 class CheckedAdapter(GymnasiumAdapter):
@@ -82,7 +91,7 @@ def make_environment(name: str, options: Settings) -> gym.Env:
         UserError: it cannot be made, or an episode may never end.
     """
     try:
-        env = gym.make(name, max_episode_steps=options.max_steps)
+        env = gym.make(name, options.max_steps, **json.loads(options.arguments))
     except Exception as error:  # noqa: BLE001  (it is anybody's code)
         hint = did_you_mean(name, gym.registry)
         raise UserError(
@@ -98,6 +107,14 @@ def make_environment(name: str, options: Settings) -> gym.Env:
 
 def _longest(env: gym.Env) -> int | None:
     return env.spec.max_episode_steps if env.spec is not None else None
+
+
+def _arguments(env: gym.Env) -> Mapping[str, Any] | None:
+    """What an environment was made with, as data sets say it; None: it cannot be said."""
+    try:
+        return json.loads(env.spec.to_json())["kwargs"] if env.spec is not None else None
+    except ValueError:  # arguments that are not JSON
+        return None
 
 
 def make(name: str, options: Settings) -> Domain:
@@ -126,6 +143,8 @@ def make(name: str, options: Settings) -> Domain:
         actions=(*(str(action) for action in range(actions.n)), "end"),
         max_steps=_longest(env) or 0,
         blank=blank,
+        check=functools.partial(check_choices, space),
+        arguments=_arguments(env),
         encoders={
             "paper": functools.partial(tokens, 0),  # it embeds actions itself
             "leapjax": functools.partial(tokens, int(actions.n) + 1),

@@ -56,6 +56,34 @@ def parts_of(space: gym.Space) -> tuple[Part, ...]:
     return (Part("image" if picture else "numbers"),)
 
 
+def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
+    """Refuses choices that there are not: a network would see none instead.
+
+    Args:
+        space: of one observation.
+        observations: any number of them, `[n, ...]`.
+        where: they are from.
+
+    Raises:
+        UserError: says which.
+    """
+    if isinstance(space, gym.spaces.Dict):
+        for key, part in space.spaces.items():
+            check_choices(part, observations[key], f"{where}: {key}")
+        return
+    if isinstance(space, gym.spaces.Discrete):
+        first, last = space.start, space.start + space.n - 1
+    elif isinstance(space, gym.spaces.MultiDiscrete):
+        first, last = space.start, space.start + space.nvec - 1
+    else:
+        return
+    if np.any(observations < first) or np.any(observations > last):
+        raise UserError(
+            f"{where}: choices from {np.min(observations)} to {np.max(observations)}, "
+            f"expected {np.min(first)} to {np.max(last)}"
+        )
+
+
 class StateTokens(nn.Module):
     """A token for each state of a context: `[K + 1, D]`, the current state last."""
 
