@@ -123,7 +123,7 @@ def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
     """
     figure, axis = plt.subplots(figsize=(6, 0.8 + 0.35 * len(found)), layout="constrained")
     for place, (score, low, high) in enumerate(reversed(found.values())):
-        axis.barh(place, high - low, left=low, height=0.5, color=f"C{place}", alpha=0.6)
+        axis.barh(place, high - low, left=low, height=0.5, color="C0", alpha=0.6)
         axis.plot([score, score], [place - 0.3, place + 0.3], color="black")
     axis.set_yticks(range(len(found)), [label.replace("`", "") for label in reversed(found)])
     axis.set(xlim=(0, 102))

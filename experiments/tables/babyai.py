@@ -1,6 +1,5 @@
 """The BabyAI tables: every setting of LEAP, and every method."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -71,13 +70,13 @@ def success(rows: Sequence[Row]) -> str:
 def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     """The interquartile means of the paper's LEAP, and of what has rows on every level."""
     paper = middle_of_paper()
-    methods = [
-        dataclasses.replace(by_method[method], title=f"{method}, {of.removeprefix('preset ')}")
-        for of, by_method in BY_METHOD.items()
-        for method in BASELINES
-        if method in by_method
-    ]
-    found = {setting.title: middle(rows, setting) for setting in (*SETTINGS, *methods)}
+    random, *_, executed = SETTINGS
+    named = {"random": random}
+    for preset, by_method in BY_METHOD.items():
+        said = preset.removeprefix("preset ")
+        named |= {f"{name}, {said}": of for name, of in by_method.items() if name != "random"}
+    named[f"leap, {executed.title}"] = executed
+    found = {title: middle(rows, setting) for title, setting in named.items()}
     known = {title: each for title, each in found.items() if each is not None}
     return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
 
