@@ -80,6 +80,11 @@ def run(options: Options) -> None:
         for game in options.games
         for name in options.presets
     ]
+    papers = [config for config in configs if config.model.architecture == "paper"]
+    try:
+        in_runs = [with_options(config, {"run": options.run}) for config in papers]
+    except ValueError as error:
+        raise UserError(f"--run {options.run}: {error}") from None
     console = Console()
     playing = [
         row for config in configs for row in measure(config, options.batches, options.seconds)
@@ -87,8 +92,6 @@ def run(options: Options) -> None:
     console.print(table(playing))
     write_rows(options.json, playing)
     if options.training:
-        papers = [config for config in configs if config.model.architecture == "paper"]
-        in_runs = [with_options(config, {"run": options.run}) for config in papers]
         trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
         console.print(training.table(trained))
         write_rows(options.training_json, trained)

@@ -24,7 +24,7 @@ from rich.table import Table
 
 from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, fastest, matmul_peak, write_rows
-from experiments.common import runtime
+from experiments.common import plots, program, runtime
 from experiments.common.config import make_domain, preset, specify, with_options
 from leapjax import pretrained
 from leapjax.babyai import levels
@@ -61,8 +61,20 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.planning", given, lambda: run(options))
+
+
+def run(options: Options) -> None:
+    """Measures both presets on every level.
+
+    Raises:
+        UserError: the plot cannot be of that kind.
+    """
+    if options.plot is not None:
+        plots.check_kind(options.plot)
     runtime.use_every_core()  # and no compilation cache: compile times are real
-    options = tyro.cli(Options, args=None if arguments is None else list(arguments))
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
     batches = (1, 256) if options.quick else BATCHES
     console = Console()
@@ -79,7 +91,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_rows(options.json, rows)
     if options.plot:
         draw(rows, options.plot)
-    return 0
 
 
 def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> list[Row]:
@@ -212,9 +223,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     left.set(xlabel="batch", ylabel="plans per second", xscale="log", yscale="log")
     right.set(xlabel="batch", ylabel="% of matrix-multiply peak", xscale="log", ylim=(0, 100))
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    plots.save(figure, path)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, fastest, write_rows
-from experiments.common import program, runtime
+from experiments.common import plots, program, runtime
 from leapjax import pretrained, rollouts
 from leapjax.babyai import levels
 from leapjax.batching import plan_keys
@@ -64,6 +64,8 @@ def run(options: Options) -> None:
     """Measures every setting."""
     if not options.runs:
         raise UserError("expected at least one folder of a run, or a level")
+    if options.plot is not None:
+        plots.check_kind(options.plot)
     folders = [pretrained.find(path) for path in options.runs]
     searches = {}
     for folder in folders:
@@ -187,9 +189,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    plots.save(figure, path)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ steps, episodes = (int(given) for given in (sys.argv[1:] + ["600", "20"][len(sys
 
 # Data: somebody's, or of a rule that balances the pole.
 env = DataCollector(gymnasium.make("CartPole-v1"))
-for seed in range(20):
+for seed in range(0 if storage.exists("mine/cartpole-v0") else 20):
     (x, speed, angle, turning), _ = env.reset(seed=seed)
     over = False
     while not over:
@@ -32,7 +32,8 @@ for seed in range(20):
         over = fallen or out_of_time
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it would like to know who we are
-    env.create_dataset("mine/cartpole-v0")
+    if not storage.exists("mine/cartpole-v0"):
+        env.create_dataset("mine/cartpole-v0")
 
 # A network of plans of five actions, trained and played.
 domain = find_domain("gymnasium").make("CartPole-v1", Settings())
@@ -47,6 +48,6 @@ state = train(
 )  # fmt: skip
 plan = leap.compile_planner(agent.energy, leap.GibbsConfig(horizon=5, iterations=5))
 played = leap.evaluate(
-    domain.make_adapter, range(episodes), plan, state.params, context=0, executed=1
+    domain.make_adapter, range(1000, 1000 + episodes), plan, state.params, context=0, executed=1
 )
 print(f"mean return {played.returns.mean():.0f}, success {played.successes.mean():.0%}")

@@ -61,6 +61,11 @@ def report(options: Options) -> None:
         specification = pretrained.read_specification(run)
         if specification.method != "leap":
             raise UserError(f"{run} is of method {specification.method}: only leap masks actions")
+        if pretrained.make_domain(specification).collect is None:
+            raise UserError(
+                f"{run} is of {specification.level}, which nobody here demonstrates: there are no "
+                "other demonstrations to compare with"
+            )
     runtime.start()
     for run in options.runs:
         Console().print(describe(pretrained.load(run), options, run.name))
@@ -84,6 +89,7 @@ def others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration
 
 
 def _collect(domain: Domain, count: int, seed: int) -> Sequence[Demonstration]:
+    assert domain.collect is not None  # see `report`; all levels of BabyAI have a demonstrator
     return domain.collect(count, seed, lambda done: None).demonstrations
 
 

@@ -56,6 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def report(options: Options) -> None:
     """The correlation of each game, the file and the figure."""
     check_counts(options, "windows")
+    if not options.checkpoint:
+        raise UserError("--checkpoint: name the folder of at least one run")
     specifications = [pretrained.read_specification(path) for path in options.checkpoint]
     for path, specification in zip(options.checkpoint, specifications, strict=True):
         if (specification.domain, specification.method) != ("atari", "leap"):

@@ -16,7 +16,7 @@ from leapjax.pretrained import Pretrained
 from leapjax.types import Plan
 
 REFINE_MS, STEP_MS, PAUSE_MS = 250, 220, 900
-MAX_PLANS = 8  # an episode that needs more is cut off
+MAX_PLANS = 8  # an episode that needs more is cut off, of plans that are executed whole
 
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
@@ -24,17 +24,21 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     level = levels.find_level(run.domain.level)
     frames: list[Frame] = []
     for level_seed in seeds:
-        frames += episode_frames(planner, level, level_seed, run.seed)
+        frames += episode_frames(planner, level, level_seed, run.seed, run.config.executed)
     save_animation(frames, path)
 
 
-def episode_frames(planner: Pretrained, level: Level, level_seed: int, seed: int) -> list[Frame]:
+def episode_frames(
+    planner: Pretrained, level: Level, level_seed: int, seed: int, executed: int | None = None
+) -> list[Frame]:
     """The frames of one episode with their durations in milliseconds."""
     adapter = BabyAIAdapter(level)
     frames: list[Frame] = []
     replan = step = 0
     context = planner.specification.context
-    for event in watched(adapter, planner, context, level_seed, seed, most=MAX_PLANS):
+    horizon = planner.specification.planner.horizon
+    most = MAX_PLANS * min(3, -(-horizon // (executed or horizon)))  # shorter ones, a few more
+    for event in watched(adapter, planner, context, level_seed, seed, executed, most):
         if isinstance(event, Plan):
             replan += 1
             trace = np.asarray(event.trace[0])

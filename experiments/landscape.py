@@ -75,13 +75,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def report(options: Options, interruption: Interruption) -> None:
     """Trains with each preset; the table, the file and the figure of what was found."""
     check_counts(options, "trajectories")
+    if options.steps is not None:
+        check_counts(options, "steps")
+    if not options.presets:
+        raise UserError("--presets: name at least one, such as leapjax")
     console = Console()
     wanted = []
     for preset in options.presets:
         config = configs.preset("babyai", options.level, "leap", preset)
         if options.steps is not None:
             config = configs.with_options(config, {"steps": options.steps})
-        config = dataclasses.replace(config, seeds=(options.seed,), runs=options.runs)
+        # What is watched is part of a run: one of another count is another run.
+        runs = options.runs / f"landscape-{options.trajectories}"
+        config = dataclasses.replace(config, seeds=(options.seed,), runs=runs)
         configs.check(config)
         wanted.append(config)
     runtime.start()

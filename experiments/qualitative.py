@@ -87,6 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def draw(options: Options, interruption: Interruption) -> None:
     """Both figures."""
+    seeds.test_seeds(options.test_seed, MOST_LEVELS)
+    seeds.training_seeds(options.seed)
     runtime.start()
     work = Work(
         properties.ANALYSIS,

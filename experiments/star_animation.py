@@ -1,4 +1,4 @@
-"""The way through star graphs being found, by two planners side by side, as an animated GIF."""
+"""The way through star graphs being found, by planners side by side, as an animated GIF."""
 
 import dataclasses
 import math
@@ -29,14 +29,16 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     """Draws the passes over one graph per level seed; nothing for methods of one action."""
     if not searches(run.config):
         return
+    horizon, fills = run.config.planner.horizon, planner.energy.accepts_mask
+    shown = [s for s in SEARCHES if s.name in SHOWN and s.passes == 1]
+    chosen = {s.name: s.of(horizon) for s in shown if fills or "fill" not in s.options}
     star = find_level(run.domain.level)
-    chosen = {s.name: s.of(star.length) for s in SEARCHES if s.name in SHOWN and s.passes == 1}
     plans = {
         name: compile_planner(
-            planner.energy, dataclasses.replace(run.config.planner, **chosen[name]),
+            planner.energy, dataclasses.replace(run.config.planner, **options),
             (1,), jax.devices()[:1],
         )
-        for name in SHOWN
+        for name, options in chosen.items()
     }  # fmt: skip
     frames: list[Frame] = []
     for seed in seeds:
@@ -126,7 +128,7 @@ def picture(
     known = [str(node) if node in places else "?" for node in plan.tolist()]
     pen.text((6, side + 4), f"{name}: pass {len(trace)}", fill=BLACK)
     way = f"from {int(graph.node)} to {int(graph.goal)}: {' '.join(known)}"
-    right = bool((plan == path).all())
+    right = np.array_equal(plan, path[: len(plan)])
     pen.text(
         (6, side + 22), f"{way}   {'found' if right else 'wrong'}" if last else way, fill=BLACK
     )

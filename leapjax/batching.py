@@ -73,6 +73,7 @@ class CompiledPlanner:
             ValueError: no contexts, or not as many as keys.
             NotANumber: the energy of some action was NaN.
         """
+        keys = keys if hasattr(keys, "dtype") else jnp.stack(list(keys))
         typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
         if keys.ndim != (1 if typed else 2):
             raise ValueError(
@@ -200,6 +201,8 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
         replans: `[B]` how many plans the episode has had.
     """
     batch = len(episodes)
+    if batch == 0:
+        return np.zeros((0, 2), np.uint32)
     # Padded to a power of two, so that a shrinking batch does not compile at every size.
     rows = np.minimum(np.arange(1 << max(batch - 1, 0).bit_length()), batch - 1)
     folded = np.stack([episodes, replans]).astype(np.uint32)[:, rows]

@@ -41,7 +41,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
         check_path(folder)
-        self._folder = folder.absolute()
+        self._folder = folder.resolve()  # TensorStore reads no path with ".." in it
         self._identity = identity
         self._keep = keep
         if processes.is_first():
@@ -165,10 +165,10 @@ def check_path(folder: Path) -> None:
     Raises:
         UserError: says why.
     """
-    found = [text for text in UNUSABLE if text in str(folder.absolute())]
+    found = [text for text in UNUSABLE if text in str(folder.resolve())]
     if found:
         raise UserError(
-            f"{folder.absolute()} cannot hold checkpoints, because of {found[0]!r} in its name: "
+            f"{folder.resolve()} cannot hold checkpoints, because of {found[0]!r} in its name: "
             "choose another folder"
         )
 
@@ -190,7 +190,7 @@ def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
         raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
     reasons = []
     for step in steps:
-        path = folder.absolute() / str(step)
+        path = folder.resolve() / str(step)
         try:
             target = _sealed({"params": _blank(like)}, identity)
             wanted = ("params/", "digests/params/", "identity/")

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from leapjax.environments import Adapter
@@ -86,8 +87,9 @@ class Domain(NamedTuple):
 
     level: str  # its name
     make_adapter: Callable[[], Adapter]
-    collect: Callable[[int, int, Callable[[int], None]], Collection]
-    # (count, training seed, progress) -> so many demonstrations; UserError if there are none
+    collect: Callable[[int, int, Callable[[int], None]], Collection] | None
+    # (count, training seed, progress) -> so many demonstrations; UserError if there are none. None:
+    # nobody here demonstrates it
     actions: tuple[str, ...]  # names; the last is the end action
     max_steps: int  # of the longest episode
     blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
@@ -164,6 +166,12 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
         )
     expected, found = jax.tree.leaves_with_path(blank), jax.tree.leaves(context)
     for (path, leaf), given in zip(expected, found, strict=True):
+        numbers = jnp.result_type(given)
+        if jnp.issubdtype(numbers, jnp.inexact) and not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            raise UserError(
+                f"the context{jax.tree_util.keystr(path)} has numbers of type {numbers}, but this "
+                f"network was made for {leaf.dtype}"
+            )
         if np.shape(given) != leaf.shape:
             raise UserError(
                 f"the context{jax.tree_util.keystr(path)} has shape {np.shape(given)}, but this "

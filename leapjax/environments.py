@@ -16,6 +16,7 @@ class Transition(NamedTuple):
     truncated: bool
     success: bool  # by the environment's own measure
     score: float | None = None  # what counts in the end, where that is not the reward
+    taken: int | None = None  # the action that was executed, where it is another than asked for
 
     @property
     def counted(self) -> float:
@@ -87,5 +88,5 @@ class GymnasiumAdapter:
         if self._threshold is None:
             success = terminated and reward > 0
         else:
-            success = (terminated or truncated) and self._return >= self._threshold
+            success = self._return >= self._threshold  # so far: it counts once all is over
         return Transition(observation, reward, terminated, truncated, bool(success))

@@ -113,6 +113,8 @@ def compile_rollout(
     def rollout(params: Params, seeds: Sequence[int], seed: int = 0) -> Episodes:
         begun = time.perf_counter()
         level_seeds = np.asarray(seeds)
+        if not level_seeds.size:
+            raise ValueError("no seeds: there is no episode to play")
         played = jax.device_get(many(params, level_seeds.astype(np.uint32), jax.random.key(seed)))
         if not played.valid.all():
             raise ValueError(
@@ -137,7 +139,7 @@ def _advanced(context: Context, action: jax.Array, found: Transition) -> Context
     return Context(
         found.observation,
         jax.tree.map(shifted, context.past, context.observation),
-        shifted(context.actions, action),
+        shifted(context.actions, action if found.taken is None else jnp.asarray(found.taken)),
         shifted(context.rewards, found.reward),
         context.step + 1,
         context.return_so_far + found.reward,

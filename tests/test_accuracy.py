@@ -1,5 +1,6 @@
 """How much of demonstrations a model knows: against a model whose answers are known."""
 
+import json
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -130,6 +131,15 @@ def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch,
     assert "not a checkpoint" in capsys.readouterr().err
     assert accuracy.main([str(untrained_run(tmp_path / "other", "--method", "random"))]) == 2
     assert "only leap masks actions" in capsys.readouterr().err
+
+
+def test_what_nobody_demonstrates_has_nothing_to_compare_with(tmp_path, capsys):
+    run = untrained_run(tmp_path)
+    specification = json.loads((run / "specification.json").read_text())
+    changed = {"domain": "gymnasium", "level": "CartPole-v1", "domain_settings": {}}
+    (run / "specification.json").write_text(json.dumps(specification | changed))
+    assert accuracy.main([str(run)]) == 2
+    assert "CartPole-v1, which nobody here demonstrates" in capsys.readouterr().err
 
 
 def test_no_run_is_an_error(capsys):

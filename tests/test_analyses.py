@@ -219,6 +219,9 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
     assert landscape.main([*arguments, "--trajectories", "0"]) == 2
+    assert landscape.main([*arguments, "--steps", "0"]) == 2
+    assert landscape.main(["--presets"]) == 2
+    assert json.loads((place / "runs" / "landscape.json").read_text()) == [found]  # still there
 
 
 def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):

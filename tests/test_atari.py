@@ -1,5 +1,6 @@
 import functools
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -329,15 +330,50 @@ def test_collecting_goes_on_where_it_was_stopped(collected):
     logs = replay.replay_logs(folder, BREAKOUT, 1)
     shard = logs / "$store$_observation_ckpt.0.gz"
     before, when = shard.read_bytes(), shard.stat().st_mtime_ns
-    assert collect.is_whole(folder, BREAKOUT, 900)
-    assert not collect.is_whole(folder, BREAKOUT, 100_000)
-    assert not collect.is_whole(folder, PONG, 900)
+    assert collect.is_whole(folder, BREAKOUT, 900, 1, 80)
+    assert not collect.is_whole(folder, BREAKOUT, 100_000, 1, 80)
+    assert not collect.is_whole(folder, PONG, 900, 1, 80)
     assert atari.main(arguments) == 0
     assert shard.stat().st_mtime_ns == when  # nothing was left to do
     (logs / "manifest.0.json").unlink()  # as if it had been killed before its end
-    assert not collect.is_whole(folder, BREAKOUT, 900)
+    assert not collect.is_whole(folder, BREAKOUT, 900, 1, 80)
     assert atari.main(arguments) == 0
     assert shard.stat().st_mtime_ns > when and shard.read_bytes() == before
+
+
+def test_what_others_have_made_is_not_replaced(collected, tmp_path, capsys):
+    folder, arguments = collected
+    theirs = replay.replay_logs(tmp_path, BREAKOUT, 1)
+    theirs.mkdir(parents=True)
+    for path in replay.replay_logs(folder, BREAKOUT, 1).glob("*.gz"):
+        shutil.copy(path, theirs)
+    assert atari.main([*arguments, "--folder", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "holds files that were not made here" in error and error.count("\n") == 1
+    assert collect.shards(tmp_path, BREAKOUT, 100, 1) is None
+    assert not list(theirs.glob("manifest*"))
+
+
+def test_games_of_another_length_are_not_taken_for_those_asked_for(collected, capsys):
+    _, arguments = collected
+    assert atari.main([*arguments, "--longest", "90"]) == 2
+    assert "cut off after 80 decisions, not after 90" in capsys.readouterr().err
+
+
+def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path):
+    folder, _ = collected
+    copy = tmp_path / "atari"
+    shutil.copytree(folder, copy)
+    wanted = collect.shards(copy, BREAKOUT, 100, 1)
+    assert wanted == range(1) and collect.shards(copy, BREAKOUT, 10_000, 1) is None
+    found = domain.source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
+    (logs := replay.replay_logs(copy, BREAKOUT, 1)) and shutil.rmtree(logs.parent / "leapjax")
+    for path in logs.glob("*_ckpt.0.gz"):  # half a file that nobody asks for
+        if "action" in path.name:
+            shutil.copy(path, logs / path.name.replace(".0.", ".9."))
+    again = domain.source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
+    lengths = [[len(d.actions) for d in each.demonstrations] for each in (found, again)]
+    assert lengths[0] == lengths[1]
 
 
 def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys, quick_begin):

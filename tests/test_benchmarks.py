@@ -123,6 +123,13 @@ def test_the_benchmark_of_games_refuses_to_write_what_it_does_not_measure(tmp_pa
     assert "--no-training" in capsys.readouterr().err and not rows.exists()
 
 
+def test_what_cannot_be_drawn_or_measured_is_refused_before_anything_is(tmp_path, capsys):
+    assert planning.main(["--plot", str(tmp_path / "plot.foo")]) == 2
+    assert "a figure can be" in capsys.readouterr().err
+    assert atari.main(["--run", "7", "--presets", "paper"]) == 2
+    assert "--run 7: a batch of 64 windows is not made of runs of 7" in capsys.readouterr().err
+
+
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):
     assert training.main(["--levels", "Nowhere"]) == 2
     assert "Nowhere" in capsys.readouterr().err

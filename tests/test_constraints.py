@@ -191,9 +191,15 @@ def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
         assert int(steps_to(jnp.array(start), jnp.array(cell))) == fewest
 
 
-def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal():
-    """As the world decides: it ends at the goal, and forgets a cell that was visited."""
-    adapter, rng = WatchedErrand("GoToVia", FEW_TURNS), np.random.default_rng(0)
+@pytest.mark.parametrize(
+    ("level", "budget"), [("GoToVia", FEW_TURNS), ("GoToViaDetour", DETOUR_TURNS)]
+)
+def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal(level, budget):
+    """As the world decides: it ends at the goal, and forgets a cell that was visited.
+
+    Among several things that are alike each is the goal.
+    """
+    adapter, rng = WatchedErrand(level, budget), np.random.default_rng(0)
     distance, early = jax.jit(steps_to_visit), jax.jit(goal_before_visit)
     outcomes = set()
     for seed in range(40):

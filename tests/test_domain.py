@@ -121,6 +121,9 @@ def test_contexts_of_another_domain_are_refused():
     with pytest.raises(UserError, match=r"context\.past has shape \(3,\), but .* \(1,\)"):
         leap.domain.check_context(blank, lake, 1)
     leap.domain.check_context(jax.tree.map(np.asarray, blank), lake, 3)
+    scaled = blank._replace(observation=np.float32(0.5))
+    with pytest.raises(UserError, match=r"context\.observation has numbers of type float32"):
+        leap.domain.check_context(scaled, lake, 3)
 
 
 def test_unknown_names_are_one_line():

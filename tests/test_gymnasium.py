@@ -132,6 +132,8 @@ def test_success_is_what_the_environment_says_or_the_user():
     # CartPole's authors ask for a return of 475: to fall is no success, though it is rewarded.
     assert not any(play(make("CartPole-v1", Settings()), [0] * 11))
     assert any(play(make("CartPole-v1", Settings(success_return=5.0)), [0] * 11))
+    # What is given up by the rollout is judged by what it had until then.
+    assert play(make("CartPole-v1", Settings(success_return=2.0)), [0] * 3)[:2] == [False, True]
     short = make("Corridor-v0", Settings(max_steps=2))
     assert short.max_steps == 2 and make("Endless-v0", Settings(max_steps=7)).max_steps == 7
     adapter = short.make_adapter()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from experiments import babyai
 from experiments.common import results, run, runtime
 from experiments.common.interruption import SIGNALS, Interrupted, interruptible
 from experiments.common.progress import Meter
-from leapjax.checkpoints import Checkpoints
+from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, write_text
 from leapjax.types import TrainState
@@ -169,6 +170,17 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path):
     saved.close()
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 3
     assert (tmp_path / "checkpoints" / "3.damaged").is_dir()
+
+
+def test_a_path_that_goes_up_is_the_folder_that_it_leads_to(tmp_path):
+    (tmp_path / "below").mkdir()
+    roundabout = tmp_path / "below" / ".." / "checkpoints"
+    saved = Checkpoints(roundabout)
+    saved.save(state(1))
+    saved.close()
+    assert int(Checkpoints(roundabout).restore(state(0)).step) == 1
+    like = jax.eval_shape(lambda: state(0)).params
+    np.testing.assert_array_equal(restore_params(roundabout, like)["w"], 1.0)
 
 
 def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):

@@ -1123,7 +1123,15 @@ def test_contexts_of_words_are_refused():
         batched(CONFIGS["gibbs"])(TABLE, keys, {**contexts, "mission": np.array(["go", "stay"])})
 
 
+def test_keys_may_be_a_list():
+    keys, contexts = batch_of(2)
+    plan = batched(CONFIGS["gibbs"])
+    found = plan(TABLE, [*keys], contexts)
+    np.testing.assert_array_equal(found.actions, plan(TABLE, keys, contexts).actions)
+
+
 def test_no_contexts_are_refused():
+    assert plan_keys(0, np.arange(0), np.arange(0)).shape == (0, 2)
     keys, contexts = batch_of(2)
     with pytest.raises(ValueError, match="no contexts"):
         batched(CONFIGS["gibbs"])(TABLE, keys[:0], {"tilt": contexts["tilt"][:0]})

@@ -305,6 +305,24 @@ def test_an_episode_is_a_success_only_where_the_environment_says_so():
     assert late.plans == np.ceil(LIMIT / HORIZON)
 
 
+class Slippery(Corridor):
+    """Goes left, whatever it is asked for, and says so."""
+
+    def step(self, action: int) -> Transition:
+        return super().step(LEFT)._replace(taken=LEFT)
+
+
+def test_a_context_remembers_what_was_executed():
+    """As demonstrations do, not what was asked for."""
+
+    def right_until_it_went_left(params, context):
+        return jnp.full(HORIZON, jnp.where(context.actions[-1] == LEFT, END, RIGHT))
+
+    plan = compiled(scripted_energy(right_until_it_went_left))
+    played = leap.evaluate(Slippery, [5], plan, None, context=1, executed=1)
+    assert played.lengths.tolist() == [1]
+
+
 class Scored(Corridor):
     """Counts ten for each step; what a planner sees stays the reward."""
 
@@ -497,7 +515,9 @@ def test_success_is_a_return_where_one_is_asked_for():
         while not steps[-1].terminated:
             steps.append(adapter.step(0))
         assert 8 <= len(steps) < 100 and steps[-1].reward > 0
-        assert steps[-1].success == succeeds and not any(step.success for step in steps[:-1])
+        assert steps[-1].success == succeeds
+        so_far = [asked is not None and count >= asked for count in range(1, len(steps) + 1)]
+        assert [step.success for step in steps] == so_far
 
 
 def test_evaluation_in_a_gymnasium_environment():

@@ -1,5 +1,7 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +10,11 @@ from PIL import Image
 
 from experiments import star_animation, stars
 from experiments.common import results, searches
-from experiments.common.config import preset
+from experiments.common.config import preset, with_options
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -215,6 +218,20 @@ def test_nodes_are_drawn_apart_and_in_the_picture(star):
     assert apart.min() > 2 * star_animation.RADIUS
     assert (places > star_animation.RADIUS).all()
     assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
+
+
+def test_what_judges_no_open_plan_is_animated_without_filling(tmp_path):
+    """And plans that are shorter than the way are, too."""
+    star = Star(2, 3)
+    short = {"horizon": 2, "iterations": 2}
+    config = with_options(preset("stars", "Star2x3", "classifier", "leapjax"), short)
+    num_actions = StarAdapter(star).num_actions
+    energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
+    run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)
+    planner = SimpleNamespace(energy=energy, params=(), specification=SimpleNamespace(context=0))
+    star_animation.animate(planner, run, [0], tmp_path / "plan.gif")
+    with Image.open(tmp_path / "plan.gif") as animation:
+        assert animation.width == star_animation.side_of(star)  # one planner
 
 
 def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):

@@ -194,6 +194,41 @@ def test_the_energy_of_the_rules_counts_what_breaks_them():
     assert np.isinf(energy.total((), memory, jnp.asarray(changed - 1)))
 
 
+@pytest.mark.parametrize("horizon", [16, 5])
+def test_the_rules_continue_a_board_from_its_next_cell(horizon):
+    """As the plan of the whole board does there, of which a part is written already."""
+    energy, rng = rules(4), np.random.default_rng(0)
+    clues, solution = boards.draw(SMALL, 0)
+    context = blank_context(make("Sudoku4x6", Settings()), 0)
+
+    def memory(digits, cell):
+        board = context.observation._replace(digits=digits, cell=np.int32(cell))
+        return energy.encode((), context._replace(observation=board))
+
+    at = 7
+    written = np.where(np.arange(16) < at, solution, clues)
+    plan = rng.integers(0, 4, 16)
+    plan[:at] = solution[:at] - 1
+    plan[at + horizon :] = 5  # not planned: MASK
+    rest = np.concatenate([plan[at:], np.full(16, 5)])[:horizon]
+    on_board = np.arange(min(horizon, 16 - at))
+    whole = energy.conditional((), memory(clues, 0), jnp.asarray(plan), jnp.asarray(at + on_board))
+    found = energy.conditional((), memory(written, at), jnp.asarray(rest), jnp.arange(horizon))
+    np.testing.assert_allclose(found[: len(on_board)], whole)
+    for past in np.asarray(found[len(on_board) :]):  # the board is full
+        np.testing.assert_array_equal(past, [0.0] * 4 + [np.inf])
+    right = np.zeros(horizon, int)
+    right[: len(on_board)] = (solution - 1)[at : at + horizon]
+    assert float(energy.total((), memory(written, at), jnp.asarray(right))) == 0
+    first = int(np.flatnonzero(written[at : at + horizon] == 0)[0])
+    wrong = right.copy()
+    wrong[first] = (right[first] + 1) % 4
+    board = written.copy()
+    board[at : at + horizon] = (wrong + 1)[: len(on_board)]
+    total = float(energy.total((), memory(written, at), jnp.asarray(wrong)))
+    assert total == pytest.approx(4.0 * broken(board, 4)) and total > 0
+
+
 def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     domain = make("Sudoku4x6", Settings())
     drawn = [boards.draw(SMALL, seed) for seed in range(40)]
@@ -262,6 +297,12 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
     assert sudoku.main([*toy, "--method", "rules"]) == 0
+    # Planned anew after every few digits, and only as far: the rules go on where the board is.
+    again = ["--executed", "4", "--runs", "again"]
+    for less in ([], ["--horizon", "5", "--iterations", "5"]):
+        assert sudoku.main([*toy, "--method", "rules", *again, *less]) == 0
+    whole, short = results.read(tmp_path / "again" / "sudoku.jsonl")[::2]
+    assert whole["successes"] >= 6 and short["successes"] >= 3
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
     found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
     assert found == [

@@ -149,6 +149,7 @@ def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
         adapter.reset(seed)
         for action in rng.integers(0, END, 100).tolist():
             transition = adapter.step(action)
+            assert transition.taken == adapter.taken
             asked[action] += 1
             slipped[action, adapter.taken] += 1
             if transition.terminated or transition.truncated:

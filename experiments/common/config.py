@@ -241,6 +241,9 @@ def check(config: AnyConfig) -> None:
             f"use --level {recorded}"
         )
     domain = make_domain(config)
+    made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
+    if made and domain.collect is None and domain.source is None:
+        raise UserError(storage.no_demonstrator(domain))
     if not 0 <= config.rules < float("inf"):  # false for NaN too
         raise UserError(f"--rules must be a number, at least 0, got {config.rules}")
     if config.rules and domain.rules is None:

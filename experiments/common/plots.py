@@ -10,12 +10,14 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from experiments.common.results import Row
 from leapjax import files, scores
+from leapjax.errors import UserError
 
 
 def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
@@ -31,7 +33,7 @@ def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
         axis.plot(steps, values)
         axis.set(ylabel=name.replace("_", " "), yscale="log" if min(values) > 0 else "linear")
     axes[-1, 0].set_xlabel("step")
-    _save(figure, path)
+    save(figure, path)
 
 
 def success_by_iteration(
@@ -54,7 +56,7 @@ def success_by_iteration(
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     axis.set(xlabel="iterations", ylabel="success (%), 95% interval", title=title)
     axis.set_ylim(0, 101)
-    _save(figure, path)
+    save(figure, path)
 
 
 def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
@@ -86,7 +88,7 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         [drawn[label] for label in labels], [label.replace("`", "") for label in labels],
         loc="outside lower center", fontsize=8, ncols=columns,
     )  # fmt: skip
-    _save(figure, path)
+    save(figure, path)
 
 
 def methods_by_level(
@@ -111,7 +113,7 @@ def methods_by_level(
     if rates:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    _save(figure, path)
+    save(figure, path)
 
 
 def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
@@ -129,7 +131,7 @@ def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
     axis.set(xlim=(0, 102))
     axis.set_xlabel("interquartile mean of success (%), and its 95% interval", fontsize=9)
     axis.grid(axis="x", alpha=0.3)
-    _save(figure, path)
+    save(figure, path)
 
 
 def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -161,7 +163,7 @@ def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
         right.set(xlabel="passes N", ylabel="energy", yscale="log")
         right.set_title("of plans being refined", fontsize=9)
         right.legend(fontsize=7)
-    _save(figure, path)
+    save(figure, path)
 
 
 def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
@@ -184,7 +186,7 @@ def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) ->
         axis.set(xlabel="reward", xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
         axis.set_title(f"{name}: rank correlation {each['correlation']:.2f}", fontsize=9)
     axes[0][0].set_ylabel("energy")
-    _save(figure, path)
+    save(figure, path)
 
 
 def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
@@ -202,7 +204,19 @@ def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Ax
     return figure, list(axes.flat)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def check_kind(path: Path) -> None:
+    """Refuses, before anything is measured, a file of a kind that no figure can be.
+
+    Raises:
+        UserError: names the kinds.
+    """
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix.removeprefix(".") not in known:
+        raise UserError(f"{path}: a figure can be {', '.join(sorted(known))}")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure, atomically, and lets go of it."""
     try:
         with files.whole(path) as scratch:
             figure.savefig(scratch, dpi=120)

@@ -26,6 +26,7 @@ SHARD = 1_000  # transitions of a file, at least: what a killed program loses at
 GAMES = 1_000  # of a file, at most
 BYTES = 200  # of a transition on the disk, more or less
 POLL = 0.2  # seconds
+MARK = ".made-by-leapjax"  # in a folder whose files may be replaced
 
 Manifest = dict[str, Any]
 
@@ -52,14 +53,18 @@ def collect(
 
     Returns:
         What is in each file: its games, with their scores.
+
+    Raises:
+        UserError: there are files of somebody else, or games of another length.
     """
     logs = replay.replay_logs(folder, game, run)
     workers = workers or len(os.sched_getaffinity(0))
     with files.only_process_in(logs):
+        _claim(logs)
         files.check_room(logs, transitions * BYTES)
-        made = _made(logs, transitions)
+        made = _made(logs, transitions, longest)
         if _count(made) < transitions:  # else no process needs to be started
-            waiting = (number for number in itertools.count() if _known(logs, number) is None)
+            waiting = (n for n in itertools.count() if _known(logs, n, longest) is None)
             # Not forked: this process may run threads.
             with multiprocessing.get_context("spawn").Pool(workers, _ignore_interrupts) as pool:
                 running: list[AsyncResult[Manifest]] = []
@@ -69,17 +74,38 @@ def collect(
                         shard = folder, game.name, run, next(waiting), longest
                         running.append(pool.apply_async(make_shard, shard))
                     time.sleep(POLL)
-                    made = _made(logs, transitions, made)
+                    made = _made(logs, transitions, longest, made)
                     progress(min(_count(made), transitions))
     progress(transitions)
     files.write_text(logs.parent / "manifest.json", json.dumps(made, indent=1) + "\n")
     return made
 
 
-def is_whole(folder: Path, game: Game, transitions: int, run: int = 1) -> bool:
+def is_whole(folder: Path, game: Game, transitions: int, run: int, longest: int) -> bool:
     """Whether `collect` has nothing left to do."""
-    made = _made(replay.replay_logs(folder, game, run), transitions)
+    made = _made(replay.replay_logs(folder, game, run), transitions, longest)
     return _count(made) >= transitions
+
+
+def shards(folder: Path, game: Game, transitions: int, run: int) -> range | None:
+    """The files that so many transitions are in, whatever else was made; None: not made here."""
+    made = _made(replay.replay_logs(folder, game, run), transitions)
+    return range(len(made)) if _count(made) >= transitions else None
+
+
+def _claim(logs: Path) -> None:
+    """Marks a folder as one to make files in; refuses one that somebody else's are in.
+
+    Raises:
+        UserError: they would be replaced.
+    """
+    theirs = [path.name for path in logs.glob("*_ckpt.*.gz")]
+    if theirs and not (logs / MARK).exists() and not any(logs.glob("manifest.*.json")):
+        raise UserError(
+            f"{logs} holds files that were not made here, such as {min(theirs)}: learn from them "
+            "with --demonstrations, or make others in another --folder"
+        )
+    files.write_text(logs / MARK, "")
 
 
 def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> Manifest:
@@ -103,7 +129,7 @@ def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> 
         )  # fmt: skip
     replay.write_shard(logs, number, played)
     manifest = {
-        "game": name, "run": run, "shard": number, "games": games,
+        "game": name, "run": run, "shard": number, "longest": longest, "games": games,
         "versions": {each: metadata.version(each) for each in ("leapjax", "ale-py", "numpy")},
     }  # fmt: skip
     # Last: a file without its manifest is made again.
@@ -115,8 +141,8 @@ def _manifest(logs: Path, number: int) -> Path:
     return logs / f"manifest.{number}.json"
 
 
-def _known(logs: Path, number: int) -> Manifest | None:
-    """What is in a file that was made here; None if it was not."""
+def _known(logs: Path, number: int, longest: int | None = None) -> Manifest | None:
+    """What is in a file that was made here, of games of some length; None if it was not."""
     path = _manifest(logs, number)
     if not path.exists() or not replay.has_shard(logs, number):
         return None
@@ -125,16 +151,27 @@ def _known(logs: Path, number: int) -> Manifest | None:
         _count([manifest])
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
+    found = manifest.get("longest", longest)
+    if longest is not None and found != longest:
+        raise UserError(
+            f"{logs} holds games that were cut off after {found} decisions, not after {longest}: "
+            "remove them, or name another folder"
+        )
     return manifest
 
 
-def _made(logs: Path, transitions: int, before: Sequence[Manifest] = ()) -> list[Manifest]:
+def _made(
+    logs: Path, transitions: int, longest: int | None = None, before: Sequence[Manifest] = ()
+) -> list[Manifest]:
     """What is in the files that were made here, up to so many transitions, or to a gap.
 
     `before` are those that are known already.
     """
     made = list(before)
-    while _count(made) < transitions and (manifest := _known(logs, len(made))) is not None:
+    while _count(made) < transitions:
+        manifest = _known(logs, len(made), longest)
+        if manifest is None:
+            break
         made.append(manifest)
     return made
 

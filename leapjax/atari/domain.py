@@ -74,7 +74,7 @@ def make(name: str, settings: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        collect=functools.partial(no_episodes, name),
+        collect=None,  # by transitions, not by episodes: see `source`
         actions=(*game.actions, "end"),
         max_steps=settings.max_steps,
         blank=np.zeros((HEIGHT, WIDTH), np.uint8),
@@ -88,34 +88,26 @@ def make(name: str, settings: Settings) -> Domain:
 
 def source(game: Game, settings: Settings) -> Source:
     """Where the trajectories of a game come from."""
+    count, run = settings.transitions, settings.replay_run
 
     def load(where: str, seed: int) -> Collection:
-        return replay.read(Path(where), game, settings.transitions, seed, settings.replay_run)
+        from leapjax.atari.collect import shards  # noqa: PLC0415  (ale-py is optional)
+
+        ours = shards(Path(where), game, count, run)
+        return replay.read(Path(where), game, count, seed, run, ours)
 
     def write(where: str, progress: Callable[[int], None]) -> str:
         from leapjax.atari.collect import collect  # noqa: PLC0415  (so)
 
-        count, run = settings.transitions, settings.replay_run
         collect(Path(where), game, count, run, LONGEST, progress=progress)
         return f"{count} transitions of {game.name} in {where}"
 
     def exists(where: str) -> bool:
         from leapjax.atari.collect import is_whole  # noqa: PLC0415  (so)
 
-        return is_whole(Path(where), game, settings.transitions, settings.replay_run)
+        return is_whole(Path(where), game, count, run, LONGEST)
 
-    return Source(FOLDER, exists, write, load, settings.transitions, "transitions")
-
-
-def no_episodes(name: str, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
-    """Games are played by the transition, not by the episode: see `source`.
-
-    Raises:
-        UserError: always.
-    """
-    raise UserError(
-        f"{name} is not collected by episodes: python -m experiments.atari collect --game {name}"
-    )
+    return Source(FOLDER, exists, write, load, count, "transitions")
 
 
 # By game: T, N and the batch (paper, tables 6 and 8).

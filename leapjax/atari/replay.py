@@ -147,7 +147,14 @@ def _write_header(file: IO[bytes] | gzip.GzipFile, dtype: np.dtype, shape: tuple
     np.lib.format.write_array_header_1_0(file, header)
 
 
-def read(folder: Path, game: Game, transitions: int, seed: int, run: int = 1) -> Collection:
+def read(
+    folder: Path,
+    game: Game,
+    transitions: int,
+    seed: int,
+    run: int = 1,
+    shards: Sequence[int] | None = None,
+) -> Collection:
     """Samples whole trajectories as the Decision Transformer's loader does.
 
     A random shard at a time gives up to ten trajectories, from where it was left before, until
@@ -164,6 +171,7 @@ def read(folder: Path, game: Game, transitions: int, seed: int, run: int = 1) ->
         transitions: so many at least, or all there are.
         seed: of the sampling.
         run: of the five that DQN-Replay has of each game.
+        shards: numbers of those to read; None for all that are there.
 
     Returns:
         The trajectories, in the order of the visits, and how many were cut in the shards that
@@ -178,7 +186,7 @@ def read(folder: Path, game: Game, transitions: int, seed: int, run: int = 1) ->
     if transitions < 1:
         raise UserError(f"transitions must be at least 1, got {transitions}")
     logs = _existing_logs(folder, game, run)
-    numbers = _complete_shards(logs)
+    numbers = _complete_shards(logs, shards)
     key = _key(logs, numbers, transitions, seed)
     places = _places(logs.parent)
     for place in places:
@@ -215,15 +223,15 @@ def _existing_logs(folder: Path, game: Game, run: int) -> Path:
     raise UserError(f"no run {run} of {game.name} in {folder}{only}; {expected}")
 
 
-def _complete_shards(logs: Path) -> list[int]:
-    """The numbers of the shards in a folder.
+def _complete_shards(logs: Path, wanted: Sequence[int] | None) -> list[int]:
+    """The numbers of the shards in a folder, or of those that are wanted.
 
     Raises:
         UserError: there are none, or a part of one is missing or empty.
     """
     pattern = rf"(?:{'|'.join(map(re.escape, _PARTS))})_ckpt\.(\d+)\.gz"
     found = (re.fullmatch(pattern, path.name) for path in logs.iterdir())
-    numbers = sorted({int(match[1]) for match in found if match})
+    numbers = sorted({int(match[1]) for match in found if match} if wanted is None else wanted)
     if not numbers:
         raise UserError(
             f"no shards in {logs}: expected files such as {_part(logs, _PARTS[-1], 0).name}"

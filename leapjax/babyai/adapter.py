@@ -52,4 +52,6 @@ class BabyAIAdapter:
             self.taken = int(self._random.choice([a for a in range(END) if a != action]))
         _, reward, terminated, truncated, _ = self.env.step(self.taken)
         success = bool(terminated and float(reward) > 0)
-        return Transition(self.observe(), float(reward), terminated, truncated, success)
+        return Transition(
+            self.observe(), float(reward), terminated, truncated, success, taken=self.taken
+        )

@@ -78,7 +78,8 @@ def clutter(
     """A window with objects where the demonstration never goes.
 
     The shortest way stays the shortest when others are blocked, so the demonstration stays as
-    good as it was; what changes is what it shows: that ways lead around things.
+    good as it was; what changes is what it shows: that ways lead around things. (Not where actions
+    are replaced by random ones: one in 200 windows then handles what was put there.)
 
     Half of the windows stay as they are; in the others each free cell gets an object with a
     probability that is drawn for the window, in 0 .. `share`. Kind and colour both differ from

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from leapjax.babyai import vocabulary
 from leapjax.babyai.adapter import END, TURNS
-from leapjax.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, faced, facing, roll, steps_to
+from leapjax.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, faced, roll, steps_to
 from leapjax.babyai.encoders import one_cell
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
@@ -63,7 +63,7 @@ def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
     marked = jnp.asarray(observation.grid)[..., 0] == FLOOR
     poses = roll(observation, actions)
     visited = jnp.cumsum(marked[poses[:, 0], poses[:, 1]]) > 0
-    early = (facing(poses, observation.goal) & ~visited)[1:].any()
+    early = (_at_goal(observation, poses) & ~visited)[1:].any()
     cell = jnp.stack(jnp.unravel_index(jnp.argmax(marked), marked.shape))
     far = jnp.where(visited[-1], 0, steps_to(poses[-1], cell)) + early * marked.size
     return jnp.where(marked.any(), far, 0).astype(jnp.float32)
@@ -107,7 +107,18 @@ def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
     observation = context.observation
     poses = roll(observation, actions[:1])
     left = (jnp.asarray(observation.grid)[..., 0] == FLOOR).any()
-    return (left & facing(poses[1:], observation.goal).any()).astype(jnp.float32)
+    return (left & _at_goal(observation, poses[1:]).any()).astype(jnp.float32)
+
+
+def _at_goal(observation: Observation, poses: jax.Array) -> jax.Array:
+    """`[n]` bool: at which of the poses `[n, 3]` an agent faces the goal, or a thing like it.
+
+    An instruction that names a kind and a colour is done at any such thing, not at the nearest.
+    """
+    grid, goal = jnp.asarray(observation.grid), jnp.asarray(observation.goal)
+    alike = (grid[..., :2] == grid[goal[0], goal[1], :2]).all(axis=-1) & (goal[0] >= 0)
+    x, y = faced(poses).T
+    return alike[x, y]
 
 
 def without_lava(context: Context) -> Context:

@@ -147,7 +147,7 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
                 break
             if random.random() < level.mistakes:
                 action = int(random.integers(END))
-            observation, reward, terminated, truncated, success, _ = adapter.step(action)
+            observation, reward, terminated, truncated, success = adapter.step(action)[:5]
             action = adapter.taken
             states.append(observation)
             actions.append(action)

@@ -57,11 +57,6 @@ def faced(poses: jax.Array) -> jax.Array:
     return poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
 
 
-def facing(poses: jax.Array, cell: jax.Array) -> jax.Array:
-    """`[n]` bool: at which of the poses `[n, 3]` an agent faces a cell `[2]`."""
-    return (faced(poses) == cell).all(axis=1)
-
-
 def steps_to(pose: jax.Array, cell: jax.Array) -> jax.Array:
     """`[]` int32: turns and moves from a pose `[3]` to a cell `[2]`, if nothing is in the way."""
     offset = jnp.asarray(cell) - pose[:2]

@@ -469,7 +469,7 @@ def neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Arr
     """The `(2 r + 1)^2 * C` features around a position, zero beyond the border."""
     padded = jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)))
     size = 2 * radius + 1
-    start = (position[0], position[1], 0)
+    start = (position[0], position[1], jnp.zeros_like(position[0]))  # of one type, in 64 bits too
     return jax.lax.dynamic_slice(padded, start, (size, size, image.shape[-1])).reshape(-1)
 
 

@@ -36,7 +36,7 @@ class Level:
     lava: int = 0  # cells, where the task has them
     slip: float = 0.0  # probability that a turn becomes one of the five other actions
     mistakes: float = 0.0  # share of a demonstrator's actions that are random ones
-    mislabelled: float = 0.0  # share of a demonstration's actions that are not what was done
+    mislabelled: float = 0.0  # share of a demonstration's actions that are replaced by random ones
 
 
 _GO_TO, _WITH_PLACE = 5, 9  # "go to the red ball", "pick up the red ball in front of you"
@@ -185,7 +185,8 @@ def longest_episode(level: Level, env: RoomGridLevel) -> int:
     MiniGrid's grows with the navigations that an instruction needs: 2 for each of 4 clauses.
     """
     navigations = 8 if level.sequence else 1
-    return navigations * env.room_size**2 * env.num_rows * env.num_cols
+    grows = navigations * env.room_size**2 * env.num_rows * env.num_cols
+    return max(env.max_steps or 0, grows)  # where the limit is not said beforehand it is 0
 
 
 def shortest_limit(env: RoomGridLevel) -> int:

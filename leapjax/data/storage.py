@@ -47,6 +47,8 @@ def source(domain: Domain, count: int, seed: int) -> Source:
 
     def make(name: str, progress: Callable[[int], None]) -> str:
         check_writable()
+        if domain.collect is None:
+            raise UserError(no_demonstrator(domain))
         collection = domain.collect(count, seed, progress)
         dropped = reasons(collection)
         summary = f"{count} demonstrations of {domain.level}"
@@ -68,6 +70,14 @@ def source(domain: Domain, count: int, seed: int) -> Source:
 
     default = dataset_id(domain, count, seed)
     return Source(default, exists, make, whole, count, "demonstrations")
+
+
+def no_demonstrator(domain: Domain) -> str:
+    """What to say where demonstrations would have to be made, and nobody can."""
+    return (
+        f"{domain.level} has no demonstrator: name a Minari data set of it with --dataset "
+        "(--demonstrations)"
+    )
 
 
 def observation_space(blank: PyTree) -> gym.Space:

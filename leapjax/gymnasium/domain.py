@@ -11,7 +11,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from leapjax.domain import Collection, Domain, DomainType
+from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError, check_at_least, did_you_mean, first_line
 from leapjax.gymnasium.observations import StateTokens, blank_of, check_choices, parts_of
@@ -139,7 +139,7 @@ def make(name: str, options: Settings) -> Domain:
         make_adapter=lambda: CheckedAdapter(
             make_environment(name, options), name, blank, options.success_return
         ),
-        collect=functools.partial(collect, name),
+        collect=None,
         actions=(*(str(action) for action in range(actions.n)), "end"),
         max_steps=_longest(env) or 0,
         blank=blank,
@@ -151,15 +151,6 @@ def make(name: str, options: Settings) -> Domain:
         },
         signature={"parts": [list(part) for part in parts]},
     )
-
-
-def collect(name: str, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
-    """There is no demonstrator of an environment that nobody here knows.
-
-    Raises:
-        UserError: always.
-    """
-    raise UserError(f"{name} has no demonstrator: name a Minari data set of it with --dataset")
 
 
 def preset(name: str, preset: str) -> Mapping[str, Any]:
