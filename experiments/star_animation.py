@@ -48,7 +48,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
         contexts = rollouts.stack_contexts([history])
         keys = plan_keys(run.seed, np.array([seed]), np.array([0]))
         traces = {
-            name: np.asarray(plan(planner.params, keys, contexts).trace[0])
+            name: np.asarray(plan(planner.params, keys, contexts).trace[0])[:, : star.length]
             for name, plan in plans.items()
         }
         frames += _frames(star, graph, adapter.path, traces)

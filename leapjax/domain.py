@@ -166,8 +166,10 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
         )
     expected, found = jax.tree.leaves_with_path(blank), jax.tree.leaves(context)
     for (path, leaf), given in zip(expected, found, strict=True):
-        numbers = jnp.result_type(given)
-        if jnp.issubdtype(numbers, jnp.inexact) and not jnp.issubdtype(leaf.dtype, jnp.inexact):
+        numbers = given.dtype if hasattr(given, "dtype") else np.result_type(given)
+        words = np.dtype(numbers).kind in "OSU"
+        inexact = [jnp.issubdtype(each, jnp.inexact) for each in (leaf.dtype, numbers)]
+        if words or inexact == [False, True]:
             raise UserError(
                 f"the context{jax.tree_util.keystr(path)} has numbers of type {numbers}, but this "
                 f"network was made for {leaf.dtype}"

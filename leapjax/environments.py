@@ -4,7 +4,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import gymnasium as gym
 
-from leapjax.types import PyTree
+from leapjax.types import Array, PyTree
 
 
 class Transition(NamedTuple):
@@ -17,6 +17,10 @@ class Transition(NamedTuple):
     success: bool  # by the environment's own measure
     score: float | None = None  # what counts in the end, where that is not the reward
     taken: int | None = None  # the action that was executed, where it is another than asked for
+
+    def executed(self, action: Array) -> Array:
+        """What was done when `action` was asked for."""
+        return action if self.taken is None else self.taken
 
     @property
     def counted(self) -> float:
@@ -88,5 +92,7 @@ class GymnasiumAdapter:
         if self._threshold is None:
             success = terminated and reward > 0
         else:
-            success = self._return >= self._threshold  # so far: it counts once all is over
+            # So far, for who ends it early; but what is lost on the way is known at the end alone.
+            over = terminated or truncated or self._threshold > 0
+            success = over and self._return >= self._threshold
         return Transition(observation, reward, terminated, truncated, bool(success))

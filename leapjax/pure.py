@@ -139,7 +139,7 @@ def _advanced(context: Context, action: jax.Array, found: Transition) -> Context
     return Context(
         found.observation,
         jax.tree.map(shifted, context.past, context.observation),
-        shifted(context.actions, action if found.taken is None else jnp.asarray(found.taken)),
+        shifted(context.actions, found.executed(action)),
         shifted(context.rewards, found.reward),
         context.step + 1,
         context.return_so_far + found.reward,

@@ -222,9 +222,8 @@ def evaluate(
                     break
                 transition = adapters[episode].step(int(action))
                 scores[episode] += transition.counted
-                taken = int(action) if transition.taken is None else transition.taken
                 histories[episode].advance(
-                    taken, transition.observation, transition.reward,
+                    transition.executed(int(action)), transition.observation, transition.reward,
                     None if encoded is None else encoded[row],
                 )  # fmt: skip
                 too_long = max_steps is not None and histories[episode].step >= max_steps

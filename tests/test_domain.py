@@ -124,6 +124,8 @@ def test_contexts_of_another_domain_are_refused():
     scaled = blank._replace(observation=np.float32(0.5))
     with pytest.raises(UserError, match=r"context\.observation has numbers of type float32"):
         leap.domain.check_context(scaled, lake, 3)
+    with pytest.raises(UserError, match=r"context\.observation has numbers of type <U2"):
+        leap.domain.check_context(blank._replace(observation=np.array("go")), lake, 3)
 
 
 def test_unknown_names_are_one_line():

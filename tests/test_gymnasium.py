@@ -62,14 +62,21 @@ class Grows(Corridor):
     trouble = "grows"
 
 
+class Odd(Corridor):
+    def __init__(self, way, lamp):
+        self.made_with = way, lamp
+
+
 @pytest.fixture(autouse=True, scope="module")
 def registered():
     kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows}
     for name, kind in kinds.items():
         gym.register(f"{name}-v0", f"tests.test_gymnasium:{kind.__name__}", max_episode_steps=12)
     gym.register("Endless-v0", "tests.test_gymnasium:Corridor")
+    odd = {"way": np.zeros(2), "lamp": {len}}  # nothing that JSON has
+    gym.register("Odd-v0", "tests.test_gymnasium:Odd", max_episode_steps=9, kwargs=odd)
     yield
-    for name in (*kinds, "Endless"):
+    for name in (*kinds, "Endless", "Odd"):
         del gym.registry[f"{name}-v0"]
 
 
@@ -134,6 +141,9 @@ def test_success_is_what_the_environment_says_or_the_user():
     assert any(play(make("CartPole-v1", Settings(success_return=5.0)), [0] * 11))
     # What is given up by the rollout is judged by what it had until then.
     assert play(make("CartPole-v1", Settings(success_return=2.0)), [0] * 3)[:2] == [False, True]
+    # What is asked of MountainCar is not to lose more than 110, which nobody has at the start.
+    assert not any(play(make("MountainCar-v0", Settings()), [1] * 20))
+    assert make("Odd-v0", Settings()).arguments is None
     short = make("Corridor-v0", Settings(max_steps=2))
     assert short.max_steps == 2 and make("Endless-v0", Settings(max_steps=7)).max_steps == 7
     adapter = short.make_adapter()
@@ -217,6 +227,9 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(tmp_path, monk
     asked = '{"map_name": "8x8", "is_slippery": false}'
     assert "recorded in FrozenLake-v1 with other arguments" in said
     assert f"--arguments '{asked}'" in said and said.count("\n") == 1
+    for other in ('{"is_slippery": false}', '{"map_name": "8x8"}'):  # and all are named again
+        assert program.main([*options, "--arguments", other]) == 2
+        assert f"--arguments '{asked}'" in capsys.readouterr().err
     assert program.main([*options, "--arguments", asked]) == 0
     assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [["choices", 64]]
     for wrong in ("[]", "{", "8x8"):
@@ -228,9 +241,9 @@ def test_choices_that_there_are_not_are_refused():
     several = spaces.Dict(one=spaces.Discrete(3, start=2), more=spaces.MultiDiscrete([2, 4]))
     good = {"one": np.array([2, 4]), "more": np.array([[0, 0], [1, 3]])}
     check_choices(several, good, "episode 0")
-    with pytest.raises(UserError, match="episode 0: one: choices from 1 to 4, expected 2 to 4"):
+    with pytest.raises(UserError, match="episode 0: one: a choice of 1, expected 2 to 4"):
         check_choices(several, {**good, "one": np.array([1, 4])}, "episode 0")
-    with pytest.raises(UserError, match="more: choices from 0 to 3"):
+    with pytest.raises(UserError, match="episode 0: more: a choice of 2, expected 0 to 1"):
         check_choices(several, {**good, "more": np.array([[0, 0], [2, 3]])}, "episode 0")
-    with pytest.raises(UserError, match="choices from 16 to 16, expected 0 to 15"):
+    with pytest.raises(UserError, match="a choice of 16, expected 0 to 15"):
         make("FrozenLake-v1", Settings()).check(np.array([16]), "episode 0")

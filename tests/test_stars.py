@@ -220,11 +220,12 @@ def test_nodes_are_drawn_apart_and_in_the_picture(star):
     assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
 
 
-def test_what_judges_no_open_plan_is_animated_without_filling(tmp_path):
-    """And plans that are shorter than the way are, too."""
+@pytest.mark.parametrize("horizon", [2, 5])
+def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
+    """And plans that are shorter or longer than the way are, too."""
     star = Star(2, 3)
-    short = {"horizon": 2, "iterations": 2}
-    config = with_options(preset("stars", "Star2x3", "classifier", "leapjax"), short)
+    other = {"horizon": horizon, "iterations": 2}
+    config = with_options(preset("stars", "Star2x3", "classifier", "leapjax"), other)
     num_actions = StarAdapter(star).num_actions
     energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
     run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)

@@ -47,7 +47,7 @@ def watched(
                 break
             transition = adapter.step(int(action))
             history.advance(
-                int(action), transition.observation, transition.reward,
+                transition.executed(int(action)), transition.observation, transition.reward,
                 None if encoded is None else encoded[0],
             )  # fmt: skip
             yield int(action), transition

@@ -211,7 +211,7 @@ def check_kind(path: Path) -> None:
         UserError: names the kinds.
     """
     known = FigureCanvasBase.get_supported_filetypes()
-    if path.suffix.removeprefix(".") not in known:
+    if path.suffix.removeprefix(".").lower() not in known:
         raise UserError(f"{path}: a figure can be {', '.join(sorted(known))}")
 
 

@@ -248,20 +248,23 @@ def _version(name: str) -> int | None:
 
 
 def _check_arguments(name: str, domain: Domain) -> None:
-    """Refuses data that were recorded in an environment of other arguments than is played.
+    """Refuses data of an environment that was made with other arguments than it is played with.
 
     Raises:
         UserError: says which, and how to have them.
     """
     if domain.arguments is None:
         return
-    played = {"render_mode": None, **domain.arguments}  # how it is looked at changes nothing
-    recorded = {**(described(name).arguments or {}), "render_mode": played["render_mode"]}
-    others = {key: value for key, value in recorded.items() if played.get(key) != value}
-    if others:
+    found = described(name).arguments
+    # How it is looked at changes nothing.
+    recorded, played = (
+        {key: value for key, value in given.items() if key != "render_mode"}
+        for given in (found or {}, domain.arguments)
+    )
+    if found is not None and recorded != played:
         raise UserError(
             f"{name} was recorded in {domain.level} with other arguments than it is played with: "
-            f"add --arguments '{json.dumps(others)}'"
+            f"give --arguments '{json.dumps(recorded)}'"
         )
 
 

@@ -113,7 +113,7 @@ def _arguments(env: gym.Env) -> Mapping[str, Any] | None:
     """What an environment was made with, as data sets say it; None: it cannot be said."""
     try:
         return json.loads(env.spec.to_json())["kwargs"] if env.spec is not None else None
-    except ValueError:  # arguments that are not JSON
+    except Exception:  # noqa: BLE001  (arguments that are not JSON raise many kinds)
         return None
 
 

@@ -77,11 +77,11 @@ def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
         first, last = space.start, space.start + space.nvec - 1
     else:
         return
-    if np.any(observations < first) or np.any(observations > last):
-        raise UserError(
-            f"{where}: choices from {np.min(observations)} to {np.max(observations)}, "
-            f"expected {np.min(first)} to {np.max(last)}"
-        )
+    wrong = (observations < first) | (observations > last)
+    if wrong.any():
+        at = tuple(np.argwhere(wrong)[0])
+        low, high = (np.broadcast_to(each, observations.shape)[at] for each in (first, last))
+        raise UserError(f"{where}: a choice of {observations[at]}, expected {low} to {high}")
 
 
 class StateTokens(nn.Module):
