@@ -65,6 +65,10 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     names, found = babyai.COMPARED, babyai.success_by_method(rows)
     plots.methods_by_level(found, names, tmp_path / "methods.png")
     plots.methods_by_level({}, names, tmp_path / "empty.png")
+    # All have their place and colour on every level, also where there are no rows of them.
+    everywhere = babyai.success_by_method([*rows, row("PickUpLoc", method="bc")])
+    whose = [list(each) for each in everywhere.values()]
+    assert len(whose) == 2 and whose[0] == whose[1] == ["the paper", *babyai.BY_METHOD]
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
 
 

@@ -97,7 +97,7 @@ def methods_by_level(
     """Success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
 
     Args:
-        rates: in percent by level, whose numbers they are, and method.
+        rates: in percent by level, whose numbers they are (the same everywhere), and method.
         names: of all methods, in order.
         path: to write.
     """

@@ -152,6 +152,8 @@ def methods(rows: Sequence[Row]) -> str:
         cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
         lines.append([level, "the paper", *_compared(theirs, cells)])
         for preset, by_method in by_preset.items():
+            if not by_method:
+                continue
             ours = {name: mean_rate(of) for name, of in by_method.items()}
             cells = {name: rate(of) for name, of in by_method.items()}
             lines.append([level, preset, *_compared(ours, cells)])
@@ -179,7 +181,7 @@ def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Ro
             for preset, settings in BY_METHOD.items()
         }
         if any(name in by_method for by_method in by_preset.values() for name in BASELINES):
-            found[level] = {preset: of for preset, of in by_preset.items() if of}
+            found[level] = by_preset
     return found
 
 
@@ -225,7 +227,7 @@ def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
     for level, by_preset in rows_by_method(rows).items():
         first = {
             name: cell(row)
-            for name, every in by_preset.get("preset leapjax", {}).items()
+            for name, every in by_preset["preset leapjax"].items()
             for row in every
             if row["seed"] == 0
         }
