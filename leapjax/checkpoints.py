@@ -41,7 +41,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
         check_path(folder)
-        self._folder = folder.resolve()  # TensorStore reads no path with ".." in it
+        self._folder = _absolute(folder)
         self._identity = identity
         self._keep = keep
         if processes.is_first():
@@ -159,16 +159,21 @@ class Checkpoints:
             ) from None
 
 
+def _absolute(folder: Path) -> Path:
+    """The same folder, by a path that TensorStore reads, which it does not if there is a ".."."""
+    return folder.resolve() if ".." in folder.parts else folder.absolute()
+
+
 def check_path(folder: Path) -> None:
     """Refuses a folder in which checkpoints would not be found again.
 
     Raises:
         UserError: says why.
     """
-    found = [text for text in UNUSABLE if text in str(folder.resolve())]
+    found = [text for text in UNUSABLE if text in str(_absolute(folder))]
     if found:
         raise UserError(
-            f"{folder.resolve()} cannot hold checkpoints, because of {found[0]!r} in its name: "
+            f"{_absolute(folder)} cannot hold checkpoints, because of {found[0]!r} in its name: "
             "choose another folder"
         )
 
@@ -190,7 +195,7 @@ def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
         raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
     reasons = []
     for step in steps:
-        path = folder.resolve() / str(step)
+        path = _absolute(folder) / str(step)
         try:
             target = _sealed({"params": _blank(like)}, identity)
             wanted = ("params/", "digests/params/", "identity/")
