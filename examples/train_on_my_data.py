@@ -22,22 +22,23 @@ from leapjax.training import make_train_step, train
 steps, episodes = (int(given) for given in (sys.argv[1:] + ["600", "20"][len(sys.argv) - 1 :]))
 
 # Data: somebody's, or of a rule that balances the pole.
-env = DataCollector(gymnasium.make("CartPole-v1"))
-for seed in range(0 if storage.exists("mine/cartpole-v0") else 20):
-    (x, speed, angle, turning), _ = env.reset(seed=seed)
-    over = False
-    while not over:
-        push = int(angle + 0.5 * turning + 0.05 * x + 0.1 * speed > 0)
-        (x, speed, angle, turning), _, fallen, out_of_time, _ = env.step(push)
-        over = fallen or out_of_time
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # it would like to know who we are
-    if not storage.exists("mine/cartpole-v0"):
-        env.create_dataset("mine/cartpole-v0")
+NAME = "mine/cartpole-v0"
+if not storage.exists(NAME):
+    env = DataCollector(gymnasium.make("CartPole-v1"))
+    for seed in range(20):
+        (x, speed, angle, turning), _ = env.reset(seed=seed)
+        over = False
+        while not over:
+            push = int(angle + 0.5 * turning + 0.05 * x + 0.1 * speed > 0)
+            (x, speed, angle, turning), _, fallen, out_of_time, _ = env.step(push)
+            over = fallen or out_of_time
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it would like to know who we are
+        env.create_dataset(NAME)
 
 # A network of plans of five actions, trained and played.
 domain = find_domain("gymnasium").make("CartPole-v1", Settings())
-data = windows.concatenate(storage.load("mine/cartpole-v0", domain).demonstrations)
+data = windows.concatenate(storage.load(NAME, domain).demonstrations)
 training = TrainingConfig(steps=steps, learning_rate=3e-3)
 model = ModelConfig(width=64, layers=2, dropout=0.0)
 agent = method.make_agent(Setup(domain, 0, 5, model, training, method.Settings("random")))

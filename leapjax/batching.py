@@ -204,7 +204,7 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
     if batch == 0:
         return np.zeros((0, 2), np.uint32)
     # Padded to a power of two, so that a shrinking batch does not compile at every size.
-    rows = np.minimum(np.arange(1 << max(batch - 1, 0).bit_length()), batch - 1)
+    rows = np.minimum(np.arange(1 << (batch - 1).bit_length()), batch - 1)
     folded = np.stack([episodes, replans]).astype(np.uint32)[:, rows]
     return np.asarray(_fold_in(jax.random.key(seed), folded))[:batch]
 

@@ -253,18 +253,18 @@ def _check_arguments(name: str, domain: Domain) -> None:
     Raises:
         UserError: says which, and how to have them.
     """
-    if domain.arguments is None:
+    recorded = described(name).arguments
+    if domain.arguments is None or recorded is None:
         return
-    found = described(name).arguments
-    # How it is looked at changes nothing.
-    recorded, played = (
-        {key: value for key, value in given.items() if key != "render_mode"}
-        for given in (found or {}, domain.arguments)
+    # How an environment is looked at changes nothing.
+    wanted, played = (
+        {key: value for key, value in arguments.items() if key != "render_mode"}
+        for arguments in (recorded, domain.arguments)
     )
-    if found is not None and recorded != played:
+    if wanted != played:
         raise UserError(
             f"{name} was recorded in {domain.level} with other arguments than it is played with: "
-            f"give --arguments '{json.dumps(recorded)}'"
+            f"give --arguments '{json.dumps(wanted)}'"
         )
 
 
