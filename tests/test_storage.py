@@ -304,7 +304,7 @@ def test_a_file_of_garbage(saved, minari_folder):
     assert "cannot be read" in refused()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\x00"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\x00", "[" * 100_000])
 def test_damaged_metadata(saved, minari_folder, text):
     (minari_folder / NAME / "data" / "metadata.json").write_text(text)
     assert "cannot be read" in refused()

@@ -335,13 +335,13 @@ def described(name: str) -> Described:
     try:
         metadata = json.loads(path.read_text(encoding="utf-8"))
         count = metadata.get("total_episodes")
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return Described()
     count = count if isinstance(count, int) and count > 0 else None
     try:
         spec = json.loads(metadata["env_spec"])
         level, arguments = spec["id"], spec.get("kwargs")
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return Described(episodes=count)
     arguments = arguments if isinstance(arguments, dict) else None
     return Described(level if isinstance(level, str) else None, count, arguments)
