@@ -22,7 +22,7 @@ from rich.table import Table
 from benchmarks import training
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
-from benchmarks.timing import Row, fastest, write_rows
+from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from leapjax import pretrained, sharding
@@ -69,10 +69,14 @@ def run(options: Options) -> None:
     """Measures every game and preset.
 
     Raises:
-        UserError: rows are asked for of what is not measured.
+        UserError: rows are asked for of what is not measured, or cannot be written, or no games
+            are to be played.
     """
+    if any(batch < 1 for batch in options.batches):
+        raise UserError(f"--batches {min(options.batches)}: at least one game must be played")
     if options.training_json and not options.training:
         raise UserError("--training-json with --no-training: there are no rows to write; drop one")
+    check_writable(options.json, options.training_json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [

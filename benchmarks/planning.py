@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.flops import matmul_flops
-from benchmarks.timing import Row, fastest, matmul_peak, write_rows
+from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import plots, program, runtime
 from experiments.common.config import make_domain, preset, specify, with_options
 from leapjax import pretrained
@@ -70,10 +70,11 @@ def run(options: Options) -> None:
     """Measures both presets on every level.
 
     Raises:
-        UserError: the plot cannot be of that kind.
+        UserError: what was asked for cannot be written.
     """
     if options.plot is not None:
-        plots.check_kind(options.plot)
+        plots.check_figure(options.plot)
+    check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
     batches = (1, 256) if options.quick else BATCHES

@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.timing import Row, fastest, write_rows
+from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import plots, program, runtime
 from leapjax import pretrained, rollouts
 from leapjax.babyai import levels
@@ -64,8 +64,11 @@ def run(options: Options) -> None:
     """Measures every setting."""
     if not options.runs:
         raise UserError("expected at least one folder of a run, or a level")
+    if options.batch < 1:
+        raise UserError(f"--batch {options.batch}: at least one plan must be made")
     if options.plot is not None:
-        plots.check_kind(options.plot)
+        plots.check_figure(options.plot)
+    check_writable(options.json)
     folders = [pretrained.find(path) for path in options.runs]
     searches = {}
     for folder in folders:
@@ -73,7 +76,13 @@ def run(options: Options) -> None:
         if not isinstance(specification.planner, GibbsConfig):
             raise UserError(f"{folder}: {specification.method} does not plan by Gibbs sampling")
         most = levels.find_level(specification.level).iterations
-        searches[folder] = variants(specification.planner, most)
+        domain = pretrained.make_domain(specification)
+        accepts_mask = pretrained.make_agent(specification, domain).energy.accepts_mask
+        searches[folder] = {
+            name: search
+            for name, search in variants(specification.planner, most).items()
+            if accepts_mask or search.fill == "together"
+        }
     runtime.start()
     rows = [
         measure(options, folder, name, config)

@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.timing import Row, fastest, write_rows
+from benchmarks.timing import Row, check_writable, fastest, write_rows
 from benchmarks.training import Stepper
 from experiments.common import program, runtime
 from experiments.common.config import preset
@@ -61,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: Options, arguments: list[str]) -> None:
     """Measures every setting, or the one of this process."""
     preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
+    check_writable(options.json)
     if options.worker:
         runtime.connect(options.cluster)
         row = measure(options)

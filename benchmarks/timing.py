@@ -62,6 +62,17 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
     return repeats * flops / best / 1e9
 
 
+def check_writable(*paths: Path | None) -> None:
+    """Makes the folders of files that will be written at the end.
+
+    Raises:
+        UserError: one cannot be made, or nothing can be written there.
+    """
+    for path in paths:
+        if path is not None:
+            files.make_folder(path.parent)
+
+
 def write_rows(path: Path | None, rows: Sequence[Row]) -> None:
     """Writes the rows where `--json` asked for them, with what they were made with."""
     if path is not None:

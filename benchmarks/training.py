@@ -24,7 +24,7 @@ from rich.table import Table
 
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
-from benchmarks.timing import Row, fastest, matmul_peak, write_rows
+from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import AnyConfig, make_domain, preset, specify
 from leapjax import pretrained, sharding, training
@@ -60,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Options) -> None:
     """Measures every level and preset."""
+    check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
     configs = [
         preset("babyai", level, "leap", name)

@@ -22,7 +22,7 @@ from rich.table import Table
 from experiments.babyai_drawing import picture
 from experiments.common import program, runtime
 from experiments.common.config import check_executed
-from experiments.common.pictures import save_sheet
+from experiments.common.pictures import check_picture, save_sheet
 from leapjax import pretrained, rollouts
 from leapjax.babyai import levels, observations
 from leapjax.babyai.adapter import BabyAIAdapter
@@ -101,6 +101,8 @@ def report(options: Options) -> None:
     """Plays validation levels, prints the tables, draws the gallery."""
     console = Console()
     played = seeds.validation_seeds(0, options.episodes)
+    if options.gallery is not None:
+        check_picture(options.gallery)
     level = only_level(options.runs, options.executed)
     runtime.start()
     recorders: list[Recorder] = []

@@ -110,6 +110,8 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
         planner, metrics = experiment.train(this, played, stack, measure, plays=False)
     last = measure(planner.energy, planner.params)
     watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in metrics]
+    if not watched:  # trained before, and its curve is gone
+        watched = [{"step": this.config.training.steps, **last}]
     return {
         "level": this.config.level,
         "preset": this.config.preset,

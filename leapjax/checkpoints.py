@@ -178,21 +178,40 @@ def check_path(folder: Path) -> None:
         )
 
 
-def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
+class Unfinished(UserError):
+    """A step of a run that was asked for is not there, or cannot be read."""
+
+
+def newest(folder: Path) -> list[int]:
+    """The steps of the checkpoints in a folder, the newest first."""
+    check_path(folder)
+    if not folder.is_dir():
+        return []
+    return sorted((int(p.name) for p in folder.iterdir() if p.name.isdecimal()), reverse=True)
+
+
+def restore_params(
+    folder: Path, like: PyTree, identity: str = "", step: int | None = None
+) -> PyTree:
     """The parameters of the newest readable checkpoint, with the structure of `like`.
 
-    Warns of each damaged one that it skips.
+    Warns of each damaged one that it skips; with `step`, no other than that of this step will do.
 
     Raises:
         UserError: there is none, none can be read, its arrays have other shapes, or it was
             saved with another identity.
+        Unfinished: that of `step` is not there, or cannot be read.
     """
-    check_path(folder)
-    steps = []
-    if folder.is_dir():
-        steps = sorted((int(p.name) for p in folder.iterdir() if p.name.isdecimal()), reverse=True)
+    steps = newest(folder)
     if not steps:
         raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
+    if step is not None:
+        if step not in steps:
+            raise Unfinished(
+                f"{folder} ends at step {steps[0]} of {step}: start the run's command again, and "
+                "it goes on"
+            )
+        steps = [step]
     reasons = []
     for step in steps:
         path = _absolute(folder) / str(step)
@@ -222,7 +241,7 @@ def restore_params(folder: Path, like: PyTree, identity: str = "") -> PyTree:
             for reason in reasons:
                 warnings.warn(f"{reason}: using step {step}", stacklevel=2)
             return jax.tree.map(jnp.asarray, params)
-    raise UserError("; ".join(reasons))
+    raise (UserError if step is None else Unfinished)("; ".join(reasons))
 
 
 def _blank(like: PyTree) -> PyTree:

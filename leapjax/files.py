@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,6 +90,20 @@ def check_room(folder: Path, needed: int) -> None:
             f"{free >> 20} MiB are free in {folder}, and {(needed + SPARE) >> 20} may be needed: "
             "make room, or use another folder"
         )
+
+
+def make_folder(folder: Path) -> None:
+    """Makes a folder, if it is not there, in which files can be made.
+
+    Raises:
+        UserError: it cannot be made, or nothing can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -153,9 +154,9 @@ def publish(folder: Path, target: Path) -> None:
     """Makes a published planner of a run: its parameters in half precision.
 
     Raises:
-        UserError: the run cannot be read, or the target not be written.
+        UserError: the run cannot be read, has not come to its end, or the target not be written.
     """
-    planner = load(folder)
+    planner = load(folder, finished=True)
     weights.write(target / WEIGHTS, planner.params, identity(planner.specification))
     save_specification(target, planner.specification)
 
@@ -192,6 +193,7 @@ def load(
     chunk_sizes: Sequence[int] = CHUNK_SIZES,
     level: str | None = None,
     target_return: float | None = None,
+    finished: bool = False,
 ) -> Pretrained:
     """A trained planner from the folder of its run, or one that comes with the library.
 
@@ -202,10 +204,12 @@ def load(
         chunk_sizes: see `leapjax.compile_planner`.
         level: to plan for, where it is another than it was trained on, and its network serves both.
         target_return: to ask for, where that is another than it was trained for.
+        finished: whether nothing will do but what the run has learned at its end. If not, what it
+            had learned at its newest readable checkpoint will, with a warning.
 
     Raises:
-        UserError: no such run, one that cannot be read, another horizon, a level that needs
-            another network, or a return that it cannot be asked for.
+        UserError: no such run, one that cannot be read or has not come to its end, another
+            horizon, a level that needs another network, or a return that it cannot be asked for.
     """
     folder = find(path)
     specification = read_specification(folder)
@@ -235,7 +239,14 @@ def load(
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
-        params = checkpoints.restore_params(folder / CHECKPOINTS, like, whose)
+        params = checkpoints.restore_params(
+            folder / CHECKPOINTS, like, whose, specification.training.steps if finished else None
+        )
+        step = checkpoints.newest(folder / CHECKPOINTS)[0]
+        if step < specification.training.steps:
+            warnings.warn(
+                f"{folder} ends at step {step} of {specification.training.steps}", stacklevel=2
+            )
     specification = dataclasses.replace(
         specification, planner=planner or specification.planner, level=level or specification.level
     )

@@ -56,7 +56,7 @@ def untrained_run(folder, *options):
     agent = pretrained.make_agent(specification, domain)
     params = random_parameters(agent, 0.1)
     saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(specification))
-    saved.save(TrainState(params, (), jnp.int32(0)))
+    saved.save(TrainState(params, (), jnp.int32(specification.training.steps)))
     saved.close()
     return folder
 

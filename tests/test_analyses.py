@@ -10,6 +10,7 @@ from experiments.common import analysis, results
 from experiments.common.analysis import Analysis, Options, Way
 from experiments.common.run import write_metrics
 from experiments.tables import analyses
+from leapjax import pretrained
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
 
@@ -92,6 +93,19 @@ def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place,
     assert f"training {folder}" in capsys.readouterr().out.replace("\n", "")
     assert analysis.main(of, ["--episodes", "1"]) == 0
     assert "training" not in capsys.readouterr().out
+
+
+def test_a_damaged_end_of_training_is_learned_again(place, capsys):
+    of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
+    assert analysis.main(of, SHORT) == 0
+    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
+    folder = analysis.run_folder(config, 0) / pretrained.CHECKPOINTS
+    for path in (folder / "0").rglob("d/*"):
+        path.write_bytes(b"")
+    capsys.readouterr()
+    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert "training" in capsys.readouterr().out and len(rows(place, "properties")) == 2
+    assert (folder / "0").is_dir() and (folder / "0.damaged").is_dir()
 
 
 def test_what_training_took_is_that_of_all_its_parts(tmp_path):
@@ -218,10 +232,15 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert last["random_0"] > 0 and last["random_100"] > 0
     assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
+    for curve in (place / "runs").rglob("metrics.csv"):
+        curve.unlink()  # trained before, and its curve is gone
+    assert landscape.main(arguments) == 0
+    (again,) = json.loads((place / "runs" / "landscape.json").read_text())
+    assert again["training"][-1]["random_0"] == pytest.approx(found["training"][-1]["random_0"])
     assert landscape.main([*arguments, "--trajectories", "0"]) == 2
     assert landscape.main([*arguments, "--steps", "0"]) == 2
     assert landscape.main(["--presets"]) == 2
-    assert json.loads((place / "runs" / "landscape.json").read_text()) == [found]  # still there
+    assert json.loads((place / "runs" / "landscape.json").read_text()) == [again]  # still there
 
 
 def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):

@@ -1,6 +1,9 @@
 import functools
 import json
+import multiprocessing
+import os
 import shutil
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -339,6 +342,17 @@ def test_collecting_goes_on_where_it_was_stopped(collected):
     assert not collect.is_whole(folder, BREAKOUT, 900, 1, 80)
     assert atari.main(arguments) == 0
     assert shard.stat().st_mtime_ns > when and shard.read_bytes() == before
+
+
+def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
+    monkeypatch.setattr(collect, "make_shard", _die)
+    with pytest.raises(UserError, match="a process that played games has ended"):
+        collect.collect(tmp_path, BREAKOUT, 900, 1, 80, workers=1)
+    assert not multiprocessing.active_children()
+
+
+def _die(*shard):
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_what_others_have_made_is_not_replaced(collected, tmp_path, capsys):

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import atari, planning, scaling, training
+from benchmarks import atari, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
 from experiments.common.config import make_domain, preset, specify, with_options
 from experiments.common.runtime import Cluster
 from leapjax import pretrained, sharding
 from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
-from tests.programs import only_long
+from tests.programs import only_long, untrained_run
 
 HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
@@ -128,6 +128,39 @@ def test_what_cannot_be_drawn_or_measured_is_refused_before_anything_is(tmp_path
     assert "a figure can be" in capsys.readouterr().err
     assert atari.main(["--run", "7", "--presets", "paper"]) == 2
     assert "--run 7: a batch of 64 windows is not made of runs of 7" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "said"),
+    [
+        (planning, ["--json", "file/rows.json"], "cannot write to file"),
+        (training, ["--json", "file/rows.json"], "cannot write to file"),
+        (scaling, ["--json", "file/rows.json"], "cannot write to file"),
+        (quality, ["GoToLocalS7N5", "--json", "file/rows.json"], "cannot write to file"),
+        (quality, ["GoToLocalS7N5", "--batch", "0"], "--batch 0"),
+        (atari, ["--training-json", "file/rows.json"], "cannot write to file"),
+        (atari, ["--batches", "16", "0"], "--batches 0"),
+        (planning, ["--plot", "file/plot.png"], "cannot write to file"),
+    ],
+)
+def test_what_cannot_be_written_is_not_measured(
+    program, arguments, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(program, "measure", lambda *given: pytest.fail("measured"))
+    assert program.main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_who_judges_whole_plans_is_not_asked_to_fill_them(tmp_path, monkeypatch):
+    run = untrained_run(tmp_path / "run", "--method", "classifier")
+    monkeypatch.setattr(quality, "measure", lambda options, path, name, search: search)
+    monkeypatch.setattr(quality, "table", lambda searches: {search.fill for search in searches})
+    shown = []
+    monkeypatch.setattr(quality, "Console", lambda: SimpleNamespace(print=shown.append))
+    assert quality.main([str(run)]) == 0
+    assert shown == [{"together"}]
 
 
 def test_the_training_benchmark_refuses_an_unknown_level(capsys):

@@ -70,6 +70,8 @@ def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
     assert failures.main([str(run), "--episodes", "2", "--executed", "9"]) == 2
     error = capsys.readouterr().err
     assert "not in 1 .. 1" in error and str(run) in error
+    assert failures.main([str(run), "--gallery", str(tmp_path / "x.foo")]) == 2
+    assert "a picture can be" in capsys.readouterr().err
     assert failures.main([str(tmp_path)]) == 2
     assert "not a checkpoint" in capsys.readouterr().err
 

@@ -20,14 +20,20 @@ TRAINED = [*SMALL, "--demos", "3", "--steps", "4"]
 
 def events(folder):
     """All that TensorBoard's files hold: (name, step, value)."""
+    return [
+        (v.tag, event.step, v.simple_value) for event in read(folder) for v in event.summary.value
+    ]
+
+
+def read(folder):
+    """The events of TensorBoard's files."""
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
     found = []
     for path in sorted(folder.iterdir()):
         data, place = path.read_bytes(), 0
         while place < len(data):  # length, its checksum, record, its checksum
             (length,) = struct.unpack("<Q", data[place : place + 8])
-            event = event_pb2.Event.FromString(data[place + 12 : place + 12 + length])
-            found += [(v.tag, event.step, v.simple_value) for v in event.summary.value]
+            found.append(event_pb2.Event.FromString(data[place + 12 : place + 12 + length]))
             place += length + 16
     return found
 
@@ -102,6 +108,11 @@ def test_a_run_that_goes_on_says_where_it_began(tmp_path, sent, monkeypatch):
         log(60, {"training/loss": 0.5})
     assert sent.begun[0]["mode"] == "online" and sent.begun[0]["resume"] == "allow"
     assert events(tmp_path / "tensorboard") == [("training/loss", 60, 0.5)]
+    # TensorBoard drops what earlier files have from there on: step 40 was logged, and is not again.
+    begun = [
+        event.step for event in read(tmp_path / "tensorboard") if event.HasField("session_log")
+    ]
+    assert begun == [41]
 
 
 def test_loggers_that_there_are_not_are_one_line(monkeypatch):

@@ -17,7 +17,7 @@ import leapjax as leap
 from experiments import babyai, report
 from experiments.common import experiment, plots, results, run, runtime
 from experiments.common.config import configuration_hash, parse
-from leapjax import checkpoints, files
+from leapjax import checkpoints, files, pretrained
 from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
@@ -166,6 +166,54 @@ def test_a_level_that_fails_does_not_end_the_others(workplace, capsys, monkeypat
     said = capsys.readouterr()
     assert said.err == "error: something is wrong with it\n"
     assert "GoToLocalS8N7, seed 1, failed" in said.out and "GoToSeqS5R2" in said.out
+
+
+@pytest.mark.parametrize("record", [True, False])
+@pytest.mark.parametrize("trained", [True, False])
+def test_where_nothing_can_be_written_nothing_is_done(
+    toy_run, workplace, capsys, monkeypatch, record, trained
+):
+    (workplace / ("results" if record else "runs")).write_text("")
+    for name in ("collect", "load", "measure"):
+        monkeypatch.setattr(run, name, lambda *given: pytest.fail("work was done"))
+    more = ["--checkpoint", toy_run] if trained else []
+    said = one_line(capsys, *more, *["--record"] * record)
+    # A file that is a folder of rows is found when it is read.
+    assert "cannot write to" in said or "cannot read" in said
+
+
+def test_a_run_that_has_not_come_to_its_end(toy_run, workplace, capsys):
+    stopped = workplace / "stopped"
+    shutil.copytree(toy_run, stopped)
+    (stopped / "checkpoints" / "4").rename(stopped / "checkpoints" / "3")
+    said = "ends at step 3 of 4: start the run's command again"
+    assert said in one_line(capsys, "--checkpoint", stopped, "--record")
+    assert not list(workplace.rglob("*.jsonl"))
+    with pytest.raises(UserError, match=said):
+        pretrained.publish(stopped, workplace / "published")
+    with pytest.warns(UserWarning, match="ends at step 3 of 4"):
+        leap.load(stopped)
+    with pytest.raises(UserError, match=said):
+        leap.load(stopped, finished=True)
+    leap.load(toy_run, finished=True)
+
+
+def test_a_level_that_was_learned_is_not_played_where_it_was_learned(toy_run, workplace, capsys):
+    run_folder = workplace / "run"
+    shutil.copytree(toy_run, run_folder)
+    data = run_folder / "data.json"
+    values = json.loads(data.read_text())
+    values["seeds"][0] = 10_000_000
+    data.write_text(json.dumps(values))
+    for more in ([], ["--play", "GoToLocalS7N5"]):
+        said = one_line(capsys, "--checkpoint", run_folder, *more)
+        assert "10000000 is both a demonstration and a test episode" in said
+
+
+def test_a_training_curve_of_no_numbers(workplace):
+    (workplace / "metrics.csv").write_text("step,seconds,loss\nnan,1.0,2.0\n")
+    with pytest.raises(UserError, match="damaged"):
+        run.read_metrics(workplace)
 
 
 def test_the_report_where_there_are_no_rows(workplace, capsys):

@@ -24,7 +24,7 @@ from experiments.common.config import AnyConfig, check_counts, configuration_has
 from experiments.common.experiment import Experiment
 from experiments.common.interruption import Interruption
 from experiments.common.results import Row
-from leapjax import pretrained, rollouts
+from leapjax import checkpoints, pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.checkpoints import differences
 from leapjax.data import seeds, windows
@@ -317,7 +317,8 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     training, folder = training_of(config), run_folder(config, seed)
     # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
-        return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES)
+        with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
+            return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES, finished=True)
     work.console.print(f"training {folder}", highlight=False, markup=False)
     this = experiment.make_run(training, config, seed, work.console, work.interruption)
     with contextlib.ExitStack() as stack:

@@ -129,12 +129,15 @@ def run_one(
         raise UserError(
             f"--episodes {config.episodes}: fewer than the {jax.process_count()} processes"
         )
+    # Not after hours of work.
+    for where in (rows.parent, config.runs):
+        processes.first_does(functools.partial(files.make_folder, where))
     metrics: run.Metrics = []
     with contextlib.ExitStack() as stack:
         if processes.is_first():
             this = run.with_loggers(this, name, stack)
         if config.checkpoint is not None:
-            if config.play is None:  # another level's seeds are others
+            if config.play in (None, config.level):  # another level's seeds are others
                 seeds.check_disjoint(run.demonstrated(config.checkpoint), played)
             planner = run.reuse(this, config.checkpoint)
         else:

@@ -39,7 +39,7 @@ def nowhere(step: int, values: Mapping[str, float]) -> None:
 def tensorboard(about: About) -> Logger:
     """Event files in the run's folder."""
     writer = _installed("tensorboard").SummaryWriter(
-        str(about.folder / "tensorboard"), purge_step=about.begin or None
+        str(about.folder / "tensorboard"), purge_step=about.begin + 1 if about.begin else None
     )
 
     def log(step: int, values: Mapping[str, float]) -> None:
@@ -92,6 +92,9 @@ def _installed(name: str) -> ModuleType:
 @contextlib.contextmanager
 def opened(names: Sequence[str], about: Callable[[], About]) -> Iterator[Log]:
     """Inside, what is given to the function goes to some loggers; they begin with the first."""
+    if not names:
+        yield nowhere
+        return
     with contextlib.ExitStack() as stack:
         begun: list[Logger] = []
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from PIL import Image
 
 from leapjax import files
+from leapjax.errors import UserError
 
 Frame = tuple[Image.Image, int]  # a picture, and for how many milliseconds it is shown
 
@@ -29,3 +30,14 @@ def save_sheet(pictures: Sequence[Image.Image], columns: int, path: Path) -> Non
         sheet.paste(picture, (width * (index % columns), height * (index // columns)))
     with files.whole(path) as scratch:
         sheet.save(scratch)
+
+
+def check_picture(path: Path) -> None:
+    """Refuses, before long work, a file that no picture can be written to.
+
+    Raises:
+        UserError: it is of an unknown kind, or its folder cannot be written to.
+    """
+    if path.suffix.lower() not in Image.registered_extensions():
+        raise UserError(f"{path}: a picture can be .png or .gif, among others")
+    files.make_folder(path.parent)

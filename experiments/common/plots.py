@@ -204,15 +204,16 @@ def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Ax
     return figure, list(axes.flat)
 
 
-def check_kind(path: Path) -> None:
-    """Refuses, before anything is measured, a file of a kind that no figure can be.
+def check_figure(path: Path) -> None:
+    """Refuses, before anything is measured, a file that no figure can be written to.
 
     Raises:
-        UserError: names the kinds.
+        UserError: it is of another kind, or its folder cannot be written to.
     """
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix.removeprefix(".").lower() not in known:
         raise UserError(f"{path}: a figure can be {', '.join(sorted(known))}")
+    files.make_folder(path.parent)
 
 
 def save(figure: Figure, path: Path) -> None:

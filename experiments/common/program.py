@@ -55,6 +55,8 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
             "again, and they continue from the last checkpoint",
             1,
         )
+    except KeyboardInterrupt:
+        return _end("stopped by Ctrl-C", 130)
     except BrokenPipeError:  # what read the output has ended, as in `--help | head`
         # What is left of it has nowhere to go; the interpreter would try again at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,6 +9,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -79,7 +80,7 @@ def with_loggers(run: Run, name: str, stack: contextlib.ExitStack) -> Run:
     """A run whose measurements go to the loggers that are asked for, until a stack is closed."""
 
     def about() -> About:
-        run.folder.mkdir(parents=True, exist_ok=True)
+        files.make_folder(run.folder)
         before = read_metrics(run.folder)
         done = int(before[-1]["step"]) if before else 0
         return About(run.folder, name, resolved(run.config, run.seed), done)
@@ -325,7 +326,8 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
     """The planner of an earlier run, refused where something else is asked for.
 
     Raises:
-        UserError: says what the run has, and what it was asked for.
+        UserError: says what the run has, and what it was asked for; or a row is to be recorded of a
+            run that has not come to its end.
     """
     trained = pretrained.read_specification(checkpoint)
     wanted, found = (_training_settings(s) for s in (run.specification, trained))
@@ -341,7 +343,7 @@ def reuse(run: Run, checkpoint: Path) -> Pretrained:
     )
     return pretrained.load(
         checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play,
-        None if target == known else target,
+        None if target == known else target, finished=run.config.record,
     )  # fmt: skip
 
 
@@ -473,6 +475,8 @@ def read_metrics(folder: Path) -> Metrics:
         metrics = [{k: float(v) for k, v in entry.items()} for entry in csv.DictReader(lines)]
         if any(not entry.keys() >= {"step", "seconds", "loss"} for entry in metrics):
             raise ValueError("a column is missing")
+        if not all(math.isfinite(e["step"]) and math.isfinite(e["seconds"]) for e in metrics):
+            raise ValueError("a step or a time is not a number")
     except (TypeError, ValueError, csv.Error) as error:
         raise UserError(
             f"{path} is damaged ({first_line(error)}): remove it, and the run goes on with a "

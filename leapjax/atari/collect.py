@@ -4,15 +4,17 @@ A file holds a game or more. It depends on its number alone, so that data do not
 many processes made them, nor on how often they were stopped.
 """
 
+import contextlib
 import itertools
 import json
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from importlib import metadata
-from multiprocessing.pool import AsyncResult
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +57,7 @@ def collect(
         What is in each file: its games, with their scores.
 
     Raises:
-        UserError: there are files of somebody else, or games of another length.
+        UserError: there are files of somebody else, or games of another length, or a process died.
     """
     logs = replay.replay_logs(folder, game, run)
     workers = workers or len(os.sched_getaffinity(0))
@@ -65,14 +67,13 @@ def collect(
         made = _made(logs, transitions, longest)
         if _count(made) < transitions:  # else no process needs to be started
             waiting = (n for n in itertools.count() if _known(logs, n, longest) is None)
-            # Not forked: this process may run threads.
-            with multiprocessing.get_context("spawn").Pool(workers, _ignore_interrupts) as pool:
-                running: list[AsyncResult[Manifest]] = []
+            with _processes(workers) as pool:
+                running: list[Future[Manifest]] = []
                 while _count(made) < transitions:
                     running = [each for each in running if not _finished(each)]
                     for _ in range(workers - len(running)):
                         shard = folder, game.name, run, next(waiting), longest
-                        running.append(pool.apply_async(make_shard, shard))
+                        running.append(pool.submit(make_shard, *shard))
                     time.sleep(POLL)
                     made = _made(logs, transitions, longest, made)
                     progress(min(_count(made), transitions))
@@ -181,11 +182,37 @@ def _count(manifests: Sequence[Manifest]) -> int:
     return sum(int(game["transitions"]) for each in manifests for game in each["games"])
 
 
-def _finished(result: AsyncResult[Manifest]) -> bool:
+@contextlib.contextmanager
+def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes to play in, which end at once when they are no longer needed.
+
+    Raises:
+        UserError: one of them died.
+    """
+    others = set(multiprocessing.active_children())
+    # Not forked: this process may run threads.
+    pool = ProcessPoolExecutor(
+        count, multiprocessing.get_context("spawn"), initializer=_ignore_interrupts
+    )
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise UserError(
+            "a process that played games has ended, perhaps for want of memory: start the same "
+            "command again, perhaps with fewer --workers, and it goes on"
+        ) from None
+    finally:
+        # What they have begun is not waited for: a file without its manifest is made again.
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _finished(made: Future[Manifest]) -> bool:
     """Whether a process is done with its file; what went wrong there is raised here."""
-    if not result.ready():
+    if not made.done():
         return False
-    result.get()
+    made.result()
     return True
 
 
