@@ -28,7 +28,7 @@ BASELINES = tuple(method for method in COMPARED if method not in ("random", "lea
 # How methods of preset `paper` act, drawn: chosen on validation levels (docs/tried.md). LEAP gains
 # nothing by noise.
 NOISE: Mapping[str, Mapping[str, Any]] = {
-    **{method: {"temperature": 4.0} for method in ("bc", "dt", "mopo")},
+    **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
     "plate": {"beams": 1, "temperature": 4.0},
 }
 BY_METHOD = {
