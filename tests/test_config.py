@@ -15,6 +15,7 @@ from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
+from leapjax.planners import CrossEntropyConfig, ShootingConfig
 
 LEVEL = "GoToLocalS7N5"
 
@@ -156,3 +157,13 @@ def test_every_program_is_known_by_name(capsys):
     assert programs.main(["babyia"]) == 2
     assert "did you mean babyai" in capsys.readouterr().err
     assert programs.main(["properties", "--only", "nothing"]) == 2  # what follows is handed on
+
+
+@pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])
+def test_any_planner_is_checked_for_memory(planner):
+    chosen = dataclasses.replace(parse("--level", LEVEL), planner=planner())
+    domain = config.make_domain(chosen)
+    config.check_memory(chosen, domain)
+    huge = dataclasses.replace(chosen, planner=planner(candidates=10**9))
+    with pytest.raises(UserError, match="--candidates"):
+        config.check_memory(huge, domain)

@@ -281,13 +281,14 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         # Parameters of the transformer, their gradients and Adam's two moments.
         "--width, --layers": 4 * 4 * 12 * model.layers * model.width**2,
     }
-    # Noise and trace of a chunk of 128 plans, in 4 bytes each; or the beams and their energies.
+    # Noise and trace of a chunk of 128 plans, in 4 bytes each; or what is weighed, and energies.
     if isinstance(search, GibbsConfig):
         drawn = search.resampled * domain.num_actions + search.horizon
         noise = 4 * 128 * search.restarts * search.iterations * drawn
         needs["--iterations, --restarts"] = noise
     else:
-        needs["--beams"] = 4 * 128 * search.beams * (search.horizon + domain.num_actions)
+        plans = getattr(search, "beams", getattr(search, "candidates", 1))
+        needs["--beams, --candidates"] = 4 * 128 * plans * (search.horizon + domain.num_actions)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for options, needed in needs.items():
         if needed > memory:
