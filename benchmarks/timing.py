@@ -63,14 +63,14 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Makes the folders of files that will be written at the end.
+    """Refuses files that could not be written at the end.
 
     Raises:
-        UserError: one cannot be made, or nothing can be written there.
+        UserError: says which folder nothing can be written to.
     """
     for path in paths:
         if path is not None:
-            files.make_folder(path.parent)
+            files.check_writable(path.parent)
 
 
 def write_rows(path: Path | None, rows: Sequence[Row]) -> None:

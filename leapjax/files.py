@@ -92,15 +92,15 @@ def check_room(folder: Path, needed: int) -> None:
         )
 
 
-def make_folder(folder: Path) -> None:
-    """Makes a folder, if it is not there, in which files can be made.
+def check_writable(folder: Path) -> None:
+    """Refuses a folder in which no file could be made, whether it is there already or not.
 
     Raises:
-        UserError: it cannot be made, or nothing can be written there.
+        UserError: it could not be made, or nothing can be written there.
     """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None

@@ -131,7 +131,7 @@ def run_one(
         )
     # Not after hours of work.
     for where in (rows.parent, config.runs):
-        processes.first_does(functools.partial(files.make_folder, where))
+        processes.first_does(functools.partial(files.check_writable, where))
     metrics: run.Metrics = []
     with contextlib.ExitStack() as stack:
         if processes.is_first():

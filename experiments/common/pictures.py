@@ -40,4 +40,4 @@ def check_picture(path: Path) -> None:
     """
     if path.suffix.lower() not in Image.registered_extensions():
         raise UserError(f"{path}: a picture can be .png or .gif, among others")
-    files.make_folder(path.parent)
+    files.check_writable(path.parent)

@@ -213,7 +213,7 @@ def check_figure(path: Path) -> None:
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix.removeprefix(".").lower() not in known:
         raise UserError(f"{path}: a figure can be {', '.join(sorted(known))}")
-    files.make_folder(path.parent)
+    files.check_writable(path.parent)
 
 
 def save(figure: Figure, path: Path) -> None:

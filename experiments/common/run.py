@@ -80,7 +80,8 @@ def with_loggers(run: Run, name: str, stack: contextlib.ExitStack) -> Run:
     """A run whose measurements go to the loggers that are asked for, until a stack is closed."""
 
     def about() -> About:
-        files.make_folder(run.folder)
+        files.check_writable(run.folder)
+        run.folder.mkdir(parents=True, exist_ok=True)
         before = read_metrics(run.folder)
         done = int(before[-1]["step"]) if before else 0
         return About(run.folder, name, resolved(run.config, run.seed), done)
