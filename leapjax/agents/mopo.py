@@ -32,7 +32,7 @@ class Settings(iql.Settings):
     """The options of MOPO, and those of the IQL that it trains."""
 
     members: int = 5  # of the ensemble
-    rollout: int = 1  # steps that are imagined from every state
+    rollout: int = 1  # steps that are imagined from the current state of each context
     penalty: float = 1.0  # on the disagreement of the ensemble
     real_share: float = 0.5  # of the loss: that of the data, not of what is imagined
 
@@ -151,11 +151,19 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.apply(params, *inputs, method=method, **options)
 
     def improve(
-        params: Params, target: Params, features: jax.Array, taken: jax.Array, returns: jax.Array
+        params: Params,
+        target: Params,
+        features: jax.Array,
+        target_features: jax.Array,
+        taken: jax.Array,
+        returns: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """IQL's losses `[P]` of actions that were taken, given what they returned; the values."""
+        """IQL's losses `[P]` of actions that were taken, given what they returned; the values.
+
+        States are given twice, as the network sees them and as its target does, `[P, D]` each.
+        """
         value, *qs = call(params, "judge", features)
-        held = call(target, "judge", jax.lax.stop_gradient(features))[1:]
+        held = call(target, "judge", target_features)[1:]
         least = jnp.minimum(*(losses.of_action(q, taken) for q in held))
         logits = call(params, "logits", features)
         return iql.loss(settings, value, qs, least, logits, taken, returns), value
@@ -180,7 +188,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             after = predicted.features[member]
             later = jax.lax.stop_gradient(call(params, "judge", after)[0])
             returns = rewards + settings.discount * goes_on * later
-            loss, _ = improve(params, target, features, taken, returns)
+            loss, _ = improve(params, target, features, features, taken, returns)
             return (after, alive * goes_on), ((alive * loss).mean(), (alive * differ).mean())
 
         start = features, jnp.ones(features.shape[0])
@@ -207,7 +215,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
         values = call(params, "judge", later)[0]
         returns = losses.bellman(transition, values, settings.discount)
-        real, value = improve(params, target, now, taken, returns)
+        real, value = improve(params, target, now, seen, taken, returns)
 
         predicted = call(params, "predict", seen, taken)
         ending = jnp.zeros(len(now)).at[-1].set(transition.terminated)

@@ -255,7 +255,8 @@ def _context(steps: Steps, index: jax.Array, length: int, end: int, after: int =
 
     def take_past(leaf: jax.Array, rows: jax.Array) -> jax.Array:
         shape = (length,) + (1,) * (leaf.ndim - 1)
-        return jnp.where(known.reshape(shape), leaf[rows], 0)
+        zero = jnp.zeros((), leaf.dtype)  # a plain 0 would make booleans integers
+        return jnp.where(known.reshape(shape), leaf[rows], zero)
 
     states = steps.state[earlier]
     return Context(
