@@ -16,7 +16,7 @@ def slow_path_lengths(
             return True
         if content.type == "wall":
             return False
-        return content.type == "door" or through_objects
+        return content.type in ("door", "floor") or through_objects
 
     cells = [(x, y) for x in range(grid.width) for y in range(grid.height)]
     edges = [

@@ -11,7 +11,7 @@ from minigrid.core.grid import Grid
 
 from leapjax.babyai import augmentation, demonstrations, levels, vocabulary
 from leapjax.babyai.adapter import END
-from leapjax.babyai.dynamics import FORWARD
+from leapjax.babyai.dynamics import FORWARD, LAVA, roll
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.data import windows
@@ -311,10 +311,9 @@ def test_settings_choose_augmentations_and_clutter_comes_first():
     assert all((w.actions == window.actions).all() for w in cluttered)
 
 
-def plain_windows(horizon=10):
-    """Windows of an empty room, from every step."""
-    level = levels.find_level("GoToLocalS8N1")
-    data = demonstrations.collect(level, 6, seed=1).demonstrations
+def plain_windows(horizon=10, level="GoToLocalS8N1", episodes=6):
+    """Windows of an empty room, or of another level, from every step."""
+    data = demonstrations.collect(levels.find_level(level), episodes, seed=1).demonstrations
     steps = jax.tree.map(jnp.asarray, lay_out(data))
     return [window_at(steps, i, 0, horizon, END) for i in range(steps.actions.shape[0])]
 
@@ -341,6 +340,20 @@ def test_a_false_start_leads_to_where_the_window_began():
         lengths[moves] += 1
         assert after.extras[tuple(state.pose[:2])]
     assert set(lengths) == set(range(1, 7))
+
+
+@pytest.mark.parametrize("name", ["false_start", "detour"])
+def test_what_begins_earlier_never_steps_on_lava(name):
+    """Demonstrations walk around it: what is added to them must too."""
+    options = {"false_start": (1.0,), "detour": (1.0, GRID_WORDS)}[name]
+    change = jax.jit(lambda key, window: getattr(augmentation, name)(key, window, *options))
+    lava = changed = 0
+    for _, after in changed_by(change, plain_windows(10, "GoToLavaMedium", 20)):
+        state, changed = after.context.observation, changed + 1
+        lava += (state.grid[..., 0] == LAVA).any()
+        cells = roll(state, jnp.asarray(after.actions))[:, :2]
+        assert (state.grid[cells[:, 0], cells[:, 1], 0] != LAVA).all()
+    assert lava > 50 and changed > 50
 
 
 def walked(state, actions):

@@ -1,6 +1,7 @@
 """Environments of one's own: what they may look like, what goes wrong, the program at toy size."""
 
 import warnings
+from collections import OrderedDict
 
 import gymnasium as gym
 import jax
@@ -62,6 +63,18 @@ class Grows(Corridor):
     trouble = "grows"
 
 
+class Deep(Corridor):
+    observation_space = spaces.Dict(
+        below=spaces.Dict(
+            level=spaces.Discrete(6, start=-2), two=spaces.MultiDiscrete([3, 4], start=[0, -1])
+        )
+    )
+
+    def seen(self):
+        below = OrderedDict(level=self.place - 2, two=np.array([0, -1]))
+        return OrderedDict(below=below)
+
+
 class Odd(Corridor):
     def __init__(self, way, lamp):
         self.made_with = way, lamp
@@ -69,7 +82,7 @@ class Odd(Corridor):
 
 @pytest.fixture(autouse=True, scope="module")
 def registered():
-    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows}
+    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows, "Deep": Deep}
     for name, kind in kinds.items():
         gym.register(f"{name}-v0", f"tests.test_gymnasium:{kind.__name__}", max_episode_steps=12)
     gym.register("Endless-v0", "tests.test_gymnasium:Corridor")
@@ -231,10 +244,35 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(tmp_path, monk
         assert program.main([*options, "--arguments", other]) == 2
         assert f"--arguments '{asked}'" in capsys.readouterr().err
     assert program.main([*options, "--arguments", asked]) == 0
-    assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [["choices", 64]]
+    assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [
+        ["choices", 64, 0]
+    ]
     for wrong in ("[]", "{", "8x8"):
         with pytest.raises(ValueError, match="arguments must be a JSON object like"):
             Settings(arguments=wrong)
+
+
+def test_choices_below_zero_are_told_apart():
+    """A one-hot code that is counted from 0 would be nothing for all of them."""
+    parts = parts_of(Deep.observation_space)
+    assert parts == (Part("choices", 6, -2), Part("choices", 4, -1))
+    module = StateTokens(parts, 8, 0)
+    context = blank_context(make("Deep-v0", Settings()), 0)
+    params = random_like(jax.eval_shape(module.init, jax.random.key(0), context))
+    encode = jax.jit(module.apply)
+    seen = [
+        {"below": {"level": np.int64(level), "two": np.array([0, 0])}} for level in range(-2, 3)
+    ]
+    tokens = [encode(params, context._replace(observation=each))[-1] for each in seen]
+    for index, token in enumerate(tokens):
+        for other in tokens[:index]:
+            assert np.abs(token - other).max() > 1e-3
+
+
+def test_dicts_of_any_kind_are_observations():
+    adapter = make("Deep-v0", Settings()).make_adapter()
+    assert adapter.reset(0) == {"below": {"level": -2, "two": pytest.approx([0, -1])}}
+    assert adapter.step(1).observation["below"]["level"] == -1
 
 
 def test_choices_that_there_are_not_are_refused():

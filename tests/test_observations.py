@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from minigrid.core.constants import COLOR_TO_IDX, DIR_TO_VEC, OBJECT_TO_IDX
 from minigrid.core.grid import Grid
-from minigrid.core.world_object import Ball, Door, Key, Wall
+from minigrid.core.world_object import Ball, Door, Floor, Key, Wall
 from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc
 
 from leapjax.babyai import demonstrations, levels, observations, vocabulary
@@ -143,7 +143,9 @@ def test_the_goal_is_the_nearest_match(name, seeds):
 
 
 def hand_made(drawing: list[str], target: str) -> tuple:
-    """A level drawn by hand: # wall, b red ball, k key, D closed door, L locked door, @ agent."""
+    """A level drawn by hand: # wall, b red ball, k key, D closed door, L locked door, f floor,
+    @ agent.
+    """
     env = levels.make_environment(levels.find_level("GoToLocalS7N5"))
     with levels.silenced():
         env.reset(seed=0)
@@ -154,6 +156,7 @@ def hand_made(drawing: list[str], target: str) -> tuple:
         "k": lambda: Key("blue"),
         "D": lambda: Door("green"),
         "L": lambda: Door("green", is_locked=True),
+        "f": lambda: Floor("purple"),
     }
     for y, row in enumerate(drawing):
         for x, symbol in enumerate(row):
@@ -182,6 +185,8 @@ def hand_made(drawing: list[str], target: str) -> tuple:
         # Doors are on the way, closed or locked.
         (["#######", "#@D.b.#", "#.#####", "#.....#", "#.....#", "#....b#", "#######"], (4, 1)),
         (["#######", "#@L.b.#", "#.#####", "#.....#", "#.....#", "#....b#", "#######"], (4, 1)),
+        # Coloured floors are no obstacle.
+        (["#######", "#@f.b.#", "#.#####", "#.....#", "#.....#", "#....b#", "#######"], (4, 1)),
         # Behind walls all around: still an answer, after all others.
         (["#######", "#@#b#.#", "#.###.#", "#.....#", "#.....#", "#....b#", "#######"], (5, 5)),
         (["#######", "#@#b#.#", "#.###.#", "#.....#", "#.....#", "#.....#", "#######"], (3, 1)),

@@ -11,7 +11,6 @@ import pytest
 from leapjax import training
 from leapjax.agents import cql, qr_dqn, rem
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Agent, TrainState
@@ -30,12 +29,6 @@ TRAINED = {
     "cql without": (mixed.DOMAIN, cql.Settings(**QUICKLY, alpha=0.0)),
     "qr_dqn": (COVERED, qr_dqn.Settings(**QUICKLY, quantiles=8)),
     "rem": (COVERED, rem.Settings(**QUICKLY, q_heads=8)),
-}
-# One Q-function each, of losses that can be computed by hand.
-PLAIN = {
-    "cql": cql.Settings(discount=0.9, alpha=0.7),
-    "qr_dqn": qr_dqn.Settings(discount=0.9, quantiles=1),
-    "rem": rem.Settings(discount=0.9, q_heads=1),
 }
 
 
@@ -126,55 +119,6 @@ def test_mixtures_are_random_and_convex():
     np.testing.assert_array_equal(rem.mixture(jax.random.key(1), 1), [1])
 
 
-def huber(error):
-    return 0.5 * error**2 if abs(error) <= 1 else abs(error) - 0.5
-
-
-def loss_by_hand(name, now, later, held, taken, reward, goes_on):
-    """Of one step, from Q-values `[2]` around it."""
-    value = held[np.argmax(later)] if name == "cql" else held.max()
-    error = huber(reward + 0.9 * goes_on * value - now[taken])
-    if name == "qr_dqn":
-        return error / 2  # the only quantile is the median
-    return error + (0.7 * (np.log(np.exp(now).sum()) - now[taken]) if name == "cql" else 0)
-
-
-@pytest.mark.parametrize("name", list(MODULES))
-def test_the_loss_of_one_q_function_is_what_it_is_by_hand(name):
-    """So with one head REM is Q-learning; of sequences, each of whose states counts."""
-    model = ModelConfig("paper", layers=1, heads=1, width=16, dropout=0.0)
-    setup = Setup(COVERED, 2, 1, model, TrainingConfig(batch=16, windows="step"), PLAIN[name])
-    agent = MODULES[name].make_agent(setup)
-
-    rng = np.random.default_rng(0)
-    state = jax.tree.map(  # another in the target network
-        lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype),
-        jax.eval_shape(agent.init, jax.random.key(0)),
-    )
-    batch = quick_jit(agent.batch)(jax.random.key(3), data())
-    loss = quick_jit(lambda *update: agent.update(*update)[1]["loss"])(
-        state, batch, jax.random.key(4)
-    )
-
-    apply = quick_jit(jax.vmap(setup.policy(("q", 2)).apply, (None, 0)))
-    earlier, after = (jax.vmap(f)(batch.context) for f in (windows.before, windows.after))
-    judged = (apply(state.params, earlier), apply(state.params, after), apply(state.extra, after))
-    now, later, held = (np.asarray(said["q"], np.float64) for said in judged)  # [B, P, 2]
-    means = []
-    for i in range(16):
-        each = [
-            loss_by_hand(
-                name, now[i, j], later[i, j], held[i, j], int(batch.context.actions[i, j]),
-                float(batch.context.rewards[i, j]), not (j == 2 and batch.terminated[i]),
-            )
-            for j in range(3)
-            if batch.context.actions[i, j] < 2  # the episode had begun
-        ]  # fmt: skip
-        means.append(np.mean(each))
-    assert batch.terminated.any() and (batch.context.actions >= 2).any()
-    assert float(loss) == pytest.approx(np.mean(means), rel=1e-4)
-
-
 def test_the_target_network_follows_slowly():
     _, step, state, _ = trained("rem")
     after, _ = step(jax.tree.map(jnp.copy, state), data(), jax.random.key(5))
@@ -186,7 +130,7 @@ def test_the_target_network_follows_slowly():
 
 @pytest.mark.parametrize("name", list(MODULES))
 def test_longer_plans_are_refused(name):
-    setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), PLAIN[name])
+    setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), MODULES[name].Settings())
     with pytest.raises(UserError, match="--horizon 5: .* one action at a time"):
         MODULES[name].make_agent(setup)
 

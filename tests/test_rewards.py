@@ -197,6 +197,16 @@ def test_returns_to_go_are_sums_of_what_is_to_come():
     np.testing.assert_array_equal(returns.returns_to_go(context, jnp.float32(10)), [17, 16, 14, 10])
 
 
+def test_the_return_that_is_wanted_is_less_by_what_was_given():
+    """In units that do not saturate; where a demonstration tells the rest, that is taken."""
+    domain = mixed.DOMAIN._replace(return_scale=4.0)
+    settings = dt.Settings(target_return=10.0)
+    wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
+    context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 1.0]), return_so_far=2.0)
+    np.testing.assert_allclose(wanted(context), np.array([10, 9, 8]) / 4)
+    np.testing.assert_allclose(wanted(context, jnp.float32(5)), np.array([7, 6, 5]) / 4)
+
+
 @pytest.mark.parametrize("name", list(MODULES))
 def test_longer_plans_are_refused(name):
     setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), SETTINGS[name])

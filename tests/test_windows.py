@@ -198,6 +198,22 @@ def test_transitions_are_what_was_before_and_after_every_step(context):
             index += 1
 
 
+def test_states_keep_their_type():
+    """A network that is trained must see what it sees when it acts, `~` of booleans included."""
+    kinds = {"flags": bool, "pixels": np.uint8, "counts": np.int32, "numbers": np.float32}
+    states = {name: np.ones((4, 2), kind) for name, kind in kinds.items()}
+    episode = Demonstration(states, np.zeros(3, np.int32), np.zeros(3, np.float32), True, False, 0)
+    steps = on_device(windows.concatenate([episode]))
+    start = windows.window(steps, jnp.int32(1), 2, 3, END).context
+    taken = windows.transition_window(steps, jnp.int32(1), 2, END).context
+    unrolled = windows.unrolled_window(steps, jnp.int32(1), 2, 3, END).context
+    for context in (
+        start, windows.before(taken), windows.after(taken), windows.context_at(unrolled, 1, 2)
+    ):  # fmt: skip
+        for name, kind in kinds.items():
+            assert context.past[name].dtype == context.observation[name].dtype == kind
+
+
 @pytest.mark.parametrize(("context", "horizon"), [(0, 1), (0, 4), (2, 3)])
 def test_unrolled_windows_hold_every_context_of_their_plan(context, horizon):
     demonstrations = toy_demonstrations()

@@ -24,7 +24,11 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of IQL alone. The defaults are the paper's (appendix)."""
+    """The options of IQL alone.
+
+    The expectile is that of the IQL paper in its mazes of ants, the temperature that in its
+    locomotion: LEAP's paper does not say which it took.
+    """
 
     expectile: float = 0.9
     inverse_temperature: float = 3.0  # of the advantages that weigh what is cloned

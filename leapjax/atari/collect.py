@@ -49,7 +49,7 @@ def collect(
         game: to play.
         transitions: at least so many, in whole games.
         run: number of the run, from 1; others have other games.
-        longest: decisions of a game, which then counts as over.
+        longest: decisions of a game, which is then cut off: see `replay.Episode`.
         workers: processes; None for one on each core.
         progress: called with the number of transitions so far.
 

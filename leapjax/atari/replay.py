@@ -58,7 +58,10 @@ _FRAMES, _STEPS, _UNFINISHED = "frames.npy", "steps.npz", ".unfinished"
 
 
 class Episode(NamedTuple):
-    """One game of n steps, played until it was over."""
+    """One game of n steps, played until it was over or cut off.
+
+    The format has one mark for both, which is learned from as an end.
+    """
 
     frames: np.ndarray  # [n, 84, 84] uint8: before each action
     actions: np.ndarray  # [n] int32
@@ -176,8 +179,8 @@ def read(
     Returns:
         The trajectories, in the order of the visits, and how many were cut in the shards that
         were visited. Their frames are views of the memory map. The frame after the last action
-        is the one before it again: DQN-Replay does not hold it, and no network ever sees it,
-        since the episode is over.
+        is the one before it again, which DQN-Replay does not hold. Only what predicts states
+        learns from it; the value of a state after the end is 0 to all others.
 
     Raises:
         UserError: nothing there, or a shard that was visited is damaged or of another game;

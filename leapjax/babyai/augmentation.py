@@ -13,7 +13,7 @@ import numpy as np
 
 from leapjax.babyai import symmetries, vocabulary
 from leapjax.babyai.adapter import END
-from leapjax.babyai.dynamics import DOOR, FORWARD, passable
+from leapjax.babyai.dynamics import DOOR, FORWARD, LAVA, passable
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
@@ -79,7 +79,7 @@ def clutter(
 
     The shortest way stays the shortest when others are blocked, so the demonstration stays as
     good as it was; what changes is what it shows: that ways lead around things. (Not where actions
-    are replaced by random ones: one in 200 windows then handles what was put there.)
+    are replaced by random ones: up to one in 120 windows then handles what was put there.)
 
     Half of the windows stay as they are; in the others each free cell gets an object with a
     probability that is drawn for the window, in 0 .. `share`. Kind and colour both differ from
@@ -291,7 +291,7 @@ def begin_earlier(
     """A window with random moves before its own, all of its moves, and whether they are possible.
 
     Ends follow all moves, `[most + horizon]` in all. Moves are not possible where they lead
-    through things, past the goal, or out of a doorway, of which the agent's mark hides the door.
+    through things or lava, past the goal, or out of a doorway: the agent's mark hides its door.
 
     Args:
         key: chooses the moves.
@@ -307,7 +307,7 @@ def begin_earlier(
     moves = jnp.where(jax.random.bernoulli(forward_key, forward, shape), FORWARD, turns)
     observation = context.observation
     grid, pose = jnp.asarray(observation.grid), jnp.asarray(observation.pose)
-    free = passable(grid)
+    free = passable(grid) & (grid[..., 0] != LAVA)
     vectors = jnp.asarray(DIRECTION_VECTORS)
 
     def undo(

@@ -100,14 +100,14 @@ def path_lengths(grid: Grid, start: Cell, through_objects: bool) -> dict[Cell, i
     """Moves from `start` to every cell that can be reached, or touched, from it.
 
     An object ends a path (it is reached, not passed) unless `through_objects`; a wall
-    always does.
+    always does, doors and coloured floors never.
     """
     lengths = {start: 0}
     queue = deque([start])
     while queue:
         x, y = cell = queue.popleft()
         content = grid.get(x, y)
-        passable = content is None or content.type == "door"
+        passable = content is None or content.type in ("door", "floor")
         passable |= through_objects and content is not None and content.type != "wall"
         if cell != start and not passable:
             continue

@@ -73,8 +73,7 @@ class CheckedAdapter(GymnasiumAdapter):
             ) from error
 
     def _checked(self, observation: Any) -> PyTree:
-        if isinstance(observation, dict):
-            observation = dict(observation)
+        observation = _plain(observation)
         shapes = jax.tree.map(np.shape, observation)
         if shapes != self._shapes:
             raise UserError(
@@ -82,6 +81,13 @@ class CheckedAdapter(GymnasiumAdapter):
                 f"{self._shapes}"
             )
         return jax.tree.map(lambda x, like: np.asarray(x, like.dtype), observation, self._blank)
+
+
+def _plain(observation: Any) -> PyTree:
+    """Dicts of any kind as plain ones: to `jax.tree` each kind is another structure."""
+    if isinstance(observation, dict):
+        return {key: _plain(part) for key, part in observation.items()}
+    return observation
 
 
 def make_environment(name: str, options: Settings) -> gym.Env:

@@ -23,6 +23,7 @@ class Part(NamedTuple):
 
     kind: str  # "numbers", "image" or "choices"
     choices: int = 0  # of each number, where they are choices
+    first: int = 0  # the least of them, where that is below 0
 
 
 def blank_of(space: gym.Space, name: str) -> PyTree:
@@ -49,11 +50,17 @@ def parts_of(space: gym.Space) -> tuple[Part, ...]:
     if isinstance(space, gym.spaces.Dict):
         return tuple(part for key in sorted(space.spaces) for part in parts_of(space[key]))
     if isinstance(space, gym.spaces.Discrete):
-        return (Part("choices", int(space.start + space.n)),)
+        return (_choices(int(space.start), int(space.start + space.n)),)
     if isinstance(space, gym.spaces.MultiDiscrete):
-        return (Part("choices", int((space.start + space.nvec).max())),)
+        return (_choices(int(space.start.min()), int((space.start + space.nvec).max())),)
     picture = len(space.shape or ()) == 3 and space.dtype == np.uint8
     return (Part("image" if picture else "numbers"),)
+
+
+def _choices(start: int, end: int) -> Part:
+    """Choices in `start` .. `end - 1`, or those that are counted from 0."""
+    first = min(start, 0)
+    return Part("choices", end - first, first)
 
 
 def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
@@ -125,7 +132,7 @@ class StateTokens(nn.Module):
         return self._dense(scaled, f"numbers_{name}")
 
     def _choices(self, leaf: jax.Array, part: Part, name: str) -> jax.Array:
-        chosen = jax.nn.one_hot(leaf, part.choices).reshape(leaf.shape[0], -1)
+        chosen = jax.nn.one_hot(leaf - part.first, part.choices).reshape(leaf.shape[0], -1)
         return self._dense(chosen, f"choices_{name}")
 
     def _image(self, leaf: jax.Array, part: Part, name: str) -> jax.Array:

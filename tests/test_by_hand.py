@@ -1,0 +1,322 @@
+"""The losses of every method that learns from rewards, and PlaTe's, written down once more.
+
+Each is a function of the trained parameters alone: all that a method holds fixed is computed
+before, so that not only its value but also its gradient says whether the method is what it is.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from leapjax.agents import bcq, cql, iql, mopo, plate, qr_dqn, rem
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.data import windows
+from leapjax.models.trajectory import ModelConfig
+from tests import mixed, toy
+from tests.quick import quick_jit
+
+BATCH, PAST, WIDTH, CHOICES, DISCOUNT = 16, 2, 16, 2, 0.9
+DOMAIN = mixed.DOMAIN._replace(actions=("left", "right", "end"))
+MODEL = ModelConfig("paper", layers=1, heads=1, width=WIDTH, dropout=0.0)
+KEY = jax.random.key(4)
+IQL = {
+    "discount": DISCOUNT, "expectile": 0.8, "inverse_temperature": 2.0, "largest_weight": 1.5
+}  # fmt: skip
+
+
+class Case(NamedTuple):
+    """An agent, parameters and others for the target network, and transitions."""
+
+    setup: Setup
+    agent: object
+    state: object
+    batch: object
+
+
+def make_case(module, settings, domain=DOMAIN, horizon=1, data=mixed.steps, seed=0):
+    learn = TrainingConfig(batch=BATCH, windows="step")
+    setup = Setup(domain, PAST, horizon, MODEL, learn, settings)
+    agent = module.make_agent(setup)
+    rng = np.random.default_rng(seed)
+    state = jax.tree.map(
+        lambda x: jnp.asarray(rng.normal(scale=0.5, size=x.shape), x.dtype),
+        jax.eval_shape(agent.init, jax.random.key(0)),
+    )
+    batch = quick_jit(agent.batch)(jax.random.key(3), jax.tree.map(jnp.asarray, data()))
+    return Case(setup, agent, state, batch)
+
+
+def assert_is(case, loss):
+    """The agent's loss, and the norm of its gradient, are those of a function of parameters."""
+    update = quick_jit(lambda *inputs: case.agent.update(*inputs)[1])
+    found = update(case.state, case.batch, KEY)
+    expected, gradient = quick_jit(jax.value_and_grad(loss))(case.state.params)
+    assert float(found["loss"]) == pytest.approx(float(expected), rel=1e-4)
+    norm = float(optax.global_norm(gradient))
+    assert float(found["gradient_norm"]) == pytest.approx(norm, rel=1e-3)
+
+
+class Around(NamedTuple):
+    """Steps [B, P] and the contexts before and after the last of them."""
+
+    earlier: object
+    after: object
+    taken: jax.Array
+    rewards: jax.Array
+    goes_on: jax.Array
+    known: jax.Array  # where the episode had begun
+
+
+def around(batch):
+    earlier, after = (jax.vmap(f)(batch.context) for f in (windows.before, windows.after))
+    known = batch.context.actions < CHOICES
+    assert batch.terminated.any() and not known.all() and known[:, -1].all()
+    return Around(
+        earlier, after, jnp.where(known, batch.context.actions, 0), batch.context.rewards,
+        jnp.ones(known.shape).at[:, -1].set(1.0 - batch.terminated), known,
+    )  # fmt: skip
+
+
+def mean(values, known):
+    """Over the steps [P] of each example, then over examples."""
+    return (jnp.where(known, values, 0).sum(axis=1) / known.sum(axis=1)).mean()
+
+
+def at(values, index):
+    return jnp.take_along_axis(values, index[..., None], axis=-1)[..., 0]
+
+
+def huber(errors):
+    size = jnp.abs(errors)
+    return jnp.where(size <= 1, size**2 / 2, size - 1 / 2)
+
+
+def cross_entropy(logits, taken):
+    return jax.nn.logsumexp(logits, axis=-1) - at(logits, taken)
+
+
+def many(apply):
+    """A network's `apply` of one context, for a batch of them."""
+    return jax.vmap(apply, (None, 0))
+
+
+def test_bcq():
+    case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
+    steps = around(case.batch)
+    say = many(case.setup.policy(("q", CHOICES), ("behaviour", CHOICES)).apply)
+    later, held = (say(of, steps.after) for of in (case.state.params, case.state.extra))
+    likely = jax.nn.softmax(later["behaviour"])
+    likely = likely / likely.max(axis=-1, keepdims=True) >= 0.9
+    best = jnp.where(likely, later["q"], -jnp.inf).argmax(axis=-1)
+    assert (best != later["q"].argmax(axis=-1)).any()
+    target = steps.rewards + DISCOUNT * steps.goes_on * at(held["q"], best)
+
+    def loss(params):
+        now = say(params, steps.earlier)
+        difference = huber(target - at(now["q"], steps.taken))
+        imitation = cross_entropy(now["behaviour"], steps.taken)
+        squares = (now["behaviour"] ** 2).mean(axis=-1)
+        return mean(difference + 0.01 * squares + imitation, steps.known)
+
+    assert_is(case, loss)
+
+
+def iql_loss(value, qs, least, logits, returns, taken):
+    """`least` and `returns` are held fixed."""
+    advantage = least - value
+    weight = jnp.minimum(jnp.exp(2.0 * jax.lax.stop_gradient(advantage)), 1.5)
+    return (
+        jnp.where(advantage > 0, 0.8, 0.2) * advantage**2
+        + sum((returns - at(q, taken)) ** 2 for q in qs)
+        + weight * cross_entropy(logits, taken)
+    )
+
+
+def test_iql():
+    case = make_case(iql, iql.Settings(**IQL))
+    steps, params = around(case.batch), case.state.params["params"]
+    critic = many(case.setup.policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)).apply)
+    policy = many(case.setup.policy(("logits", CHOICES)).apply)
+    later = critic({"params": params["critic"]}, steps.after)["value"][..., 0]
+    returns = steps.rewards + DISCOUNT * steps.goes_on * later
+    held = critic(case.state.extra, steps.earlier)
+    least = jnp.minimum(at(held["q1"], steps.taken), at(held["q2"], steps.taken))
+
+    def loss(params):
+        now = critic({"params": params["params"]["critic"]}, steps.earlier)
+        logits = policy({"params": params["params"]["policy"]}, steps.earlier)["logits"]
+        value, qs = now["value"][..., 0], (now["q1"], now["q2"])
+        return mean(iql_loss(value, qs, least, logits, returns, steps.taken), steps.known)
+
+    assert_is(case, loss)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_mopo(share):
+    """Of the data alone; and of what is imagined, two steps far, too."""
+    settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)
+    case = make_case(mopo, settings)
+    steps, old, target = around(case.batch), case.state.params, case.state.extra
+    module = mopo.Networks(case.setup.policy(("features", WIDTH)), CHOICES, 3)
+
+    def call(params, method, *inputs):
+        apply = functools.partial(module.apply, method=method)
+        return jax.vmap(apply, (None, *(0 for _ in inputs)))(params, *inputs)
+
+    seen, seen_later = (call(target, "features", of) for of in (steps.earlier, steps.after))
+    later = call(old, "judge", call(old, "features", steps.after))[0]
+    returns = steps.rewards + DISCOUNT * steps.goes_on * later
+
+    def least_of(features, taken):
+        _, *qs = call(target, "judge", features)
+        return jnp.minimum(*(at(q, taken) for q in qs))
+
+    def of_data(params):
+        now = call(params, "features", steps.earlier)
+        value, *qs = call(params, "judge", now)
+        logits = call(params, "logits", jax.lax.stop_gradient(now))
+        policy = iql_loss(value, qs, least_of(seen, steps.taken), logits, returns, steps.taken)
+        said = call(params, "predict", seen, steps.taken)  # [B, M, P, ...]
+        ends = jnp.zeros(steps.known.shape).at[:, -1].set(case.batch.terminated)[:, None]
+        ended = jnp.where(ends > 0, said.ending, -said.ending)
+        ensemble = (
+            ((said.features - seen_later[:, None]) ** 2).mean(axis=-1)
+            + (said.reward - steps.rewards[:, None]) ** 2
+            + jnp.logaddexp(0, -ended)
+        ).sum(axis=1)
+        cloned = cross_entropy(call(params, "behaviour", now), steps.taken)
+        return mean(share * policy + ensemble + cloned, steps.known)
+
+    imagined = []  # features [B, 1, D], actions, returns, and how alive it still is
+    features, alive = seen[:, -1:], jnp.ones((BATCH, 1))
+    keys = jax.vmap(lambda place: jax.random.split(jax.random.fold_in(KEY, place))[1])(
+        jnp.arange(BATCH)
+    )
+    for step in range(2):
+        draws = jax.vmap(lambda key, step=step: jax.random.split(jax.random.split(key, 2)[step]))(
+            keys
+        )
+        logits = call(old, "logits", features)
+        taken = jax.vmap(jax.random.categorical)(draws[:, 0], logits)
+        said = call(old, "predict", features, taken)
+        spread = jnp.sqrt(said.features.var(axis=1).mean(axis=-1)) + said.reward.std(axis=1)
+        goes_on = 1 - (1 / (1 + jnp.exp(-said.ending))).mean(axis=1)
+        member = jax.vmap(lambda key: jax.random.randint(key, (), 0, 3))(draws[:, 1])
+        next_features = said.features[jnp.arange(BATCH), member]
+        value = call(old, "judge", next_features)[0]
+        reward = said.reward.mean(axis=1) - 0.7 * spread
+        imagined.append((features, taken, reward + DISCOUNT * goes_on * value, alive))
+        features, alive = next_features, alive * goes_on
+
+    def loss(params):
+        total = of_data(params)
+        for features, taken, returns, alive in imagined:
+            value, *qs = call(params, "judge", features)
+            logits, least = call(params, "logits", features), least_of(features, taken)
+            each = alive * iql_loss(value, qs, least, logits, returns, taken)
+            total += (1 - share) * each.mean() / 2
+        return total
+
+    assert_is(case, loss)
+
+
+def test_cql():
+    case = make_case(cql, cql.Settings(discount=DISCOUNT, alpha=0.7))
+    steps, say = around(case.batch), many(case.setup.policy(("q", CHOICES)).apply)
+    later, held = (say(of, steps.after)["q"] for of in (case.state.params, case.state.extra))
+    target = steps.rewards + DISCOUNT * steps.goes_on * at(held, later.argmax(axis=-1))
+
+    def loss(params):
+        q = say(params, steps.earlier)["q"]
+        each = huber(target - at(q, steps.taken)) + 0.7 * cross_entropy(q, steps.taken)
+        return mean(each, steps.known)
+
+    assert_is(case, loss)
+
+
+def test_qr_dqn():
+    count = 3
+    case = make_case(qr_dqn, qr_dqn.Settings(discount=DISCOUNT, quantiles=count))
+    steps = around(case.batch)
+    apply = many(case.setup.policy(("q", CHOICES * count)).apply)
+
+    def say(params, contexts):
+        """[B, P, N, 2]."""
+        said = apply(params, contexts)["q"]
+        return said.reshape(*said.shape[:2], CHOICES, count).swapaxes(2, 3)
+
+    held = say(case.state.extra, steps.after)
+    best = jnp.broadcast_to(held.mean(axis=2).argmax(axis=-1)[..., None], held.shape[:3])
+    gain = DISCOUNT * steps.goes_on[..., None] * at(held, best)
+    targets = steps.rewards[..., None] + gain  # [B, P, N]
+
+    def loss(params):
+        q, total = say(params, steps.earlier), 0.0
+        for place in range(count):
+            estimate = at(q[:, :, place], steps.taken)
+            for other in range(count):
+                error = targets[..., other] - estimate
+                share = (place + 0.5) / count
+                total += jnp.where(error < 0, 1 - share, share) * huber(error) / count
+        return mean(total, steps.known)
+
+    assert_is(case, loss)
+
+
+def test_rem():
+    count = 3
+    case = make_case(rem, rem.Settings(discount=DISCOUNT, q_heads=count))
+    steps = around(case.batch)
+    apply = many(case.setup.policy(("q", CHOICES * count)).apply)
+    keys = [jax.random.split(jax.random.fold_in(KEY, place))[1] for place in range(BATCH)]
+    mixtures = jnp.stack([rem.mixture(key, count) for key in keys])
+
+    def say(params, contexts):
+        """[B, P, 2]: each example's own mixture."""
+        said = apply(params, contexts)["q"].reshape(BATCH, PAST + 1, CHOICES, count)
+        return (said * mixtures[:, None, None]).sum(axis=-1)
+
+    highest = say(case.state.extra, steps.after).max(axis=-1)
+    target = steps.rewards + DISCOUNT * steps.goes_on * highest
+
+    def loss(params):
+        difference = target - at(say(params, steps.earlier), steps.taken)
+        return mean(huber(difference), steps.known)
+
+    assert_is(case, loss)
+
+
+def test_plate():
+    """Past an end nothing is chosen, and no state is predicted; those it predicts do not move."""
+    horizon = 4
+    case = make_case(
+        plate, plate.Settings(state_weight=0.6), mixed.DOMAIN, horizon,
+        lambda: windows.concatenate(toy.demonstrations()),
+    )  # fmt: skip
+    actions, setup = case.batch.actions, case.setup
+    module = plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+
+    def call(params, method, *inputs):
+        apply = functools.partial(module.apply, method=method)
+        return jax.vmap(apply, (None, *(0 for _ in inputs)))(params, *inputs)
+
+    reached = call(case.state.params, "encode_unrolled", case.batch.context)[0][:, 1 - horizon :]
+    ends = [[int(action) == toy.END for action in plan] for plan in actions]
+    chosen = jnp.array([[not any(plan[:place]) for place in range(horizon)] for plan in ends])
+    acted = jnp.array([[not any(plan[: place + 1]) for place in range(horizon)] for plan in ends])
+    acted = acted[:, :-1]
+    assert not chosen.all() and chosen.all(axis=1).any()
+
+    def loss(params):
+        states, between = call(params, "encode_unrolled", case.batch.context)
+        logits, led = call(params, "read", states, between)
+        errors = jnp.where(acted, ((led - reached) ** 2).mean(axis=-1), 0).sum(axis=1)
+        errors = errors / jnp.maximum(acted.sum(axis=1), 1)
+        return mean(cross_entropy(logits, actions), chosen) + 0.6 * errors.mean()
+
+    assert_is(case, loss)
