@@ -5,7 +5,7 @@ import sys
 import jax.numpy as jnp
 
 import leapjax as leap
-from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.babyai.adapter import ACTIONS, END, BabyAIAdapter
 from leapjax.babyai.levels import find_level
 
 LEVEL, EPISODES = "GoToLocalS7N5", int(sys.argv[1]) if len(sys.argv) > 1 else 100
@@ -13,7 +13,8 @@ LEFT = ACTIONS.index("left")
 
 
 def left_turns(context, actions):  # a penalty: 0 where a plan is allowed
-    return 20.0 * jnp.sum(actions == LEFT)
+    executed = jnp.cumsum(actions == END) == 0  # what follows the end is not
+    return 20.0 * jnp.sum((actions == LEFT) & executed)
 
 
 class Counting(BabyAIAdapter):

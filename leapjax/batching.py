@@ -17,7 +17,7 @@ CHUNK_SIZES = (1, 16, 128)
 
 
 class NotANumber(ValueError):
-    """An energy that was minimised is NaN somewhere; `plan` is what came of it all the same."""
+    """An energy that was minimised is NaN or -inf; `plan` is what came of it all the same."""
 
     def __init__(self, message: str, plan: Plan) -> None:
         super().__init__(message, plan)
@@ -70,8 +70,8 @@ class CompiledPlanner:
             A `Plan` of NumPy arrays with a leading `[B]`.
 
         Raises:
-            ValueError: no contexts, or not as many as keys.
-            NotANumber: the energy of some action was NaN.
+            ValueError: no contexts, or not as many as keys, or contexts that are not numbers.
+            NotANumber: the energy of some action was NaN or -inf; it holds the plans.
         """
         keys = keys if hasattr(keys, "dtype") else jnp.stack(list(keys))
         typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
@@ -165,6 +165,10 @@ def compile_planner(
         chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
             split over as many of the devices as divide it.
         devices: to plan on; all of this process, if not given.
+
+    Raises:
+        TypeError: a `config` that is of no planner.
+        ValueError: chunk sizes that are not positive.
     """
     return CompiledPlanner(energy, config, chunk_sizes, devices)
 

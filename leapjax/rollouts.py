@@ -38,7 +38,13 @@ def join(parts: Sequence[Episodes]) -> Episodes:
 
 
 class History:
-    """The last K states, actions and rewards of one episode, as a planner's context."""
+    """The last K states, actions and rewards of one episode, as a planner's context.
+
+    Args:
+        observation: of the first state.
+        length: K.
+        num_actions: A.
+    """
 
     def __init__(self, observation: PyTree, length: int, num_actions: int) -> None:
         self.current = _copy(observation)
@@ -185,6 +191,7 @@ def evaluate(
         ValueError: nothing to play or to execute, an iteration that there is not, environments
             that are one and the same, or that have other actions than the planner, or
             observations that are not all of one shape.
+        NotANumber: see `CompiledPlanner`.
     """
     check_limits(executed, max_steps)
     begun = time.perf_counter()

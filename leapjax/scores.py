@@ -13,6 +13,11 @@ def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple
 
     Unlike the normal approximation it stays inside 0 .. 1 and is sound at 0% and 100%.
 
+    Args:
+        successes: of the episodes.
+        episodes: how many.
+        z: standard errors to each side; 1.96 for 95%.
+
     Raises:
         ValueError: no episodes, or more successes than episodes.
     """

@@ -36,7 +36,8 @@ class Demonstration(NamedTuple):
     actions: Array  # [n] int32
     rewards: Array  # [n] float32
     terminated: bool  # it came to an end of its own
-    truncated: bool  # it was cut off, by a limit of steps for instance
+    truncated: bool  # it was cut off, by a limit of steps for instance; what is then learned to
+    # follow is the end action, as after any other, but its last state keeps its value
     seed: int  # with which the environment was reset
 
 

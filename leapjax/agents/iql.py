@@ -26,8 +26,8 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 class Settings:
     """The options of IQL alone.
 
-    The expectile is that of the IQL paper in its mazes of ants, the temperature that in its
-    locomotion: LEAP's paper does not say which it took.
+    The IQL paper has the expectile in its mazes of ants, the temperature in its locomotion; LEAP's
+    does not say what it took.
     """
 
     expectile: float = 0.9
