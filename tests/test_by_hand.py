@@ -71,6 +71,10 @@ class Around(NamedTuple):
     goes_on: jax.Array
     known: jax.Array  # where the episode had begun
 
+    def returned(self, value):
+        """Each reward, and the discounted value [B, P] of the state that it led to."""
+        return self.rewards + DISCOUNT * self.goes_on * value
+
 
 def around(batch):
     earlier, after = (jax.vmap(f)(batch.context) for f in (windows.before, windows.after))
@@ -100,21 +104,32 @@ def cross_entropy(logits, taken):
     return jax.nn.logsumexp(logits, axis=-1) - at(logits, taken)
 
 
-def many(apply):
-    """A network's `apply` of one context, for a batch of them."""
-    return jax.vmap(apply, (None, 0))
+def caller(module):
+    """(parameters, method, *inputs) -> what a network says of each of a batch."""
+
+    def call(params, method, *inputs):
+        apply = functools.partial(module.apply, method=method)
+        return jax.vmap(apply, (None, *(0 for _ in inputs)))(params, *inputs)
+
+    return call
+
+
+def many(module):
+    """(parameters, contexts) -> the same, of a network that has but one thing to say."""
+    call = caller(module)
+    return lambda params, contexts: call(params, "__call__", contexts)
 
 
 def test_bcq():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = around(case.batch)
-    say = many(case.setup.policy(("q", CHOICES), ("behaviour", CHOICES)).apply)
+    say = many(case.setup.policy(("q", CHOICES), ("behaviour", CHOICES)))
     later, held = (say(of, steps.after) for of in (case.state.params, case.state.extra))
     likely = jax.nn.softmax(later["behaviour"])
     likely = likely / likely.max(axis=-1, keepdims=True) >= 0.9
     best = jnp.where(likely, later["q"], -jnp.inf).argmax(axis=-1)
     assert (best != later["q"].argmax(axis=-1)).any()
-    target = steps.rewards + DISCOUNT * steps.goes_on * at(held["q"], best)
+    target = steps.returned(at(held["q"], best))
 
     def loss(params):
         now = say(params, steps.earlier)
@@ -140,10 +155,10 @@ def iql_loss(value, qs, least, logits, returns, taken):
 def test_iql():
     case = make_case(iql, iql.Settings(**IQL))
     steps, params = around(case.batch), case.state.params["params"]
-    critic = many(case.setup.policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)).apply)
-    policy = many(case.setup.policy(("logits", CHOICES)).apply)
+    critic = many(case.setup.policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)))
+    policy = many(case.setup.policy(("logits", CHOICES)))
     later = critic({"params": params["critic"]}, steps.after)["value"][..., 0]
-    returns = steps.rewards + DISCOUNT * steps.goes_on * later
+    returns = steps.returned(later)
     held = critic(case.state.extra, steps.earlier)
     least = jnp.minimum(at(held["q1"], steps.taken), at(held["q2"], steps.taken))
 
@@ -162,15 +177,11 @@ def test_mopo(share):
     settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)
     case = make_case(mopo, settings)
     steps, old, target = around(case.batch), case.state.params, case.state.extra
-    module = mopo.Networks(case.setup.policy(("features", WIDTH)), CHOICES, 3)
-
-    def call(params, method, *inputs):
-        apply = functools.partial(module.apply, method=method)
-        return jax.vmap(apply, (None, *(0 for _ in inputs)))(params, *inputs)
+    call = caller(mopo.Networks(case.setup.policy(("features", WIDTH)), CHOICES, 3))
 
     seen, seen_later = (call(target, "features", of) for of in (steps.earlier, steps.after))
     later = call(old, "judge", call(old, "features", steps.after))[0]
-    returns = steps.rewards + DISCOUNT * steps.goes_on * later
+    returns = steps.returned(later)
 
     def least_of(features, taken):
         _, *qs = call(target, "judge", features)
@@ -227,9 +238,9 @@ def test_mopo(share):
 
 def test_cql():
     case = make_case(cql, cql.Settings(discount=DISCOUNT, alpha=0.7))
-    steps, say = around(case.batch), many(case.setup.policy(("q", CHOICES)).apply)
+    steps, say = around(case.batch), many(case.setup.policy(("q", CHOICES)))
     later, held = (say(of, steps.after)["q"] for of in (case.state.params, case.state.extra))
-    target = steps.rewards + DISCOUNT * steps.goes_on * at(held, later.argmax(axis=-1))
+    target = steps.returned(at(held, later.argmax(axis=-1)))
 
     def loss(params):
         q = say(params, steps.earlier)["q"]
@@ -243,7 +254,7 @@ def test_qr_dqn():
     count = 3
     case = make_case(qr_dqn, qr_dqn.Settings(discount=DISCOUNT, quantiles=count))
     steps = around(case.batch)
-    apply = many(case.setup.policy(("q", CHOICES * count)).apply)
+    apply = many(case.setup.policy(("q", CHOICES * count)))
 
     def say(params, contexts):
         """[B, P, N, 2]."""
@@ -252,15 +263,15 @@ def test_qr_dqn():
 
     held = say(case.state.extra, steps.after)
     best = jnp.broadcast_to(held.mean(axis=2).argmax(axis=-1)[..., None], held.shape[:3])
-    gain = DISCOUNT * steps.goes_on[..., None] * at(held, best)
-    targets = steps.rewards[..., None] + gain  # [B, P, N]
+    values = at(held, best)  # [B, P, N]
+    targets = [steps.returned(values[..., place]) for place in range(count)]
 
     def loss(params):
         q, total = say(params, steps.earlier), 0.0
         for place in range(count):
             estimate = at(q[:, :, place], steps.taken)
-            for other in range(count):
-                error = targets[..., other] - estimate
+            for target in targets:
+                error = target - estimate
                 share = (place + 0.5) / count
                 total += jnp.where(error < 0, 1 - share, share) * huber(error) / count
         return mean(total, steps.known)
@@ -272,7 +283,7 @@ def test_rem():
     count = 3
     case = make_case(rem, rem.Settings(discount=DISCOUNT, q_heads=count))
     steps = around(case.batch)
-    apply = many(case.setup.policy(("q", CHOICES * count)).apply)
+    apply = many(case.setup.policy(("q", CHOICES * count)))
     keys = [jax.random.split(jax.random.fold_in(KEY, place))[1] for place in range(BATCH)]
     mixtures = jnp.stack([rem.mixture(key, count) for key in keys])
 
@@ -282,7 +293,7 @@ def test_rem():
         return (said * mixtures[:, None, None]).sum(axis=-1)
 
     highest = say(case.state.extra, steps.after).max(axis=-1)
-    target = steps.rewards + DISCOUNT * steps.goes_on * highest
+    target = steps.returned(highest)
 
     def loss(params):
         difference = target - at(say(params, steps.earlier), steps.taken)
@@ -299,11 +310,7 @@ def test_plate():
         lambda: windows.concatenate(toy.demonstrations()),
     )  # fmt: skip
     actions, setup = case.batch.actions, case.setup
-    module = plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
-
-    def call(params, method, *inputs):
-        apply = functools.partial(module.apply, method=method)
-        return jax.vmap(apply, (None, *(0 for _ in inputs)))(params, *inputs)
+    call = caller(plate.AlternatingModel(setup.model, setup.sizes, setup.encoder()))
 
     reached = call(case.state.params, "encode_unrolled", case.batch.context)[0][:, 1 - horizon :]
     ends = [[int(action) == toy.END for action in plan] for plan in actions]
