@@ -20,7 +20,7 @@ DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/re
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 MEASURED = (  # files of rows beside those of experiments
-    "planning", "training", "quality", "landscape",
+    "planning", "training", "quality", "methods", "landscape",
     "atari-data", "atari-energy", "atari-cost", "atari-training",
 )  # fmt: skip
 
@@ -64,7 +64,7 @@ def documents(root: Path) -> dict[Path, str]:
         "iterations": (babyai.iterations, "babyai"),
         "methods": (babyai.methods, "babyai"),
         "acting": (babyai.acting, "babyai"),
-        "price": (babyai.price, "babyai"),
+        "price": (functools.partial(babyai.price, measured=rows["methods"]), "babyai"),
         "searches": (puzzles.searches, "puzzles"),
         "arms": (puzzles.arms, "puzzles"),
         "atari": (functools.partial(atari.played, data=rows["atari-data"]), "atari"),

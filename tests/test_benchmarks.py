@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import atari, planning, quality, scaling, training
+from benchmarks import atari, methods, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
 from experiments.common.config import make_domain, preset, specify, with_options
 from experiments.common.runtime import Cluster
@@ -80,6 +80,28 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     assert all(set(fields) <= row.keys() for row in written)
     assert all(row[field] > 0 for row in written for field in fields[5:])
     assert plot.stat().st_size > 1000
+
+
+def test_methods_take_turns_and_an_action_costs_its_share_of_a_plan(tmp_path, monkeypatch):
+    calls = []
+
+    def make_call(level, method, batch):
+        return lambda: calls.append((level, method, batch))
+
+    monkeypatch.setattr(methods, "make_call", make_call)
+    path = tmp_path / "rows.json"
+    small = ["--batch", "2", "--rounds", "2", "--seconds", "0"]
+    assert methods.main([*small, "--level", "PickUpLoc", "--json", str(path)]) == 0
+    assert calls == [("PickUpLoc", method, 2) for method in methods.METHODS] * 2
+    rows = json.loads(path.read_text())
+    assert [row["method"] for row in rows] == list(methods.METHODS)
+    assert all(row["plans_per_second"] > 0 and row["batch"] == 2 for row in rows)
+
+
+def test_a_plan_of_a_method_is_measured_as_the_method_plans(monkeypatch):
+    monkeypatch.setattr(methods, "preset", tiny_preset)
+    plan = methods.make_call("GoToLocalS7N5", "bc", 2)()
+    assert plan.actions.shape == (2, 1)  # of one action
 
 
 def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, quick_begin):

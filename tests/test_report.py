@@ -86,19 +86,21 @@ def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
 
 
 def test_what_acting_costs():
-    # 500 episodes of 6 steps, a plan for each, 100 plans per second.
-    rows = [row(method="bc", rate=1.0) | {"plans": 3000, "plans_per_second": 100}]
-    rows += [row() | {"plans": 1000, "plans_per_second": 100}]
+    # 500 episodes of 6 steps: a plan for each step, or for three.
+    rows = [row(method="bc", rate=1.0) | {"plans": 3000}, row() | {"plans": 1000}]
     assert babyai.acting(rows).splitlines()[2:] == [
         "| GoToLocalS8N7 | 6.0 | - | - | - | - | - | 6.0 (2.0) |"
     ]
-    busy = [row(method="mopo") | {"plans": 1000, "plans_per_second": 1}]  # other things ran too
-    assert babyai.price(rows + busy).splitlines()[2:] == [
-        "| GoToLocalS8N7 | 10.00 | - | - | - | - | - | 3.33 |"
+    timed = [
+        {"level": "GoToLocalS8N7", "method": method, "plans_per_second": 100.0}
+        for method in ("bc", "mopo", "leap")
     ]
-    rows = [row("PickUpLoc", method="bc") | {"plans": 3000, "plans_per_second": 100}]
+    assert babyai.price(rows, timed).splitlines()[2:] == [
+        "| GoToLocalS8N7 | 10.000 | - | - | - | - | - | 3.333 |"
+    ]
+    rows = [row("PickUpLoc", method="bc") | {"plans": 3000}]
     assert babyai.acting(rows).endswith("\n| PickUpLoc | 6.0 | - | - | - | - | - | - |")
-    assert babyai.price(rows).splitlines()[2:] == []  # something else was running
+    assert babyai.price(rows, timed).splitlines()[2:] == []  # not measured
 
 
 def test_settings_are_kept_apart():

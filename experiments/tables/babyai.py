@@ -40,8 +40,6 @@ BY_METHOD = {
 }
 ITERATED = (PAPER, WITHOUT_DISTANCES, OURS)
 ITERATIONS = (1, 2, 5, 10, 15, 30)  # T and N of every level, and fewer
-# What was played in one sitting, with nothing else running.
-TIMED = {"GoToLocalS8N7": ("bc", "bcq", "iql", "dt", "plate", "leap")}
 
 
 def uses(row: Row) -> bool:
@@ -209,14 +207,20 @@ def acting(rows: Sequence[Row]) -> str:
     return _by_acting_method(rows, cell)
 
 
-def price(rows: Sequence[Row]) -> str:
-    """Milliseconds of planning for each action, with preset `leapjax`, seed 0."""
+def price(rows: Sequence[Row], measured: Sequence[Row]) -> str:
+    """Milliseconds of planning for each action, with preset `leapjax`.
+
+    Args:
+        rows: of episodes, for the plans that an action takes (seed 0).
+        measured: plans per second, those of `benchmarks.methods`.
+    """
+    speeds = {(row["level"], row["method"]): row["plans_per_second"] for row in measured}
 
     def cell(row: Row) -> str:
-        planning = row["plans"] / row["plans_per_second"]
-        return f"{1e3 * planning / (row['mean_length'] * row['episodes']):.2f}"
+        plans = row["plans"] / (row["mean_length"] * row["episodes"])
+        return f"{1e3 * plans / speeds[row['level'], row['method']]:.3f}"
 
-    return _by_acting_method([r for r in rows if r["method"] in TIMED.get(r["level"], ())], cell)
+    return _by_acting_method([r for r in rows if (r["level"], r["method"]) in speeds], cell)
 
 
 def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:

@@ -1,0 +1,108 @@
+"""What a plan of each method costs: `python -m benchmarks.methods`.
+
+Speed does not depend on what a model has learned, so parameters are random. All methods take turns,
+and each keeps its fastest call: on a machine that is slow for a while, it is for all of them.
+"""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.planning import random_contexts
+from benchmarks.timing import Row, check_writable, fastest, write_rows
+from experiments.common import program, runtime
+from experiments.common.config import check_counts, make_domain, preset, specify
+from experiments.tables.babyai import COMPARED
+from leapjax import pretrained
+from leapjax.babyai import levels
+from leapjax.batching import compile_planner
+
+METHODS = tuple(name for name in COMPARED if name != "random")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure a plan of every method, with preset `leapjax`."""
+
+    level: str = "GoToLocalS8N7"
+    """A level of BabyAI."""
+    batch: int = 256
+    """Plans in one call."""
+    rounds: int = 5
+    """How often each method has its turn."""
+    seconds: float = 0.5
+    """Time to spend on each turn, at least."""
+    json: Path | None = None
+    """Write the rows here."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures, prints a table, and writes what was asked for."""
+    given = program.arguments_of(arguments)
+    options = tyro.cli(Options, args=given)
+    return program.guarded("benchmarks.methods", given, lambda: run(options))
+
+
+def run(options: Options) -> None:
+    """Measures every method on one level.
+
+    Raises:
+        UserError: an unknown level, a count below 1, or a file that cannot be written.
+    """
+    check_counts(options, "batch", "rounds")
+    level = levels.find_level(options.level)
+    check_writable(options.json)
+    runtime.use_every_core()
+    calls = {method: make_call(level.name, method, options.batch) for method in METHODS}
+    best = dict.fromkeys(METHODS, float("inf"))
+    for _ in range(options.rounds):
+        for method, call in calls.items():
+            best[method] = min(best[method], fastest(call, options.seconds))
+    rows: list[Row] = [
+        {
+            "level": level.name,
+            "method": method,
+            "preset": "leapjax",
+            "batch": options.batch,
+            "plans_per_second": options.batch / seconds,
+        }
+        for method, seconds in best.items()
+    ]
+    Console().print(table(rows))
+    write_rows(options.json, rows)
+
+
+def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
+    """A compiled call that makes plans for as many contexts as `batch` says."""
+    config = preset("babyai", level, method, "leapjax")
+    domain = make_domain(config)
+    agent = pretrained.make_agent(specify(config, 0, domain), domain)
+    planner = compile_planner(agent.energy, config.planner)
+    params = jax.jit(agent.init)(jax.random.key(0)).params
+    contexts = jax.device_put(random_contexts(domain, config.context, batch))
+    call = partial(planner, params, jax.random.split(jax.random.key(1), batch), contexts)
+    begun = time.perf_counter()
+    jax.block_until_ready(call())
+    print(f"{method}: compiled in {time.perf_counter() - begun:.0f} s", flush=True)
+    return call
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The rows for a terminal."""
+    result = Table("method", "plans/s", "ms per plan")
+    for row in rows:
+        speed = row["plans_per_second"]
+        result.add_row(row["method"], f"{speed:,.0f}", f"{1e3 / speed:.2f}")
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
