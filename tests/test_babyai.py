@@ -262,6 +262,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--horizon", "50", "--resampled", "1"], "longer than an episode"),
         (["--horizon", "0"], "horizon must be at least 1"),
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
+        (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--masking", "some"], "unknown masking 'some'"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
         (["--seeds", "-1"], "a training seed must be in"),

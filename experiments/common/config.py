@@ -230,6 +230,7 @@ def check(config: AnyConfig) -> None:
     if config.context < 0:
         raise UserError(f"--context must be at least 0, got {config.context}")
     check_executed(config.executed, config.planner.horizon)
+    check_target_return(config)
     checkpoints.check_path(config.runs)
     if config.play is not None and config.checkpoint is None:
         raise UserError("--play: another level is played with a --checkpoint, and there is none")
@@ -263,6 +264,23 @@ def check(config: AnyConfig) -> None:
             "begin at once (--fill together)"
         )
     check_memory(config, domain)
+
+
+def check_target_return(config: AnyConfig) -> None:
+    """Refuses to ask for a return where the model is not told of any.
+
+    Raises:
+        UserError: says which option is missing.
+    """
+    settings = config.method_settings
+    if getattr(settings, "returns", True):
+        return
+    default = preset(config.domain, config.level, config.method, config.preset).method_settings
+    if settings.target_return != default.target_return:
+        raise UserError(
+            f"--target-return {settings.target_return}: --method {config.method} is told of "
+            "returns with --returns only"
+        )
 
 
 def check_memory(config: AnyConfig, domain: Domain) -> None:
