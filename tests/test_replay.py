@@ -34,7 +34,7 @@ def test_a_view_may_be_as_large_as_the_level(level):
     assert not collection.dropped and len(collection.demonstrations) == 2
 
 
-def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None):
+def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None, first=1000):
     """A data set of MiniGrid's bot, whose episode 1 is spoiled."""
     with levels.silenced():
         env = wrap(gym.make(level))
@@ -43,7 +43,7 @@ def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None):
     collector = DataCollector(env, observation_space=space, jpeg_encoding=False)
     for episode in range(episodes):
         with levels.silenced():
-            collector.reset(seed=1000 + episode)
+            collector.reset(seed=first + episode)
         bot, action, over = BabyAIBot(env.unwrapped), None, False
         if episode == 1 and spoil is not None:
             collector.step(spoil)
@@ -84,6 +84,13 @@ def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(spoil, reas
     assert collection.dropped == {reason: 1}
     assert [d.seed for d in collection.demonstrations] == [1000, 1002, 1003, 1004]
     assert storage.reasons(collection) == f"1 {reason}"
+
+
+def test_an_episode_that_ends_at_another_match_is_dropped_and_counted():
+    # What is observed of the goal would teach to go elsewhere.
+    collection = storage.load(recorded(NAMES["partial"], episodes=2, first=1008), DOMAIN)
+    assert collection.dropped == {replay.OTHER_GOAL: 1}
+    assert [d.seed for d in collection.demonstrations] == [1008]
 
 
 def test_episodes_that_go_otherwise_are_dropped_and_counted():
@@ -132,4 +139,5 @@ def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
 def test_many_levels_replay():
     for level in ("BabyAI-GoToSeqS5R2-v0", "BabyAI-PickupLoc-v0", "BabyAI-UnlockLocal-v0"):
         name = recorded(f"minigrid/{level}/optimal-v0", episodes=20, level=level)
-        assert len(storage.load(name, BABYAI.make(level, Settings())).demonstrations) == 20
+        found = storage.load(name, BABYAI.make(level, Settings()))
+        assert len(found.demonstrations) + found.dropped.get(replay.OTHER_GOAL, 0) == 20

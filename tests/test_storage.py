@@ -220,6 +220,40 @@ def test_a_killed_save_leaves_what_was_there(saved, monkeypatch):
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
+def test_a_save_that_is_killed_between_two_names_is_mended_by_the_next(saved, monkeypatch):
+    rename, calls = Path.rename, []
+
+    def die_at_the_second(path, target):
+        calls.append(path)
+        return rename(path, target) if len(calls) == 1 else die()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", die_at_the_second)
+        with pytest.raises(Killed):
+            save(saved[:1])
+    assert not storage.exists(NAME)
+    save(saved[:1], "leapjax/other-v0")
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+
+
+def test_a_data_set_does_not_take_the_place_of_a_folder_of_others(saved):
+    parent = NAME.rpartition("/")[0]
+    with pytest.raises(UserError, match=f"{parent!r} is a folder of data sets"):
+        save(saved[:1], parent)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+
+
+def test_a_name_that_no_file_may_have():
+    assert not storage.exists("a" * 300)
+
+
+def test_room_is_asked_for_all_that_is_written(local_demonstrations, monkeypatch, minari_folder):
+    asked = []
+    monkeypatch.setattr(files, "check_room", lambda folder, needed: asked.append(needed))
+    save(local_demonstrations)
+    assert file_of(minari_folder).stat().st_size < asked[0]
+
+
 def test_several_processes_make_the_same_data_set(local_demonstrations, minari_folder):
     """Threads with one process id, as processes in containers have, on an empty folder."""
     with futures.ThreadPoolExecutor(4) as pool:

@@ -41,6 +41,12 @@ class BabyAIAdapter:
         self._instruction = vocabulary.encode(self.env.mission, self.level.words)
         return self.observe()
 
+    @property
+    def misled(self) -> bool:
+        """Whether an episode ended in front of another match than the goal that was observed."""
+        goal = self.goal
+        return goal != observations.NO_GOAL and observations.front_cell(self.env) != goal
+
     def observe(self) -> Observation:
         """The current state."""
         return observations.observe(self.env, self.side, self.goal, self._instruction)

@@ -8,7 +8,6 @@ from minigrid.core.world_object import Door
 from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.utils.baby_ai_bot import BabyAIBot
 
-from leapjax.babyai import observations
 from leapjax.babyai.adapter import END, BabyAIAdapter
 from leapjax.babyai.levels import Level
 from leapjax.babyai.observations import Observation
@@ -157,10 +156,7 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
     if not success:
         dropped[FAILED] += 1
         return None
-    if (
-        adapter.goal != observations.NO_GOAL
-        and observations.front_cell(adapter.env) != adapter.goal
-    ):
+    if adapter.misled:
         dropped[OTHER_GOAL] += 1
         return None
     wrong = random.random(len(actions)) < level.mislabelled

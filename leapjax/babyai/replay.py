@@ -18,6 +18,7 @@ DONE = "with the action `done`"
 DIFFERENT = "that go otherwise when they are played again"
 FAILED = "that failed"
 INCOMPLETE = "without an observation for every step"
+OTHER_GOAL = "that ended at another match than the nearest"
 
 
 def replay(recording: Recording, level: Level) -> Demonstration | str | None:
@@ -47,6 +48,8 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
         same = same and bool(np.isclose(reward, recording.rewards[step - 1]))
     if not same or not success:
         return DIFFERENT
+    if adapter.misled:
+        return OTHER_GOAL
     return Demonstration(
         Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
         recording.actions.astype(np.int32),

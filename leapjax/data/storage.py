@@ -12,7 +12,7 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
 SCRATCH, LOCK = ".leapjax-unfinished-", ".leapjax-lock"  # hidden: Minari passes them over
+BEFORE = "before"  # where in such a folder what a new data set replaces is kept
+ARRAY_ROOM = 2**12  # bytes that HDF5 takes for an array, beside what it holds
 UNKNOWN_SEED = -1  # of a user's episodes: no test level has it
 FORMAT = 2  # raised whenever what a demonstration holds changes: old caches are then unused
 
@@ -96,7 +98,11 @@ def _fields(observations: PyTree) -> dict[str, Any]:
 
 
 def save(name: str, collection: Collection, domain: Domain, description: str) -> None:
-    """Writes a Minari data set; a killed program leaves either all of it or nothing."""
+    """Writes a Minari data set; a killed program leaves all of it, or what was there before.
+
+    Raises:
+        UserError: there is no room, nothing can be written, or others have that name before theirs.
+    """
     buffers = [
         EpisodeBuffer(
             id=index,
@@ -113,17 +119,22 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
     root = datasets_folder()
     try:
         with files.only_process_in(root / LOCK, wait=True):
-            arrays = jax.tree.leaves([d.observations for d in collection.demonstrations])
-            files.check_room(root, sum(x.nbytes for x in arrays) // 4)  # they compress well
+            final = get_dataset_path(name)
+            if final.exists() and not exists(name):
+                raise UserError(f"{name!r} is a folder of data sets: name another")
+            files.check_room(root, _room(collection.demonstrations))
             for left_over in root.glob(f"{SCRATCH}*"):  # by a program that was killed
+                _put_back(left_over / BEFORE, root)
                 shutil.rmtree(left_over, ignore_errors=True)
             # Minari lists no hidden folders: nothing is a data set before it is whole.
             scratch = Path(tempfile.mkdtemp(prefix=SCRATCH, dir=root))
-            whole, final = scratch / "whole", get_dataset_path(name)
+            whole = scratch / "whole"
             _write(whole, buffers, domain, {"dataset_id": name, "description": description})
             final.parent.mkdir(parents=True, exist_ok=True)
             if final.exists():
-                final.rename(scratch / "before")
+                before = scratch / BEFORE / name
+                before.parent.mkdir(parents=True)
+                final.rename(before)
             whole.rename(final)
             files.flush(final.parent)
             shutil.rmtree(scratch, ignore_errors=True)
@@ -134,6 +145,20 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
             f"cannot write the data set {name!r} to {root} ({first_line(error)}): make room, or "
             "name another folder in MINARI_DATASETS_PATH"
         ) from None
+
+
+def _room(demonstrations: Sequence[Demonstration]) -> int:
+    """How many bytes demonstrations may take on the disk; nothing is compressed."""
+    arrays = jax.tree.leaves([each[:5] for each in demonstrations])
+    return sum(2 * np.asarray(each).nbytes + ARRAY_ROOM for each in arrays)
+
+
+def _put_back(before: Path, root: Path) -> None:
+    """Returns a data set that was to be replaced, where the program was killed in between."""
+    for data in list(before.rglob("data")):
+        name = data.parent.relative_to(before)
+        if data.is_dir() and not (root / name).exists():
+            data.parent.rename(root / name)
 
 
 def datasets_folder() -> Path:
@@ -478,4 +503,7 @@ def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
 def exists(name: str) -> bool:
     """Whether a data set of that id is in the local Minari folder."""
     # A folder without data is a namespace: others may be below it.
-    return (datasets_folder() / name / "data").exists()
+    try:
+        return (datasets_folder() / name / "data").exists()
+    except OSError:  # no file may have that name, or nobody may look
+        return False
