@@ -6,7 +6,6 @@ alone.
 """
 
 import dataclasses
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,14 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, program
+from experiments.common import experiment, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
-from leapjax import files
 from leapjax.atari.domain import FOLDER, LONGEST, Settings, make, preset
 from leapjax.atari.games import find_game
-from leapjax.checkpoints import read_json
 
 RECORDED = Path("results/atari-data.json")
 EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
@@ -82,8 +79,7 @@ def run(options: Collect) -> None:
     games = [game for manifest in made for game in manifest["games"]]
     console.print(scores_table(games))
     if options.record:
-        known = read_json(RECORDED) if RECORDED.exists() else {}
-        files.write_text(RECORDED, json.dumps({**known, options.game: games}, indent=1) + "\n")
+        results.add(RECORDED, options.game, games)
 
 
 def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:

@@ -6,7 +6,6 @@ that it learned from, beside what each of them was rewarded with.
 
 import dataclasses
 import functools
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,8 +21,7 @@ from scipy import stats
 from experiments.accuracy import learned
 from experiments.common import plots, program, results, runtime
 from experiments.common.config import check_counts
-from leapjax import files, pretrained
-from leapjax.checkpoints import read_json
+from leapjax import pretrained
 from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
@@ -66,19 +64,17 @@ def report(options: Options) -> None:
             )
     runtime.start()
     path = (Path("results") if options.record else options.runs) / RESULTS
-    found = read_json(path) if path.exists() else {}
     console = Console()
     for checkpoint in options.checkpoint:
         planner = pretrained.load(checkpoint)
         specification = planner.specification
         domain, origin = pretrained.make_domain(specification), specification.origin
         each = correlate(planner, learned(domain, origin, origin.demos), options.windows)
-        found[specification.level] = each
+        found = results.add(path, specification.level, each)
         console.print(
             f"{specification.level}: rank correlation {each['correlation']:.2f} of energy "
             f"and reward (p = {each['p_value']:.2g}, {len(each['energies'])} trajectories)"
         )
-    files.write_text(path, json.dumps(found, indent=1) + "\n")
     picture = options.runs / "atari-energy.png"
     plots.energy_against_reward(found, picture)
     console.print(f"picture: {picture}", highlight=False, markup=False)

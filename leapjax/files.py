@@ -131,7 +131,7 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
                 owner = file.read().strip() or "unknown"
                 raise UserError(
                     f"{folder} is in use by another process ({owner}): wait for it, stop it, or "
-                    "give this run another --runs folder"
+                    "name another folder"
                 ) from None
         file.seek(0)
         file.truncate()

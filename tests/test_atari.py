@@ -1,9 +1,13 @@
+import dataclasses
 import functools
 import json
 import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -215,8 +219,8 @@ def same(found, expected):
     np.testing.assert_array_equal(found, expected)
 
 
-# Where in memory a player is, along the axis of the mirror.
-PLACES = {"Breakout": 72, "Qbert": 43, "Pong": 51, "Seaquest": 70}
+# Where in memory a player is, along the axis of the mirror; and across it.
+PLACES = {"Breakout": (72,), "Qbert": (43, 67), "Pong": (51,), "Seaquest": (70, 97)}
 
 
 @pytest.mark.parametrize("name", GAMES)
@@ -232,15 +236,18 @@ def test_in_a_mirror_actions_do_the_opposite(name):
 
     def way(action):
         emulator.restore(start)
-        before = int(emulator.ram()[PLACES[name]])
+        before = [int(emulator.ram()[place]) for place in PLACES[name]]
         for _ in range(6):
             emulator.step(game.actions.index(action))
-        return int(emulator.ram()[PLACES[name]]) - before
+        after = [int(emulator.ram()[place]) for place in PLACES[name]]
+        return np.subtract(after, before)
 
     pairs = {a: game.mirror.actions[a] for a in game.actions if a in game.mirror.actions}
     assert len(pairs) >= 2
     for action, other in pairs.items():
-        assert way(action) * way(other) < 0
+        ours, theirs = way(action), way(other)
+        assert ours[0] * theirs[0] < 0
+        np.testing.assert_array_equal(ours[1:], theirs[1:])
 
 
 def test_the_mirror_of_breakout_is_in_its_middle():
@@ -272,7 +279,7 @@ def test_presets_are_the_papers_and_ours():
 @pytest.mark.parametrize(
     "changes",
     [{"transitions": 0}, {"sticky": 1.5}, {"sticky": float("nan")}, {"shift": -1}, {"shift": 84},
-     {"max_steps": 0}, {"replay_run": 0}],
+     {"max_steps": 0}, {"max_steps": 2**29}, {"replay_run": 0}],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
@@ -351,6 +358,33 @@ def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
     assert not multiprocessing.active_children()
 
 
+def test_processes_end_when_the_first_is_killed():
+    program = (
+        "import os, time\n"
+        "from leapjax.atari.collect import _processes\n"
+        "if __name__ == '__main__':\n"
+        "    with _processes(1) as pool:\n"
+        "        print(pool.submit(os.getpid).result(), flush=True)\n"
+        "        time.sleep(100)\n"
+    )
+    first = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    other = int(first.stdout.readline())
+    first.kill()
+    first.wait()
+    for _ in range(100):
+        if not _runs(other):
+            return
+        time.sleep(0.1)
+    pytest.fail(f"process {other} has not ended")
+
+
+def _runs(process):
+    try:
+        return "Z" not in Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+
+
 def _die(*shard):
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -372,6 +406,13 @@ def test_games_of_another_length_are_not_taken_for_those_asked_for(collected, ca
     _, arguments = collected
     assert atari.main([*arguments, "--longest", "90"]) == 2
     assert "cut off after 80 decisions, not after 90" in capsys.readouterr().err
+
+
+def test_games_of_other_demonstrators_are_not_taken_for_todays(collected, monkeypatch, capsys):
+    _, arguments = collected
+    monkeypatch.setattr(collect.demonstrators, "_NOISES", (0.2,))
+    assert atari.main(arguments) == 2
+    assert "other shares of random actions than today's" in capsys.readouterr().err
 
 
 def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path):
@@ -433,10 +474,13 @@ def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys
 def test_the_table_has_normalised_scores():
     row = {
         "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
-        "mean_return": 30.5, "return_error": 2.88,
+        "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
     }  # fmt: skip
     name = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
+    # Its checkpoint played again is no other seed.
+    again = dataclasses.replace(preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path())
+    rows += [{**rows[0], "train_steps": 0, "hash": configuration_hash(again, 0)}]
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table

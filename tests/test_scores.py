@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from leapjax.scores import (
+    SHARED,
     aggregate,
     interquartile_mean,
     interval_over_seeds,
@@ -85,7 +86,8 @@ def test_seeds_that_differ_widen_the_interval():
         return high - low
 
     alike, apart = width(450, 450, 450), width(400, 450, 500)
-    low, high = wilson_interval(1350, 1500)
+    # They play the same levels: three seeds do not say as much as three times the levels would.
+    low, high = wilson_interval(round(450 / SHARED), round(500 / SHARED))
     assert alike == pytest.approx(high - low, rel=0.05)
     assert apart > 3 * alike
 
@@ -93,19 +95,24 @@ def test_seeds_that_differ_widen_the_interval():
 def test_where_episodes_are_many_it_is_the_bootstrap_over_seeds():
     rates = np.array([0.2, 0.5, 0.9])
     low, high = interval_over_seeds((rates * 10**9).astype(int), [10**9] * 3)
-    # Three of three seeds are the least, or the best, one time in 27: more often than 2.5%.
-    assert (low, high) == pytest.approx((0.2, 0.9), abs=1e-3)
+    # Three of three seeds are the least, or the best, one time in 27: more often than 2.5%. From
+    # their mean that is further by the root of 3 / 2, for which three seeds vary too little.
+    mean = rates.mean()
+    expected = mean + math.sqrt(3 / 2) * (rates[[0, 2]] - mean)
+    assert (low, high) == pytest.approx(tuple(expected), abs=1e-3)
 
 
 def test_the_interval_over_seeds_holds_the_truth_as_often_as_it_says():
-    """Up to what three seeds can say: a bootstrap of few is known to be too narrow."""
+    """Of seeds that differ, and fail on the same levels more often than chance has it."""
     rng = np.random.default_rng(1)
     held = 0
-    for _ in range(100):
-        rates = np.clip(rng.normal(0.8, 0.03, 8), 0, 1)
-        low, high = interval_over_seeds(rng.binomial(200, rates), [200] * 8)
+    for _ in range(200):
+        hard, alone = rng.normal(size=200), rng.normal(size=(3, 200))
+        needed = stats.norm.ppf(np.clip(rng.normal(0.8, 0.02, 3), 0, 1))
+        solved = np.sqrt(0.6) * hard + np.sqrt(0.4) * alone < needed[:, None]
+        low, high = interval_over_seeds(solved.sum(axis=1), [200] * 3)
         held += low <= 0.8 <= high
-    assert 85 <= held <= 100
+    assert 185 <= held <= 199
 
 
 @pytest.mark.parametrize(("successes", "episodes"), [([], []), ([1], [0]), ([3, 6], [5, 5])])
@@ -129,7 +136,9 @@ def test_an_aggregate_is_stratified_by_level():
     assert low < middle < high
     # Of many episodes only the seeds of the first level are left to differ.
     certain = [([g * 10**7 for g in good], [c * 10**7 for c in of]) for good, of in levels]
-    assert aggregate(certain)[1] == pytest.approx(((0.5 + 0.8) / 2, (0.6 + 0.8) / 2), abs=1e-3)
+    far = 0.05 * math.sqrt(2)
+    expected = [(0.55 - far + 0.8) / 2, (0.55 + far + 0.8) / 2]
+    assert aggregate(certain)[1] == pytest.approx(expected, abs=1e-3)
     one = aggregate([([190], [200])])
     assert one == (0.95, interval_over_seeds([190], [200]))
     with pytest.raises(ValueError, match="no levels"):

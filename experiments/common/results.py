@@ -12,6 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from leapjax import scores
+from leapjax.checkpoints import read_json
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, read_text, write_text
 from leapjax.rollouts import Episodes
@@ -78,6 +79,14 @@ def record(path: Path, row: Row) -> None:
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
         write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def add(path: Path, name: str, value: Any) -> dict[str, Any]:
+    """Adds a value by its name to a JSON file, in the place of one of that name; all of them."""
+    with only_process_in(path.parent, wait=True):
+        found = {**(read_json(path) if path.exists() else {}), name: value}
+        write_text(path, json.dumps(found, indent=1) + "\n")
+    return found
 
 
 def write_episodes(path: Path, episodes: Episodes) -> None:

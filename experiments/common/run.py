@@ -218,6 +218,7 @@ def fit(
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
+    del examples  # of Atari, as large as all frames
     compiling = time.perf_counter()
     if total:  # the one program that depends on how many demonstrations there are
         jax.block_until_ready(step.draw(key, state.step, steps))

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.common.results import Row
 from experiments.tables.cells import table
-from experiments.tables.settings import Setting
+from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
 from leapjax.atari.games import GAMES
 
@@ -37,10 +37,8 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     columns = [*COLUMNS, "the data"]
     lines = []
     for name, game in GAMES.items():
-        of = {
-            title: [row for row in rows if row["level"] == name and setting.has(row)]
-            for title, setting in COLUMNS.items()
-        }
+        played = [row for row in rows if row["level"] == name]
+        of = {title: of_setting(played, setting) for title, setting in COLUMNS.items()}
         theirs = {"LEAP without return": game.paper_without_return} | {
             title: game.paper[setting.method]
             for title, setting in COLUMNS.items()

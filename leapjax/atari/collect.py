@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -113,13 +114,12 @@ def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> 
     """Plays and writes one file; what is in it."""
     game = find_game(name)
     logs = replay.replay_logs(folder, game, run)
-    noises = demonstrators.NOISES
     first = TRAINING_START + run * TRAINING_STRIDE + number * GAMES
     played: list[replay.Episode] = []
     games: list[dict[str, Any]] = []
     while sum(len(episode.actions) for episode in played) < SHARD:
         index = len(played)
-        seed, noise = first + index, noises[(number + index) % len(noises)]
+        seed, noise = first + index, demonstrators.noise_of(game, number + index)
         each = demonstrators.play(game, seed, noise, longest)
         played.append(replay.Episode(each.frames, each.actions, each.rewards))
         games.append(
@@ -150,6 +150,8 @@ def _known(logs: Path, number: int, longest: int | None = None) -> Manifest | No
     try:
         manifest = json.loads(files.read_text(path))
         _count([manifest])
+        noises = [game["noise"] for game in manifest["games"]]
+        game = find_game(manifest["game"])
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
     found = manifest.get("longest", longest)
@@ -157,6 +159,12 @@ def _known(logs: Path, number: int, longest: int | None = None) -> Manifest | No
         raise UserError(
             f"{logs} holds games that were cut off after {found} decisions, not after {longest}: "
             "remove them, or name another folder"
+        )
+    today = [demonstrators.noise_of(game, number + index) for index in range(len(noises))]
+    if longest is not None and noises != today:
+        raise UserError(
+            f"{logs} holds games with other shares of random actions than today's demonstrators "
+            "have: remove them, or name another folder"
         )
     return manifest
 
@@ -192,7 +200,7 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
     others = set(multiprocessing.active_children())
     # Not forked: this process may run threads.
     pool = ProcessPoolExecutor(
-        count, multiprocessing.get_context("spawn"), initializer=_ignore_interrupts
+        count, multiprocessing.get_context("spawn"), initializer=_end_with_the_first
     )
     try:
         yield pool
@@ -216,6 +224,14 @@ def _finished(made: Future[Manifest]) -> bool:
     return True
 
 
-def _ignore_interrupts() -> None:
-    """Ctrl-C reaches all processes: the first one ends the others."""
+def _end_with_the_first() -> None:
+    """Ctrl-C reaches all processes: the first one ends the others, also when it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    first = multiprocessing.parent_process()
+
+    def follow() -> None:
+        if first is not None:
+            first.join()
+            os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

@@ -13,7 +13,7 @@ import numpy as np
 from leapjax.atari import replay
 from leapjax.atari.augmentation import mirrored, shifted
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
-from leapjax.atari.games import GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
+from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, check_at_least
@@ -21,6 +21,7 @@ from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
+MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
 TOKENS = 4  # of a state, of our encoder
 TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
 
@@ -42,6 +43,8 @@ class Settings:
         check_at_least(self, 0, "shift")
         if not 0 <= self.sticky <= 1:  # false for NaN too
             raise ValueError(f"sticky must be in 0 .. 1, got {self.sticky}")
+        if self.max_steps > MOST_STEPS:
+            raise ValueError(f"max_steps must be at most {MOST_STEPS}, got {self.max_steps}")
         if self.shift >= WIDTH:
             raise ValueError(f"shift must be less than {WIDTH}, got {self.shift}")
 
@@ -94,7 +97,14 @@ def source(game: Game, settings: Settings) -> Source:
         from leapjax.atari.collect import shards  # noqa: PLC0415  (ale-py is optional)
 
         ours = shards(Path(where), game, count, run)
-        return replay.read(Path(where), game, count, seed, run, ours)
+        found = replay.read(Path(where), game, count, seed, run, ours)
+        held = sum(len(each.actions) for each in found.demonstrations)
+        if held < count:
+            raise UserError(
+                f"{where} holds {held} transitions of {game.name}, fewer than --transitions "
+                f"{count}: use --transitions {held}"
+            )
+        return found
 
     def write(where: str, progress: Callable[[int], None]) -> str:
         from leapjax.atari.collect import collect  # noqa: PLC0415  (so)

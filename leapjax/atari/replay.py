@@ -7,7 +7,7 @@ A run of a game is a folder of shards; shard N is six files, each a gzip of one 
     $store$_action_ckpt.N.gz       [R] int32
     $store$_reward_ckpt.N.gz       [R] float32, clipped to [-1, 1]
     $store$_terminal_ckpt.N.gz     [R] uint8: the episode ended with this action
-    add_count_ckpt.N.gz, invalid_range_ckpt.N.gz: the buffer's own, not needed to read
+    add_count_ckpt.N.gz, invalid_range_ckpt.N.gz: the buffer's own, which nothing here reads
 
 Three rows of zeros, the padding, come before every episode. The last row is not of this shard:
 the buffer is circular, and that row had not been written again yet. An episode may go on from
@@ -49,7 +49,7 @@ _STORED: dict[str, tuple[np.dtype, tuple[int, ...]]] = {  # by name: the type, t
     "observation": (np.dtype(np.uint8), (HEIGHT, WIDTH)),
 }
 # The largest comes last: a shard that has it has everything.
-_PARTS = ("add_count", "invalid_range", *(f"$store$_{name}" for name in _STORED))
+_PARTS = tuple(f"$store$_{name}" for name in _STORED)
 
 _BLOCK = 2**19  # bytes that are unpacked at once
 _LEVEL = 4  # of gzip's compression: twice as fast as the default, and hardly larger
