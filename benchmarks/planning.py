@@ -31,6 +31,7 @@ from leapjax.babyai import levels
 from leapjax.babyai.levels import Level
 from leapjax.batching import compile_planner, plan_keys, split_batch
 from leapjax.domain import Domain, blank_context
+from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig, bind
 from leapjax.types import Energy, Params
 
@@ -70,10 +71,12 @@ def run(options: Options) -> None:
     """Measures both presets on every level.
 
     Raises:
-        UserError: what was asked for cannot be written.
+        UserError: what was asked for cannot be written, or is less than nothing.
     """
     if options.plot is not None:
         plots.check_figure(options.plot)
+    if options.large < 0:
+        raise UserError(f"--large must be at least 0, got {options.large}")
     check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]

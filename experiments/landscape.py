@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files
 from leapjax.batching import compile_planner
+from leapjax.checkpoints import read_json
 from leapjax.data import seeds, windows
 from leapjax.domain import Domain
 from leapjax.errors import UserError
@@ -79,6 +80,10 @@ def report(options: Options, interruption: Interruption) -> None:
         check_counts(options, "steps")
     if not options.presets:
         raise UserError("--presets: name at least one, such as leapjax")
+    if options.record and options.steps is not None:
+        raise UserError("--record: what is recorded is trained for the preset's number of --steps")
+    folder = Path("results") if options.record else options.runs
+    files.check_writable(folder)
     console = Console()
     wanted = []
     for preset in options.presets:
@@ -96,10 +101,21 @@ def report(options: Options, interruption: Interruption) -> None:
         this = experiment.make_run(EXPERIMENT, config, options.seed, console, interruption)
         found.append(landscape(this, options.trajectories))
     console.print(table(found))
-    folder = Path("results") if options.record else options.runs
-    files.write_text(folder / RESULTS, json.dumps(found, indent=1) + "\n")
+    keep(folder / RESULTS, found)
     plots.landscape(found, options.runs / "landscape.png")
     console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False, markup=False)
+
+
+def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
+    """Adds what was found to a file, in the place of others of the same level, preset and seed."""
+
+    def name(each: Mapping[str, Any]) -> tuple[Any, ...]:
+        return each["level"], each["preset"], each["seed"]
+
+    with files.only_process_in(path.parent, wait=True):
+        known = {name(each): each for each in (read_json(path) if path.exists() else [])}
+        known |= {name(each): each for each in found}
+        files.write_text(path, json.dumps(list(known.values()), indent=1) + "\n")
 
 
 def landscape(this: Run, count: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
 import shutil
@@ -24,6 +25,7 @@ from leapjax.types import PyTree, TrainState
 
 UNUSABLE = ("[", "*", "?", ":/")  # in a path: Orbax takes them for patterns and for addresses
 ITEM = "default"  # Orbax's name for the only thing that a checkpoint of ours holds
+PASSING = {errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM}  # not damage
 T = TypeVar("T")
 
 
@@ -124,6 +126,10 @@ class Checkpoints:
             except UserError:
                 raise
             except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+                if isinstance(error, MemoryError) or getattr(error, "errno", None) in PASSING:
+                    raise UserError(
+                        f"cannot read {path} now ({first_line(error)}): it is left as it is"
+                    ) from None
                 aside = path.with_name(f"{path.name}.damaged")
                 shutil.rmtree(aside, ignore_errors=True)
                 path.rename(aside)

@@ -119,7 +119,7 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / ".lock").open("a+", encoding="utf-8")
+        file = (folder / ".lock").open("ab+", buffering=0)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
     with file:
@@ -128,13 +128,12 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             except OSError:
                 file.seek(0)
-                owner = file.read().strip() or "unknown"
+                owner = file.read().decode(errors="replace").strip() or "unknown"
                 raise UserError(
                     f"{folder} is in use by another process ({owner}): wait for it, stop it, or "
                     "name another folder"
                 ) from None
-        file.seek(0)
-        file.truncate()
-        file.write(f"{os.getpid()}\n")
-        file.flush()
+        with contextlib.suppress(OSError):  # a full disk: the lock itself takes no room
+            file.truncate(0)
+            file.write(f"{os.getpid()}\n".encode())
         yield

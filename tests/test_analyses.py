@@ -240,7 +240,11 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert landscape.main([*arguments, "--trajectories", "0"]) == 2
     assert landscape.main([*arguments, "--steps", "0"]) == 2
     assert landscape.main(["--presets"]) == 2
-    assert json.loads((place / "runs" / "landscape.json").read_text()) == [again]  # still there
+    assert landscape.main([*arguments, "--record", "--steps", "3"]) == 2
+    path = place / "runs" / "landscape.json"
+    assert json.loads(path.read_text()) == [again]  # still there
+    landscape.keep(path, [{**again, "preset": "paper"}, again])
+    assert [each["preset"] for each in json.loads(path.read_text())] == ["leapjax", "paper"]
 
 
 def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):

@@ -268,6 +268,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--seeds", "-1"], "a training seed must be in"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
+        (["--checkpoint", "n" * 300], f"File name too long: {'n' * 300}"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):

@@ -1,5 +1,6 @@
 """Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
 
+import errno
 import json
 import os
 import signal
@@ -172,6 +173,20 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path):
     assert (tmp_path / "checkpoints" / "3.damaged").is_dir()
 
 
+def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp_path, monkeypatch):
+    def busy(*arguments, **more):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    saved = Checkpoints(tmp_path / "checkpoints")
+    saved.save(state(1))
+    with monkeypatch.context() as patch:
+        patch.setattr(saved._manager, "restore", busy)
+        with pytest.raises(UserError, match="now .*Too many open files.* it is left as it is"):
+            saved.restore(state(0))
+    assert int(saved.restore(state(0)).step) == 1
+    saved.close()
+
+
 def test_a_path_that_goes_up_is_the_folder_that_it_leads_to(tmp_path):
     (tmp_path / "below").mkdir()
     roundabout = tmp_path / "below" / ".." / "checkpoints"
@@ -222,6 +237,9 @@ try:
     saved.close()
 except UserError as error:
     print("state:", error)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 100_000))
+with files.only_process_in(folder / "run"):  # which takes no room
+    print("inside")
 """
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False
@@ -229,6 +247,7 @@ except UserError as error:
     lines = done.stdout.splitlines()
     assert lines[0].startswith(f"row: cannot write {tmp_path}/row.json"), done.stderr[-2000:]
     assert lines[1].startswith(f"state: cannot write a checkpoint to {tmp_path}/checkpoints")
+    assert lines[2] == "inside"
     assert (tmp_path / "row.json").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1

@@ -245,7 +245,8 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     missing = [name for name in ways if name not in rows]
     models = models_of(work, case, method, seed) if missing else []
     for name in missing:
-        seconds = sum(training_seconds(run_folder(each, seed)) for each in settings)
+        # A sum of models may have one of them twice.
+        seconds = sum(map(training_seconds, {run_folder(each, seed) for each in settings}))
         said, episodes = play(case, ways[name], models, seed, options, work.interruption)
         row = {
             "experiment": analysis.name,

@@ -1,5 +1,6 @@
 """Where a program begins and ends: a user's mistake is one line and exit code 2."""
 
+import errno
 import os
 import shlex
 import sys
@@ -26,6 +27,10 @@ def renamed(arguments: Sequence[str], names: Mapping[str, str]) -> list[str]:
     """A command line whose options have other names, by those that they have."""
     parts = [argument.partition("=") for argument in arguments]
     return [f"{names.get(name, name)}{equals}{value}" for name, equals, value in parts]
+
+
+# A path that is too long, leads through a file, or into a folder that may not be looked into.
+NAMED_WRONGLY = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR}
 
 
 def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
@@ -61,6 +66,10 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         # What is left of it has nowhere to go; the interpreter would try again at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _end("stopped: nobody reads the output any more", 1)
+    except OSError as error:
+        if error.errno not in NAMED_WRONGLY:
+            raise
+        return _end(f"error: {error.strerror}: {error.filename}", 2)
     return 0
 
 
