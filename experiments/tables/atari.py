@@ -37,8 +37,8 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     columns = [*COLUMNS, "the data"]
     lines = []
     for name, game in GAMES.items():
-        played = [row for row in rows if row["level"] == name]
-        of = {title: of_setting(played, setting) for title, setting in COLUMNS.items()}
+        ours = [row for row in rows if row["level"] == name]
+        of = {title: of_setting(ours, setting) for title, setting in COLUMNS.items()}
         theirs = {"LEAP without return": game.paper_without_return} | {
             title: game.paper[setting.method]
             for title, setting in COLUMNS.items()
