@@ -16,12 +16,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.planning import random_contexts
+from benchmarks.planning import random_contexts, untrained
 from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import check_counts, make_domain, preset, specify
+from experiments.common.config import check_counts, preset
 from experiments.tables.babyai import COMPARED
-from leapjax import pretrained
 from leapjax.babyai import levels
 from leapjax.batching import compile_planner
 
@@ -83,10 +82,8 @@ def run(options: Options) -> None:
 def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
     """A compiled call that makes plans for as many contexts as `batch` says."""
     config = preset("babyai", level, method, "leapjax")
-    domain = make_domain(config)
-    agent = pretrained.make_agent(specify(config, 0, domain), domain)
-    planner = compile_planner(agent.energy, config.planner)
-    params = jax.jit(agent.init)(jax.random.key(0)).params
+    energy, params, domain = untrained(config)
+    planner = compile_planner(energy, config.planner)
     contexts = jax.device_put(random_contexts(domain, config.context, batch))
     call = partial(planner, params, jax.random.split(jax.random.key(1), batch), contexts)
     begun = time.perf_counter()

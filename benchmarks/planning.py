@@ -25,7 +25,7 @@ from rich.table import Table
 from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import plots, program, runtime
-from experiments.common.config import make_domain, preset, specify, with_options
+from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from leapjax import pretrained
 from leapjax.babyai import levels
 from leapjax.babyai.levels import Level
@@ -153,7 +153,11 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
 def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
     """A preset's energy with random parameters, with the horizon of the appendix."""
     default = preset("babyai", level.name, "leap", name)
-    config = with_options(default, {"horizon": level.horizon})
+    return untrained(with_options(default, {"horizon": level.horizon}))
+
+
+def untrained(config: AnyConfig) -> tuple[Energy, Params, Domain]:
+    """The energy of a configuration with random parameters, and its domain."""
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     return agent.energy, jax.jit(agent.init)(jax.random.key(0)).params, domain

@@ -8,7 +8,6 @@ at random, over training. Beside it, the energy of plans over the iterations tha
 import contextlib
 import dataclasses
 import functools
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +29,6 @@ from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files
 from leapjax.batching import compile_planner
-from leapjax.checkpoints import read_json
 from leapjax.data import seeds, windows
 from leapjax.domain import Domain
 from leapjax.errors import UserError
@@ -112,10 +110,10 @@ def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
     def name(each: Mapping[str, Any]) -> tuple[Any, ...]:
         return each["level"], each["preset"], each["seed"]
 
-    with files.only_process_in(path.parent, wait=True):
-        known = {name(each): each for each in (read_json(path) if path.exists() else [])}
-        known |= {name(each): each for each in found}
-        files.write_text(path, json.dumps(list(known.values()), indent=1) + "\n")
+    def changed(known: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
+        return list({name(each): each for each in [*(known or []), *found]}.values())
+
+    results.change(path, changed)
 
 
 def landscape(this: Run, count: int) -> dict[str, Any]:

@@ -87,7 +87,8 @@ def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
 @games
 def test_noise_replaces_actions(name):
     levels = [noise_of(GAMES[name], number) for number in range(6)]
-    assert levels[:3] == levels[3:] == sorted(set(levels)) and 0 < levels[0] < levels[2] < 1
+    assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
+    assert levels[2] <= (0.7 if name == "Seaquest" else 0.5)
     noisy = played(name, noise=1.0)
     assert len(set(noisy.actions)) >= 4
     assert not same(played(name), noisy)

@@ -4,7 +4,7 @@ import datetime
 import json
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -81,12 +81,17 @@ def record(path: Path, row: Row) -> None:
         write_text(path, "".join(f"{line}\n" for line in lines))
 
 
-def add(path: Path, name: str, value: Any) -> dict[str, Any]:
-    """Adds a value by its name to a JSON file, in the place of one of that name; all of them."""
+def change(path: Path, changed: Callable[[Any], Any]) -> Any:
+    """Rewrites a JSON file as what becomes of it, None where there is none, atomically."""
     with only_process_in(path.parent, wait=True):
-        found = {**(read_json(path) if path.exists() else {}), name: value}
+        found = changed(read_json(path) if path.exists() else None)
         write_text(path, json.dumps(found, indent=1) + "\n")
     return found
+
+
+def add(path: Path, name: str, value: Any) -> dict[str, Any]:
+    """Adds a value by its name to a JSON file, in the place of one of that name; all of them."""
+    return change(path, lambda known: {**(known or {}), name: value})
 
 
 def write_episodes(path: Path, episodes: Episodes) -> None:

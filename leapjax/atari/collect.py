@@ -154,14 +154,16 @@ def _known(logs: Path, number: int, longest: int | None = None) -> Manifest | No
         game = find_game(manifest["game"])
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
+    if longest is None:
+        return manifest
     found = manifest.get("longest", longest)
-    if longest is not None and found != longest:
+    if found != longest:
         raise UserError(
             f"{logs} holds games that were cut off after {found} decisions, not after {longest}: "
             "remove them, or name another folder"
         )
     today = [demonstrators.noise_of(game, number + index) for index in range(len(noises))]
-    if longest is not None and noises != today:
+    if noises != today:
         raise UserError(
             f"{logs} holds games with other shares of random actions than today's demonstrators "
             "have: remove them, or name another folder"
