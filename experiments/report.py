@@ -78,6 +78,9 @@ def documents(root: Path) -> dict[Path, str]:
         "parts": (speed.parts, "training"),
         "quality": (speed.quality, "quality"),
         "landscape": (analyses.landscape, "landscape"),
+        "planning-adds": (
+            functools.partial(analyses.compared, ANALYSES["properties"]), "properties"
+        ),
         **{
             name: (functools.partial(analyses.analysed, each), name)
             for name, each in ANALYSES.items()

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
 from experiments.common import analysis
-from experiments.common.analysis import Analysis
+from experiments.common.analysis import Analysis, Case
 from experiments.common.results import Row
 from experiments.tables.cells import mean_length, mean_rate, milliseconds, rate, table
 
@@ -58,6 +58,47 @@ def analysed(of: Analysis, rows: Sequence[Row]) -> str:
     header = "case | planner | preset | paper | N = 1 | success | steps"
     header += " | ms per plan" if of.timed else ""
     return table(f"{header} | violations" if watched else header, lines)
+
+
+def compared(of: Analysis, rows: Sequence[Row]) -> str:
+    """Every case at a glance: LEAP's best way to plan beside the best choice of single actions.
+
+    Of each preset, and apart from them with a penalty on coming back. The better of a pair is in
+    bold. What is best was seen on the levels that it is of.
+    """
+
+    def best(case: Case, preset: str, plans: bool, explores: bool) -> float | None:
+        found = (
+            analysis.rows_of_way(of, rows, case, way, preset)
+            for way in case.ways
+            if (way.method == "leap") == plans and way.name.endswith("exploring") == explores
+        )
+        return max((mean_rate(mine) for mine in found if mine), default=None)
+
+    def papers(case: Case, plans: bool) -> float | None:
+        known = (way.paper for way in case.ways if (way.method == "leap") == plans)
+        return max((each for each in known if each is not None), default=None)
+
+    lines = []
+    for case in of.cases:
+        cells = [case.name, *_pair(papers(case, True), papers(case, False))]
+        for preset, explores in (("paper", False), ("leapjax", False), ("leapjax", True)):
+            cells += _pair(*(best(case, preset, plans, explores) for plans in (True, False)))
+        lines.append(cells)
+    sources = ("in the paper", "preset `paper`", "preset `leapjax`", "`leapjax`, exploring")
+    return table(" | ".join(["case", *(f"LEAP, {each} | DT or IQL" for each in sources)]), lines)
+
+
+def _pair(one: float | None, other: float | None) -> list[str]:
+    """Two success rates in percent, the better in bold, both if they are alike."""
+    known = [each for each in (one, other) if each is not None]
+
+    def said(each: float | None) -> str:
+        if each is None:
+            return "-"
+        return f"**{each:.1f}%**" if len(known) == 2 and each == max(known) else f"{each:.1f}%"
+
+    return [said(one), said(other)]
 
 
 def landscape(found: Sequence[Row]) -> str:
