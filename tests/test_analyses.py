@@ -224,9 +224,10 @@ def test_plans_stand_beside_single_actions():
     def row(name: str, successes: int) -> dict:
         way = next(way for way in case.ways if way.name == name)
         settings = analysis.configurations(of, case, way.method, 0, Options())
+        named = analysis.row_name(of, case, way, settings, 0, Options())
         return {
-            "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "episodes": 200,
-            "successes": successes, "hash": analysis.row_name(of, case, way, settings, 0, Options()),
+            "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "hash": named,
+            "episodes": 200, "successes": successes,
         }  # fmt: skip
 
     rows = [row("sum", 120), row("pick-up alone", 80), row("dt", 130), row("iql", 140)]
