@@ -79,7 +79,8 @@ def documents(root: Path) -> dict[Path, str]:
         "quality": (speed.quality, "quality"),
         "landscape": (analyses.landscape, "landscape"),
         "planning-adds": (
-            functools.partial(analyses.compared, ANALYSES["properties"]), "properties"
+            functools.partial(analyses.compared, ANALYSES["properties"]),
+            "properties",
         ),
         **{
             name: (functools.partial(analyses.analysed, each), name)
