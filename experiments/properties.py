@@ -49,12 +49,14 @@ LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cel
 AGAIN = 16.0  # nats for each time that the agent was before where it comes to
 PICKUP = ACTIONS.index("pickup")
 # A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
-FALSE_STARTS = {"leap": {"false_starts": 0.6, "steps": 3000}}
+# (A plan of one action has no beginning that others could follow.)
+FALSE_STARTS = {"leap": {"false_starts": 0.6}}
 # Demonstrations of empty rooms never go around things. (IQL learns from transitions, which these
 # augmentations leave as they are.)
-_DETOURS = {"detours": 0.5, "lookalikes": True, "steps": 2000}
+_DETOURS = {"detours": 0.5, "lookalikes": True}
 DETOURS = {"leap": _DETOURS, "dt": _DETOURS}
-BOTH = {"leap": {**_DETOURS, **FALSE_STARTS["leap"]}, "dt": {**_DETOURS, "steps": 3000}}
+BOTH = {"leap": {**_DETOURS, **FALSE_STARTS["leap"]}, "dt": _DETOURS}
+LONG = {"steps": 3000}  # of every method, where one of them has more to learn
 
 
 class Watched(BabyAIAdapter):
@@ -294,10 +296,10 @@ def _composed(
 
 
 MAZE, OBSTACLES = "GoToObjMazeS4", "GoToBehindObstacles"
-ROOM, OPEN_MAZE = Model("GoToLocalS8N1", more=BOTH), Model(MAZE, more=FALSE_STARTS)
+ROOM, OPEN_MAZE = Model("GoToLocalS8N1", LONG, BOTH), Model(MAZE, LONG, FALSE_STARTS)
 # A detour around objects is longer than the plans that are learned there.
 LONGER = {"horizon": 10, "iterations": 10}
-OBJECTS = Model("GoToLocalS8N7", more={"leap": {**LONGER, **FALSE_STARTS["leap"]}})
+OBJECTS = Model("GoToLocalS8N7", LONG, {"leap": {**LONGER, **FALSE_STARTS["leap"]}})
 CASES = (
     _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
     _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
@@ -305,15 +307,15 @@ CASES = (
     Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
-        "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28}, DETOURS)],
+        "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28, "steps": 2000}, DETOURS)],
         "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
     ),
     Case(
-        "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40}, DETOURS)], MAZE,
-        _without_doors((61.0, 24.5, 65.5)),
+        "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40, "steps": 2000}, DETOURS)],
+        MAZE, _without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
-        "composition-easy", [Model(OBSTACLES, more={"leap": BOTH["leap"]})] * 2, OBSTACLES,
+        "composition-easy", [Model(OBSTACLES, LONG, BOTH)] * 2, OBSTACLES,
         [*_composed(halves, (83.5, 58.0, 42.5)), *_explorers("sum", halves)],
     ),
     Case(
