@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.table import Table
 
+from experiments.common import runtime
 from leapjax import scores
 from leapjax.checkpoints import read_json
 from leapjax.errors import UserError
@@ -118,7 +119,8 @@ def versions() -> dict[str, str]:
     names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
     found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
-    return {**found, "python": platform.python_version(), "machine": platform.machine()}
+    machine = f"{runtime.processor()}, cores: {runtime.cores()}"
+    return {**found, "python": platform.python_version(), "machine": machine}
 
 
 def code_version(root: Path) -> str:

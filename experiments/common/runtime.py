@@ -128,9 +128,15 @@ def use_every_core() -> None:
     """
     if "JAX_NUM_CPU_DEVICES" in os.environ:
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
-        jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CPU_DEVICES))
+        jax.config.update("jax_num_cpu_devices", min(cores(), MOST_CPU_DEVICES))
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def use_compilation_cache() -> None:
