@@ -1,6 +1,8 @@
 """The training loop: a jitted pure step, and everything that has side effects around it."""
 
 import dataclasses
+import math
+import time
 from collections.abc import Callable
 
 import jax
@@ -14,7 +16,7 @@ BATCH_STREAM, UPDATE_STREAM = 0, 1
 # Steps that may wait for their turn: enough to keep a device busy. On several CPU devices JAX
 # 0.10 stops for ever where more than 32 programs wait: the thread that would run the other
 # half of an exchange then waits for room to queue one more.
-AHEAD = 8
+AHEAD = 4
 
 
 class NonFiniteLoss(RuntimeError):
@@ -74,10 +76,10 @@ def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
         key = jax.random.fold_in(jax.random.fold_in(key, UPDATE_STREAM), state.step)
         return agent.update(state, batch, key)
 
-    whole = None if mesh is None else NamedSharding(mesh, sharding.REPLICATED)
+    rows = None if mesh is None else NamedSharding(mesh, sharding.SPLIT)
     options = None if mesh is None else sharding.alone(mesh)
     return TrainStep(
-        jax.jit(draw, out_shardings=whole),
+        jax.jit(draw, out_shardings=rows),  # each device draws, and augments, its own
         jax.jit(update, donate_argnums=0, compiler_options=options),
     )
 
@@ -94,7 +96,7 @@ def compile_ahead(
     """
     begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
     begun = begin.lower(0)  # type: ignore[attr-defined]
-    whole = NamedSharding(mesh, sharding.REPLICATED)
+    whole, rows = (NamedSharding(mesh, spec) for spec in (sharding.REPLICATED, sharding.SPLIT))
 
     def placed(tree: PyTree, places: PyTree) -> PyTree:
         return jax.tree.map(
@@ -106,7 +108,7 @@ def compile_ahead(
     batch = jax.eval_shape(step.draw, key, state.step, like)
     arguments = (
         placed(state, sharding.parameter_shardings(state, mesh)),
-        placed(batch, jax.tree.map(lambda _: whole, batch)),
+        placed(batch, jax.tree.map(lambda _: rows, batch)),
         placed(key, whole),
     )
     update = step.update.lower(*arguments)  # type: ignore[attr-defined]
@@ -121,6 +123,7 @@ def train(
     steps: int,
     report: Callable[[int, TrainState, dict[str, float]], bool | None],
     report_every: int = 20,
+    report_seconds: float = math.inf,
 ) -> TrainState:
     """Runs until the state has seen `steps` steps, or `report` says stop.
 
@@ -133,20 +136,23 @@ def train(
         report: called with (step, state, mean metrics) every `report_every` steps and at
             the end. If it returns True, this step was the last.
         report_every: steps.
+        report_seconds: and whenever so many have passed since. Processes that share a run have
+            their own clocks, and may not differ in when they report: there it is infinite.
 
     Raises:
         NonFiniteLoss: names the step; the state of the last report was still good.
     """
     done = int(state.step)
     pending: list[dict[str, jax.Array]] = []
-    stop = False
+    stop, reported = False, time.perf_counter()
     while done < steps and not stop:
         state, metrics = train_step(state, data, key)
         done += 1
         pending.append(metrics)
         if len(pending) > AHEAD:
             jax.block_until_ready(pending[-1 - AHEAD])
-        if done % report_every == 0 or done == steps:
+        long_ago = time.perf_counter() - reported > report_seconds
+        if done % report_every == 0 or done == steps or long_ago:
             values = sharding.to_host(pending)
             for offset, value in enumerate(values):
                 for name in ("loss", "gradient_norm"):
@@ -155,5 +161,5 @@ def train(
                         raise NonFiniteLoss(f"the {name} of step {bad} is {value[name]}")
             means = {name: float(np.mean([v[name] for v in values])) for name in values[0]}
             stop = bool(report(done, state, means))
-            pending = []
+            pending, reported = [], time.perf_counter()
     return state

@@ -475,6 +475,7 @@ def test_the_table_has_normalised_scores():
     row = {
         "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
         "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
+        "configuration": {"planner": {"temperature": 0.1}},
     }  # fmt: skip
     name = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
@@ -487,6 +488,17 @@ def test_the_table_has_normalised_scores():
     assert f"| Breakout | our score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
+    # Seeds that happen to agree say no more than their games do.
+    second = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 1)
+    rows.append({**rows[0], "seed": 1, "hash": second})
+    assert "| Breakout | our score | - | - | 30.5 ± 2.0 |" in played(rows, {})
+    rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
+    assert "| Breakout | our score | - | - | 35.5 ± 5.0 |" in played(rows[:2] + rows[3:], {})
+    # Who always takes the best action plays four games, however often.
+    name = configuration_hash(preset("atari", "Breakout", "cql", "leapjax"), 0)
+    greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
+    table = played([{**rows[0], **greedy}], {})
+    assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
 
 
 def test_a_step_that_was_begun_is_waited_for():

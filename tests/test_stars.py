@@ -252,6 +252,13 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
         (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
     ]  # fmt: skip
     assert rows[0]["successes"] == rows[2]["successes"]  # the same planner, played again
+    # A recorded run whose folder is somewhere else cannot be searched in one more way.
+    (tmp_path / "results").mkdir()
+    results.record(tmp_path / "results" / "stars.jsonl", rows[0])
+    recorded = [*arguments, "--record", "--runs", "elsewhere"]
+    assert stars.main(recorded) == 2
+    error = capsys.readouterr().err
+    assert "2 of 2 ways to search with it are not" in error and "--force" in error
     # What has learned graphs of two arms plans for more of them, as they are as long.
     again = [*arguments, "--no-pictures", "--checkpoint", str(folder), "--play"]
     assert stars.main([*again, "Star5x2"]) == 0

@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import itertools
 import math
 
 import flax.linen as nn
@@ -287,6 +288,19 @@ def test_reports_hold_the_means_since_the_last():
     assert run([1, 2], 3, begin=2) == []
 
 
+def test_slow_steps_are_reported_one_by_one(monkeypatch):
+    clock = itertools.count(step=3.0)  # seconds, whenever it is looked at
+    monkeypatch.setattr(training.time, "perf_counter", lambda: next(clock))
+    reports = []
+
+    def report(step, state, means):
+        reports.append((step, means["loss"]))
+
+    step, state = made_up_step([1, 2, 3, 4, 5]), TrainState({}, (), np.int32(0))
+    training.train(step, state, None, None, 5, report, report_every=20, report_seconds=5.0)
+    assert reports == [(2, 1.5), (4, 3.5), (5, 5)]
+
+
 def test_only_so_many_steps_wait_for_their_turn():
     """Of more JAX may stop for ever, where several CPU devices exchange what they compute."""
     running, most = set(), 0
@@ -495,6 +509,7 @@ def assert_same_step(actual, expected):
 def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     agent, step = tiny()
     key = jax.random.key(0)
+    drawn = step.draw(key, jnp.int32(0), data)
     expected, _ = gradient_step(step, agent.init(key), data, key)
 
     mesh = sharding.make_mesh(TRAINING.batch, fsdp=fsdp)
@@ -503,6 +518,9 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     data = sharding.replicate(data, mesh)
     begin, step = training.compile_ahead(agent, mesh, learning.blank_steps(toy.DOMAIN))
     begun = begin(0)
+    rows = step.draw(begun[1], begun[0].step, data)
+    jax.tree.map(np.testing.assert_array_equal, rows, drawn)
+    assert {leaf.addressable_data(0).shape[0] for leaf in jax.tree.leaves(rows)} == {2}
     actual, params = gradient_step(step, begun[0], data, begun[1])
     largest = max(jax.tree.leaves(params), key=lambda leaf: leaf.size)
     assert largest.size >= sharding.SMALLEST_SPLIT

@@ -83,7 +83,8 @@ class Config(Generic[M, D, P]):
     loggers: tuple[str, ...] = ()
     """Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says more)."""
     checkpoint_seconds: float = 30.0
-    """Save the training state this often: what a killed run can lose at most."""
+    """Save the training state this often: what a killed run can lose at most (of several
+    processes: and up to 20 steps more)."""
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()

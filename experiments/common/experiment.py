@@ -64,12 +64,8 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     for config, seed in runs:
         try:
             rows.append(run_one(experiment, config, seed, versions, console, interruption))
-            if config.checkpoint is None:
-                folder = run_folder(experiment, config, seed)
-                for options in experiment.searches(config):
-                    other = with_options(config, options)
-                    again = dataclasses.replace(other, checkpoint=folder, pictures=False)
-                    rows.append(run_one(experiment, again, seed, versions, console, interruption))
+            for again in searching(experiment, config, seed):
+                rows.append(run_one(experiment, again, seed, versions, console, interruption))
         except program.FAILURES as error:
             if len(runs) > 1:  # the others can still be run
                 console.print(f"{config.level}, seed {seed}, failed: {error}", markup=False)
@@ -78,6 +74,38 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
         console.print(results.success_table(rows), results.time_table(rows))
     if failure is not None:
         raise failure
+
+
+def searching(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:
+    """The other ways to plan with what a run has learned, if it has learned anything.
+
+    Raises:
+        UserError: the run is recorded, and one of them is not, but what was learned is not here.
+    """
+    if config.checkpoint is not None:
+        return []
+    folder = run_folder(experiment, config, seed)
+    others = [with_options(config, options) for options in experiment.searches(config)]
+    found = [dataclasses.replace(o, checkpoint=folder, pictures=False) for o in others]
+
+    def out_of_reach() -> int:
+        if folder.is_dir():
+            return 0
+        known = {row["hash"] for row in results.read(rows_of(experiment, config))}
+        return sum(configuration_hash(each, seed) not in known for each in found)
+
+    count = processes.first_does(out_of_reach)
+    if count:
+        raise UserError(
+            f"{config.level}, seed {seed}, is recorded, and {count} of {len(found)} ways to search "
+            f"with it are not, but {folder} is not here: --force trains it again"
+        )
+    return found
+
+
+def rows_of(experiment: Experiment, config: AnyConfig) -> Path:
+    """The file that rows go to."""
+    return (Path("results") if config.record else config.runs) / f"{experiment.name}.jsonl"
 
 
 def run_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:
@@ -110,9 +138,8 @@ def run_one(
 ) -> results.Row:
     """One level and one seed, from demonstrations to a row."""
     name = configuration_hash(config, seed)
-    recorded = Path("results") / f"{experiment.name}.jsonl"
     # Read even where nothing is looked for: a damaged file is better found now than after the run.
-    rows = recorded if config.record else config.runs / recorded.name
+    rows = rows_of(experiment, config)
     known = processes.first_does(lambda: results.find(rows, name))
     if config.record and not config.force and known is not None:
         console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")

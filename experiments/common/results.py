@@ -1,5 +1,6 @@
 """Result rows: JSON lines, one file per experiment; tables are made from rows only."""
 
+import contextlib
 import datetime
 import json
 import platform
@@ -118,6 +119,8 @@ def versions() -> dict[str, str]:
     """What a result was made with."""
     names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
+    with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
+        found["ale-py"] = metadata.version("ale-py")
     found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
     machine = f"{runtime.processor()}, cores: {runtime.cores()}"
     return {**found, "python": platform.python_version(), "machine": machine}

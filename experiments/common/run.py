@@ -46,6 +46,7 @@ Watch = Callable[[Energy, Params], dict[str, float]]
 # One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
 # evaluation would rather have smaller ones.
 CHUNK_SIZES = (32,)
+REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
 DATA = "data.json"  # in the folder of a run: the demonstrations that it learns from
 
 
@@ -263,7 +264,8 @@ def fit(
                 last_saved = time.perf_counter()
             return any(signals)
 
-        state = training.train(step, state, steps, key, total, report)
+        often = REPORT_SECONDS if jax.process_count() == 1 else math.inf
+        state = training.train(step, state, steps, key, total, report, report_seconds=often)
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
     # Planning is each process's own business, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))

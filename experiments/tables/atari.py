@@ -31,8 +31,7 @@ def uses(row: Row) -> bool:
 def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
 
-    With the standard error, over seeds where there are several and over games where there is one;
-    and the mean score of the games that were learned from.
+    With the standard error, and the mean score of the games that were learned from.
     """
     columns = [*COLUMNS, "the data"]
     lines = []
@@ -47,10 +46,10 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         scale = game.human - game.random
         cells = {title: _mean_score(found) for title, found in of.items() if found}
         normal = {
-            title: f"{game.normalised(mean):.1f} ± {100 * error / scale:.1f}"
+            title: _with_error(game.normalised(mean), error and 100 * error / scale)
             for title, (mean, error) in cells.items()
         }
-        raw = {title: f"{mean:.1f} ± {error:.1f}" for title, (mean, error) in cells.items()}
+        raw = {title: _with_error(*each) for title, each in cells.items()}
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         if cells and name in data:
             reached = float(np.mean([each["score"] for each in data[name]]))
@@ -62,11 +61,24 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     return table("game | | " + " | ".join(columns), lines)
 
 
-def _mean_score(rows: Sequence[Row]) -> tuple[float, float]:
-    """The mean score of rows, one for each seed, and its standard error."""
+def _mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
+    """The mean score of rows, one for each seed, and its standard error.
+
+    Of several seeds the larger of two: from the spread of their means, which a few seeds may
+    happen to hide, and from that of the games alone. None where the best action is always taken:
+    a game without sticky actions then depends on its no-ops modulo the frame skip alone, so that
+    there are four, however many are played.
+    """
     means = np.array([row["mean_return"] for row in rows])
-    error = scores.standard_error(means) if len(rows) > 1 else rows[0]["return_error"]
-    return float(means.mean()), error or 0.0
+    if any(row["configuration"]["planner"]["temperature"] == 0 for row in rows):
+        return float(means.mean()), None
+    errors = np.array([row["return_error"] for row in rows])
+    of_games = float(np.sqrt((errors**2).sum())) / len(rows)
+    return float(means.mean()), max(scores.standard_error(means) or 0.0, of_games)
+
+
+def _with_error(mean: float, error: float | None) -> str:
+    return f"{mean:.1f}" if error is None else f"{mean:.1f} ± {error:.1f}"
 
 
 def data(found: Mapping[str, Any]) -> str:

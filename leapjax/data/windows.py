@@ -6,6 +6,7 @@ is `end`, predicted like any other. States after the start never enter (paper, e
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
 
+ALIGNMENT = 64  # bytes
 SAMPLINGS = ("episode", "step", "start")
 
 
@@ -30,7 +32,6 @@ class Steps(NamedTuple):
     rewards: Array  # [M] float32
     return_so_far: Array  # [M] float32: the sum of the episode's rewards before this step
     terminated: Array  # [M] bool: the episode came to its end with this step
-    truncated: Array  # [M] bool: it was cut off after this step
     step: Array  # [M] int32: steps since the episode began
     remaining: Array  # [M] int32: actions of the episode from here on, this one included
     starts: Array  # [E] int32: the index of each episode's first step
@@ -78,7 +79,6 @@ def concatenate(
             np.float32
         ),
         terminated=last & np.array([d.terminated for d in demonstrations])[episode],
-        truncated=last & np.array([d.truncated for d in demonstrations])[episode],
         step=step,
         remaining=lengths[episode] - step,
         starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
@@ -95,12 +95,21 @@ def padded(steps: Steps) -> Steps:
     """
 
     def lengthen(leaf: Array) -> Array:
-        more = (1 << (len(leaf) - 1).bit_length()) - len(leaf)
-        return np.concatenate([leaf, np.zeros((more, *leaf.shape[1:]), leaf.dtype)])
+        longer = _zeros((1 << (len(leaf) - 1).bit_length(), *leaf.shape[1:]), leaf.dtype)
+        longer[: len(leaf)] = leaf
+        return longer
 
     kept = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
     lengthened = jax.tree.map(lengthen, steps._replace(**dict.fromkeys(kept, ())))
     return lengthened._replace(**kept)
+
+
+def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array that JAX's CPU devices can share: one that begins anywhere is copied to each."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    begin = -memory.ctypes.data % ALIGNMENT
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
