@@ -221,16 +221,16 @@ def test_plans_stand_beside_single_actions():
     of = properties.ANALYSIS
     case = next(case for case in of.cases if case.name == "composition-medium")
 
-    def row(name: str, successes: int) -> dict:
+    def row(name: str, successes: int, violations: int = 0) -> dict:
         way = next(way for way in case.ways if way.name == name)
         settings = analysis.configurations(of, case, way.method, 0, Options())
         named = analysis.row_name(of, case, way, settings, 0, Options())
         return {
             "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "hash": named,
-            "episodes": 200, "successes": successes,
+            "episodes": 200, "successes": successes, "violations": violations,
         }  # fmt: skip
 
-    rows = [row("sum", 120), row("pick-up alone", 80), row("dt", 130), row("iql", 140)]
+    rows = [row("sum", 120), row("pick-up alone", 180, 11), row("dt", 130), row("iql", 140)]
     rows.append(row("iql, exploring", 199))
     (line,) = (line for line in analyses.compared(of, rows).splitlines() if case.name in line)
     assert [cell.strip() for cell in line.split("|")[2:-1]] == [
