@@ -63,7 +63,7 @@ def report(options: Options) -> None:
                 f"{path} is {specification.method} on {specification.level}, not LEAP on Atari"
             )
     runtime.start()
-    path = (Path("results") if options.record else options.runs) / RESULTS
+    path = results.folder(options.record, options.runs) / RESULTS
     console = Console()
     for checkpoint in options.checkpoint:
         planner = pretrained.load(checkpoint)

@@ -80,7 +80,7 @@ def report(options: Options, interruption: Interruption) -> None:
         raise UserError("--presets: name at least one, such as leapjax")
     if options.record and options.steps is not None:
         raise UserError("--record: what is recorded is trained for the preset's number of --steps")
-    folder = Path("results") if options.record else options.runs
+    folder = results.folder(options.record, options.runs)
     files.check_writable(folder)
     console = Console()
     wanted = []

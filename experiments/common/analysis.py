@@ -139,7 +139,7 @@ class Work(NamedTuple):
     @property
     def rows(self) -> Path:
         """The file of its rows."""
-        folder = Path("results") if self.options.record else self.options.runs
+        folder = results.folder(self.options.record, self.options.runs)
         return folder / f"{self.analysis.name}.jsonl"
 
 

@@ -105,7 +105,7 @@ def searching(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyC
 
 def rows_of(experiment: Experiment, config: AnyConfig) -> Path:
     """The file that rows go to."""
-    return (Path("results") if config.record else config.runs) / f"{experiment.name}.jsonl"
+    return results.folder(config.record, config.runs) / f"{experiment.name}.jsonl"
 
 
 def run_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:

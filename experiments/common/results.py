@@ -75,6 +75,11 @@ def _what_is_wrong(row: Any) -> str | None:
     return None
 
 
+def folder(recorded: bool, runs: Path) -> Path:
+    """Where rows go: to those that are committed, or beside the runs that they are of."""
+    return Path("results") if recorded else runs
+
+
 def record(path: Path, row: Row) -> None:
     """Adds a row, in the place of one of the same configuration, atomically."""
     with only_process_in(path.parent, wait=True):
