@@ -29,7 +29,7 @@ from experiments.common.config import AnyConfig, make_domain, preset, specify, w
 from leapjax import pretrained
 from leapjax.babyai import levels
 from leapjax.babyai.levels import Level
-from leapjax.batching import compile_planner, plan_keys, split_batch
+from leapjax.batching import CHUNK_SIZES, compile_planner, plan_keys, split_batch
 from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig, bind
@@ -50,6 +50,10 @@ class Options:
 
     quick: bool = False
     """Only the first level, (T, N) = (5, 10), at batch 1 and 256."""
+    batches: tuple[int, ...] = BATCHES
+    """Plans at a time."""
+    chunks: tuple[int, ...] = CHUNK_SIZES
+    """What they are cut into; a GPU wants larger ones than a core's cache."""
     large: int = 0
     """Also plan so many contexts of the last level in one call, and report the memory it took."""
     json: Path | None = None
@@ -77,15 +81,18 @@ def run(options: Options) -> None:
         plots.check_figure(options.plot)
     if options.large < 0:
         raise UserError(f"--large must be at least 0, got {options.large}")
+    for name, sizes in (("batches", options.batches), ("chunks", options.chunks)):
+        if not sizes or min(sizes) < 1:
+            raise UserError(f"--{name} {' '.join(map(str, sizes))}: expected positive numbers")
     check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
-    batches = (1, 256) if options.quick else BATCHES
+    batches = (1, 256) if options.quick else options.batches
     console = Console()
     rows = []
     for level in chosen:
         for name in COMPARED:
-            rows += measure(name, level, batches, options.seconds)
+            rows += measure(name, level, batches, options.seconds, options.chunks)
             console.print(f"measured {name} on {level.name}")
     compare_with_peak(rows)
     console.print(table(rows))
@@ -97,12 +104,18 @@ def run(options: Options) -> None:
         draw(rows, options.plot)
 
 
-def measure(name: str, level: Level, batches: Sequence[int], seconds: float) -> list[Row]:
+def measure(
+    name: str,
+    level: Level,
+    batches: Sequence[int],
+    seconds: float,
+    chunks: Sequence[int] = CHUNK_SIZES,
+) -> list[Row]:
     """One preset and level at every batch size."""
     model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon
     search = GibbsConfig(horizon, level.iterations)
     energy, params, domain = make_energy(name, level)
-    planner = compile_planner(energy, search)
+    planner = compile_planner(energy, search, chunks)
     one = jax.random.key(0), blank_context(domain, level.context)
     flops = matmul_flops(bind(energy, search), params, *one)
     rows: list[Row] = []

@@ -26,11 +26,12 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify
+from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
+from leapjax.errors import UserError
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
@@ -45,6 +46,9 @@ class Options:
     """Whose settings to measure: horizon, context, grid."""
     presets: tuple[str, ...] = ("leapjax", "paper")
     """Which presets."""
+    microbatch: int | None = None
+    """Windows whose loss a device takes at a time, 0 for all; None: as the preset says, which
+    fits a core's cache."""
     json: Path | None = None
     """Write the rows here."""
     seconds: float = 3.0
@@ -59,11 +63,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: Options) -> None:
-    """Measures every level and preset."""
+    """Measures every level and preset.
+
+    Raises:
+        UserError: an unknown level or preset, or a microbatch that cannot be.
+    """
     check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
+    changed = {} if options.microbatch is None else {"microbatch": options.microbatch}
+    try:
+        with_options(preset("babyai", LEVELS[0], "leap", "leapjax"), changed)
+    except ValueError as error:
+        raise UserError(f"--microbatch {options.microbatch}: {error}") from None
     configs = [
-        preset("babyai", level, "leap", name)
+        with_options(preset("babyai", level, "leap", name), changed)
         for level in options.levels
         for name in options.presets
     ]

@@ -146,8 +146,8 @@ class Work(NamedTuple):
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
     """Every case, method and seed asked for, and their table."""
     wanted = check(analysis, options)
-    versions = results.versions()
     runtime.start()
+    versions = results.versions()
     work = Work(analysis, options, versions, Console(), interruption)
     rows: list[Row] = []
     for case in wanted:

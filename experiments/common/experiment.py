@@ -56,8 +56,8 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
 def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
     """Every level and seed of a command line; the failure of one comes after all others."""
     configs = parse(experiment.domain, arguments)
-    versions = results.versions()  # of the code that runs, whatever is committed meanwhile
     runtime.start(configs[0].cluster)
+    versions = results.versions()  # of the code that runs, whatever is committed meanwhile
     console = Console(quiet=not processes.is_first())
     runs = [(config, seed) for config in configs for seed in config.seeds]
     rows, failure = [], None

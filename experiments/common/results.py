@@ -10,6 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import jax
 from rich.table import Table
 
 from experiments.common import runtime
@@ -121,13 +122,16 @@ def find(path: Path, configuration: str) -> Row | None:
 
 
 def versions() -> dict[str, str]:
-    """What a result was made with."""
+    """What a result was made with; starts JAX, if it was not."""
     names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
     with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
         found["ale-py"] = metadata.version("ale-py")
     found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
     machine = f"{runtime.processor()}, cores: {runtime.cores()}"
+    device = jax.local_devices()[0]
+    if device.platform != "cpu":
+        machine += f", {jax.local_device_count()} {device.device_kind}"
     return {**found, "python": platform.python_version(), "machine": machine}
 
 
