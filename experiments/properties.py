@@ -199,7 +199,7 @@ def _explorers(
     whole, single = (exploring(m, handling) for m in (minimise, at_once or minimise))
     ways = [Way(f"{name}, exploring", minimise=whole, search=search, executed=3)]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
-    return [way._replace(remembers=True) for way in ways]
+    return [way._replace(remembers=True, explores=True) for way in ways]
 
 
 def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
@@ -279,7 +279,7 @@ def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
     views = [
         way._replace(name=f"{way.name}, open doors seen as empty", minimise=told)
         for way in plain
-        if not way.remembers
+        if not way.explores
     ]
     return [*plain, *views]
 

@@ -59,6 +59,7 @@ class Way(NamedTuple):
     executed: int | None = None  # actions before replanning; None: all
     paper: float | None = None  # the paper's success, in percent
     remembers: bool = False  # may look at the whole episode; its models see no more than they do
+    explores: bool = False  # coming back costs: beyond what the paper asks for
 
 
 class Case(NamedTuple):

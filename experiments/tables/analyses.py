@@ -72,7 +72,7 @@ def compared(of: Analysis, rows: Sequence[Row]) -> str:
         found = (
             analysis.rows_of_way(of, rows, case, way, preset)
             for way in case.ways
-            if (way.method == "leap") == plans and way.name.endswith("exploring") == explores
+            if (way.method == "leap") == plans and way.explores == explores
         )
         kept = (mine for mine in found if mine and _violations(mine) <= 1 / 20)
         return max(map(mean_rate, kept), default=None)
@@ -84,10 +84,14 @@ def compared(of: Analysis, rows: Sequence[Row]) -> str:
     lines = []
     for case in of.cases:
         cells = [case.name, *_pair(papers(case, True), papers(case, False))]
-        for preset, explores in (("paper", False), ("leapjax", False), ("leapjax", True)):
-            cells += _pair(*(best(case, preset, plans, explores) for plans in (True, False)))
+        for explores in (False, True):
+            for preset in ("paper", "leapjax"):
+                cells += _pair(*(best(case, preset, plans, explores) for plans in (True, False)))
         lines.append(cells)
-    sources = ("in the paper", "preset `paper`", "preset `leapjax`", "`leapjax`, exploring")
+    sources = (
+        "in the paper", "preset `paper`", "preset `leapjax`",
+        "`paper`, exploring", "`leapjax`, exploring",
+    )  # fmt: skip
     return table(" | ".join(["case", *(f"LEAP, {each} | DT or IQL" for each in sources)]), lines)
 
 

@@ -166,7 +166,6 @@ def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
             options |= {"masking": "one", "microbatch": 0}
         else:  # to read frames costs more than to look at a plan in T ways
             options["masking"] = "stratified"
-            options["iterations"] = 1  # actions of a plan resemble each other (docs/tried.md)
     if preset == "leapjax":
         options["learning_rate"] = 1e-3
     if method in IMITATORS:
