@@ -62,10 +62,9 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "preset", tiny_preset)
     monkeypatch.setattr(planning, "COMPARED", ("leapjax",))
     monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
-    monkeypatch.setattr(planning, "BATCHES", (1, 2))
     monkeypatch.setattr(planning, "make_energy", functools.cache(planning.make_energy))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
-    written = ["--json", str(rows), "--plot", str(plot)]
+    written = ["--json", str(rows), "--plot", str(plot), "--batches", "1", "2", "--chunks", "1"]
     assert planning.main([*written, "--seconds", "0.01", "--large", "2"]) == 0
     assert "2 plans of (5, 10)" in capsys.readouterr().out
     fields = (
@@ -73,7 +72,7 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
         "fraction_of_peak"
     ).split()
     written = json.loads(rows.read_text())
-    assert [row["batch"] for row in written] == [1, 2]
+    assert [row["batch"] for row in written] == [1, 2] and {row["chunk"] for row in written} == {1}
     # What a batch of one has compiled serves two.
     assert written[0]["compile_seconds"] > 0 == written[1]["compile_seconds"]
     assert all(row["versions"]["leapjax"].startswith("0.") for row in written)
@@ -163,6 +162,9 @@ def test_what_cannot_be_drawn_or_measured_is_refused_before_anything_is(tmp_path
         (atari, ["--training-json", "file/rows.json"], "cannot write to file"),
         (atari, ["--batches", "16", "0"], "--batches 0"),
         (planning, ["--plot", "file/plot.png"], "cannot write to file"),
+        (planning, ["--batches", "4", "0"], "--batches 4 0: expected positive numbers"),
+        (planning, ["--chunks", "-1"], "--chunks -1: expected positive numbers"),
+        (training, ["--microbatch", "-1"], "--microbatch -1"),
     ],
 )
 def test_what_cannot_be_written_is_not_measured(

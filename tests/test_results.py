@@ -1,6 +1,7 @@
 """Rows say what they were made with."""
 
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 
@@ -46,3 +47,11 @@ def test_without_a_repository_only_the_version_is_known(tmp_path):
     assert results.code_version(tmp_path) == ""
     (tmp_path / ".git").write_text("damaged")
     assert results.code_version(tmp_path) == ""
+
+
+def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):
+    alone = results.versions()["machine"]
+    assert "H100" not in alone  # the devices of these tests are cores
+    gpus = [SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")] * 2
+    monkeypatch.setattr(results.jax, "local_devices", lambda: gpus)
+    assert results.versions()["machine"] == f"{alone}, 2 NVIDIA H100"

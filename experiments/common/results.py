@@ -129,9 +129,9 @@ def versions() -> dict[str, str]:
         found["ale-py"] = metadata.version("ale-py")
     found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
     machine = f"{runtime.processor()}, cores: {runtime.cores()}"
-    device = jax.local_devices()[0]
-    if device.platform != "cpu":
-        machine += f", {jax.local_device_count()} {device.device_kind}"
+    devices = jax.local_devices()
+    if devices[0].platform != "cpu":
+        machine += f", {len(devices)} {devices[0].device_kind}"
     return {**found, "python": platform.python_version(), "machine": machine}
 
 
