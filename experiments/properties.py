@@ -163,6 +163,12 @@ def twice(trained: GibbsConfig) -> GibbsConfig:
     return dataclasses.replace(filled, iterations=2 * filled.iterations, temperature=1.0)
 
 
+def refined(trained: GibbsConfig) -> GibbsConfig:
+    """Filled from its beginning, then gone over twice more: what comes later says what is first."""
+    filled = left_to_right(trained)
+    return dataclasses.replace(filled, iterations=3 * filled.iterations)
+
+
 def halves(energies: Sequence[Energy]) -> Energy:
     """Two models, each of which sees one half of the obstacles."""
     views = (lambda context, part=part: half_of_obstacles(context, part) for part in (0, 1))
@@ -187,7 +193,7 @@ def _explorers(
     search: Callable[[GibbsConfig], GibbsConfig] = lambda trained: trained,
     handling: bool = False,
 ) -> list[Way]:
-    """Every method, where coming back costs: LEAP's plans, three actions of each, and the others.
+    """Every method, where coming back costs: LEAP's plans, three actions or one of each executed.
 
     Args:
         name: what LEAP's way is called without that.
@@ -197,7 +203,11 @@ def _explorers(
         handling: see `revisits`.
     """
     whole, single = (exploring(m, handling) for m in (minimise, at_once or minimise))
-    ways = [Way(f"{name}, exploring", minimise=whole, search=search, executed=3)]
+    each = f"{name}, exploring, replanned after each action"
+    ways = [
+        Way(f"{name}, exploring", minimise=whole, search=search, executed=3),
+        Way(each, minimise=whole, search=refined, executed=1),
+    ]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
     return [way._replace(remembers=True, explores=True) for way in ways]
 
