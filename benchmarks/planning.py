@@ -109,7 +109,7 @@ def measure(
     level: Level,
     batches: Sequence[int],
     seconds: float,
-    chunks: Sequence[int] = CHUNK_SIZES,
+    chunks: Sequence[int],
 ) -> list[Row]:
     """One preset and level at every batch size."""
     model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon

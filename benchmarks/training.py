@@ -70,16 +70,17 @@ def run(options: Options) -> None:
     """
     check_writable(options.json)
     runtime.use_every_core()  # and no compilation cache: compile times are real
-    changed = {} if options.microbatch is None else {"microbatch": options.microbatch}
-    try:
-        with_options(preset("babyai", LEVELS[0], "leap", "leapjax"), changed)
-    except ValueError as error:
-        raise UserError(f"--microbatch {options.microbatch}: {error}") from None
     configs = [
-        with_options(preset("babyai", level, "leap", name), changed)
+        preset("babyai", level, "leap", name)
         for level in options.levels
         for name in options.presets
     ]
+    if options.microbatch is not None:
+        changed = {"microbatch": options.microbatch}
+        try:
+            configs = [with_options(config, changed) for config in configs]
+        except ValueError as error:
+            raise UserError(f"--microbatch {options.microbatch}: {error}") from None
     rows = [measure(config, options.seconds) for config in configs]
     Console().print(table(rows))
     write_rows(options.json, rows)

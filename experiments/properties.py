@@ -157,16 +157,15 @@ def noisily(trained: GibbsConfig, temperature: float = 2.0) -> GibbsConfig:
 wandering = functools.partial(noisily, temperature=5.0)
 
 
+def refined(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
+    """Filled from its beginning, and gone over again: what comes later says what is first."""
+    filled = left_to_right(trained)
+    return dataclasses.replace(filled, iterations=rounds * filled.iterations)
+
+
 def twice(trained: GibbsConfig) -> GibbsConfig:
     """Filled from its beginning, then gone over once more: where a detour is to be found."""
-    filled = left_to_right(trained)
-    return dataclasses.replace(filled, iterations=2 * filled.iterations, temperature=1.0)
-
-
-def refined(trained: GibbsConfig) -> GibbsConfig:
-    """Filled from its beginning, then gone over twice more: what comes later says what is first."""
-    filled = left_to_right(trained)
-    return dataclasses.replace(filled, iterations=3 * filled.iterations)
+    return dataclasses.replace(refined(trained, rounds=2), temperature=1.0)
 
 
 def halves(energies: Sequence[Energy]) -> Energy:
