@@ -208,12 +208,18 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
         "first_pass_successes": 100, "violations": None, "mean_length": 9.0, "plans": 10,
         "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
+        "train_seconds": 300.0, "compile_seconds": 20.0, "eval_seconds": 40.0,
+        "versions": {"machine": "x86_64"},
         "hash": analysis.row_name(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
     table = analyses.analysed(of, [row, stale])
     (line,) = (line for line in table.splitlines() if "Gibbs" in line)
     assert "62.5%" in line and "50.0%" in line and "**75.0%" in line and "2.00" in line
+    assert line.endswith("| 6.0 |")
+    on_gpu = {**row, "versions": {"machine": "x86_64, cores: 16, 1 NVIDIA H100 80GB HBM3"}}
+    assert "| 6.0* |" in analyses.analysed(of, [on_gpu])
+    assert analyses.analysed(of, [{**row, "train_seconds": 0.0}]).endswith("| - |")
     assert report.is_used(row) and not report.is_used(stale)
 
 

@@ -6,7 +6,7 @@ from experiments import ablation, properties, stochastic, suboptimal
 from experiments.common import analysis
 from experiments.common.analysis import Analysis, Case
 from experiments.common.results import Row
-from experiments.tables.cells import mean_length, mean_rate, milliseconds, rate, table
+from experiments.tables.cells import mean_length, mean_rate, milliseconds, minutes, rate, table
 
 ANALYSES = {
     program.ANALYSIS.name: program.ANALYSIS
@@ -54,10 +54,11 @@ def analysed(of: Analysis, rows: Sequence[Row]) -> str:
             if watched:
                 known = all(row["violations"] is not None for row in mine)
                 cells.append(f"{_violations(mine):.2f}" if known else "-")
-            lines.append(cells)
+            lines.append([*cells, minutes(mine)])
     header = "case | planner | preset | paper | N = 1 | success | steps"
     header += " | ms per plan" if of.timed else ""
-    return table(f"{header} | violations" if watched else header, lines)
+    header += " | violations" if watched else ""
+    return table(f"{header} | minutes", lines)
 
 
 def compared(of: Analysis, rows: Sequence[Row]) -> str:
