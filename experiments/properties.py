@@ -230,7 +230,8 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
 
 
 def _constraints(name: str, model: Model, level: str) -> Case:
-    both = masked(immediate_lava, left_turns)
+    both, never = masked(immediate_lava, left_turns), masked(lava, left_turns)
+    widely = Way("whole plan, exploring, beam search", "leap", exploring(never), beams, 3)
     return Case(
         f"constraints-{name}",
         [model],
@@ -239,7 +240,8 @@ def _constraints(name: str, model: Model, level: str) -> Case:
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
-            *_explorers("whole plan", masked(lava, left_turns), both, left_to_right),
+            *_explorers("whole plan", never, both, left_to_right),
+            widely._replace(remembers=True, explores=True),
         ],
         WatchedTurns,
     )
