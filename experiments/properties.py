@@ -231,7 +231,6 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
 
 def _constraints(name: str, model: Model, level: str) -> Case:
     both, never = masked(immediate_lava, left_turns), masked(lava, left_turns)
-    widely = Way("whole plan, exploring, beam search", "leap", exploring(never), beams, 3)
     return Case(
         f"constraints-{name}",
         [model],
@@ -241,10 +240,13 @@ def _constraints(name: str, model: Model, level: str) -> Case:
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
             *_explorers("whole plan", never, both, left_to_right),
-            widely._replace(remembers=True, explores=True),
+            Way(
+                "whole plan, exploring, beam search", minimise=exploring(never), search=beams,
+                executed=3, remembers=True, explores=True,
+            ),
         ],
         WatchedTurns,
-    )
+    )  # fmt: skip
 
 
 def _errand(name: str, model: Model, level: str, budget: int) -> Case:
