@@ -18,6 +18,7 @@ from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from tests import mixed, toy
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 BATCH, PAST, WIDTH, CHOICES, DISCOUNT = 16, 2, 16, 2, 0.9
@@ -171,7 +172,7 @@ def test_iql():
     assert_is(case, loss)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("share", [0.5, pytest.param(1.0, marks=only_long)])
 def test_mopo(share):
     """Of the data alone; and of what is imagined, two steps far, too."""
     settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)

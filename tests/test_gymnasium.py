@@ -216,7 +216,7 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
     assert domains.find_domain("gymnasium") is GYMNASIUM
 
 
-def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch):
+def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch, quick_begin):
     """Data know the environment by its id, without the module."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -224,17 +224,19 @@ def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch):
     (tmp_path / "their_corridor.py").write_text(f"import gymnasium as gym\n{register}\n")
     try:
         name = recorded("my/theirs-v0", "their_corridor:Theirs-v0", lambda seen: 1, 2)
-        options = [*SMALL, "--horizon", "3", "--steps", "2"]
+        options = [*SMALL, "--horizon", "3", "--steps", "0"]
         assert program.main(["--env", "their_corridor:Theirs-v0", "--dataset", name, *options]) == 0
     finally:
         gym.registry.pop("Theirs-v0", None)
 
 
-def test_data_of_other_arguments_are_refused_until_they_are_given(tmp_path, monkeypatch, capsys):
+def test_data_of_other_arguments_are_refused_until_they_are_given(
+    tmp_path, monkeypatch, capsys, quick_begin
+):
     monkeypatch.chdir(tmp_path)
     large = {"map_name": "8x8", "is_slippery": False}
     name = recorded("my/lake-v0", "FrozenLake-v1", lambda seen: 2, 2, **large)
-    options = ["--dataset", name, *SMALL, "--horizon", "3", "--steps", "2"]
+    options = ["--dataset", name, *SMALL, "--horizon", "3", "--steps", "0"]
     assert program.main(options) == 2
     said = capsys.readouterr().err
     asked = '{"map_name": "8x8", "is_slippery": false}'
