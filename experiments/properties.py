@@ -290,9 +290,11 @@ def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
 
     plain = _plain(paper)
     views = [
-        way._replace(name=f"{way.name}, open doors seen as empty", minimise=told)
+        way._replace(
+            name=f"{way.name}, open doors seen as empty",
+            minimise=exploring(told) if way.explores else told,
+        )
         for way in plain
-        if not way.explores
     ]
     return [*plain, *views]
 

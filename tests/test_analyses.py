@@ -185,7 +185,7 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
         (["--methods", "bcq"], "expected some of dt, iql, leap"),
         (
             ["--ways", "sums"],
-            "--ways sums: expected some of dt, dt, exploring, dt, open doors seen as empty",
+            "--ways sums: expected some of dt, dt, exploring, dt, exploring, open doors seen",
         ),
         (["--ways", "sum", "--methods", "dt"], "none of these ways is of one of these methods"),
         (["--preset", "fast"], "unknown preset 'fast'"),
