@@ -3,13 +3,15 @@
 from collections import Counter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from minigrid.core.constants import DIR_TO_VEC
 
+from experiments import properties
 from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand
 from leapjax.babyai import demonstrations, observations
-from leapjax.babyai.adapter import END, TURNS, BabyAIAdapter
+from leapjax.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     half_of_obstacles,
     without_lava,
@@ -18,6 +20,7 @@ from leapjax.babyai.constraints import (
 )
 from leapjax.babyai.dynamics import FLOOR, LAVA
 from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
+from leapjax.energy import from_total
 from leapjax.rollouts import History
 
 LAVA_LEVELS = {"GoToLavaEasy": (0, 2), "GoToLavaMedium": (0, 5), "GoToLavaHard": (4, 4)}
@@ -119,6 +122,22 @@ def test_open_doors_look_empty_and_closed_ones_do_not():
     _, closed = first("GoToObjMazeS4R2Close", 0)
     seen = jax.device_get(without_open_doors(closed).observation)
     assert cells_of(seen, 4) == cells_of(closed.observation, 4) != set()
+
+
+def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_says():
+    def total(params, memory, actions):
+        return (memory.observation.grid[..., 0] == 4).sum().astype(float)
+
+    counts = from_total(lambda params, context: context, total, NUM_ACTIONS)
+    _, context = first("GoToObjMazeS4", 0)
+    doors = len(cells_of(context.observation, 4))
+    (case,) = (case for case in properties.CASES if case.name == "generalization-hard")
+    for way in case.ways:
+        energy = way.minimise([counts])
+        found = energy.total((), energy.encode((), context), jnp.array(TURNS))
+        seen = 0 if way.name.endswith("open doors seen as empty") else doors
+        back = properties.AGAIN if "exploring" in way.name else 0
+        assert found == seen + back
 
 
 def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():
