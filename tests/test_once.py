@@ -136,7 +136,7 @@ class Walk(nn.Module):
 
 WALKS = mixed.DOMAIN._replace(encoders={"paper": lambda model, context: Walk(model.width)})
 METHODS = [
-    pytest.param(name, marks=() if name in ("bc", "leap") else only_long)
+    pytest.param(name, marks=() if name == "leap" else only_long)
     for name in ("bc", "dt", "bcq", "iql", "mopo", "plate", "qr_dqn", "leap")
 ]
 

@@ -14,6 +14,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
+from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT
 
@@ -70,7 +71,12 @@ def test_cloning_does_what_was_done_most_often():
 
 @pytest.mark.parametrize(
     ("name", "architecture", "past"),
-    [("bcq", "leapjax", 0), ("iql", "leapjax", 0), ("mopo", "leapjax", 0), ("bcq", "paper", 2)],
+    [
+        ("bcq", "leapjax", 0),
+        ("iql", "leapjax", 0),
+        ("mopo", "leapjax", 0),
+        pytest.param("bcq", "paper", 2, marks=only_long),
+    ],
 )
 def test_the_best_policy_is_found(name, architecture, past):
     agent, state, metrics = trained(name, architecture, past)

@@ -17,6 +17,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from tests import toy
 from tests.parameters import random_state
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 CONTEXT, HORIZON, RUN = 2, 3, 4
@@ -76,7 +77,7 @@ def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs, data)
     assert stopped > 0 and len(starts) > 1
 
 
-@pytest.mark.parametrize("returns", [False, True])
+@pytest.mark.parametrize("returns", [True, pytest.param(False, marks=only_long)])
 def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
     agent = leap.make_agent(setup(returns=returns))
     alone = leap.make_agent(setup(run=1, returns=returns))

@@ -157,7 +157,13 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
 
 
 @pytest.mark.parametrize(
-    ("masking", "end"), [("each", True), ("each", False), ("all", False), ("random", True)]
+    ("masking", "end"),
+    [
+        ("each", False),
+        ("all", False),
+        ("random", True),
+        pytest.param("each", True, marks=only_long),
+    ],
 )
 def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatch):
     """Equation 1, one position at a time; without an end action PAD is seen, not predicted."""
@@ -505,7 +511,7 @@ def assert_same_step(actual, expected):
         assert metrics[name] == pytest.approx(value, rel=1e-4)
 
 
-@pytest.mark.parametrize("fsdp", [1, 2])
+@pytest.mark.parametrize("fsdp", [2, pytest.param(1, marks=only_long)])
 def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     agent, step = tiny()
     key = jax.random.key(0)
@@ -530,7 +536,7 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
 
 
 @pytest.mark.parametrize(
-    "microbatch", [6, 20, pytest.param(8, marks=only_long), pytest.param(1, marks=only_long)]
+    "microbatch", [6, *(pytest.param(size, marks=only_long) for size in (20, 8, 1))]
 )
 def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
     agent, step = tiny()
