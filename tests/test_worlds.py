@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from minigrid.core.constants import DIR_TO_VEC
 
-from experiments import properties
-from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand
+from experiments.properties import AGAIN, CASES, DETOUR_TURNS, FEW_TURNS, WatchedErrand
 from leapjax.babyai import demonstrations, observations
 from leapjax.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
@@ -131,12 +130,12 @@ def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_say
     counts = from_total(lambda params, context: context, total, NUM_ACTIONS)
     _, context = first("GoToObjMazeS4", 0)
     doors = len(cells_of(context.observation, 4))
-    (case,) = (case for case in properties.CASES if case.name == "generalization-hard")
+    (case,) = (case for case in CASES if case.name == "generalization-hard")
     for way in case.ways:
         energy = way.minimise([counts])
         found = energy.total((), energy.encode((), context), jnp.array(TURNS))
         seen = 0 if way.name.endswith("open doors seen as empty") else doors
-        back = properties.AGAIN if "exploring" in way.name else 0
+        back = AGAIN if "exploring" in way.name else 0
         assert found == seen + back
 
 
