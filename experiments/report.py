@@ -19,6 +19,7 @@ from leapjax.files import read_text, write_text
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
+PROPERTIES = ("adaptation", "generalization", "composition", "constraints")  # a table each
 MEASURED = (  # files of rows beside those of experiments
     "planning", "training", "quality", "methods", "landscape",
     "atari-data", "atari-energy", "atari-cost", "atari-training",
@@ -82,6 +83,13 @@ def documents(root: Path) -> dict[Path, str]:
             functools.partial(analyses.compared, ANALYSES["properties"]),
             "properties",
         ),
+        **{
+            kind: (
+                functools.partial(analyses.analysed, ANALYSES["properties"], kind=kind),
+                "properties",
+            )
+            for kind in PROPERTIES
+        },
         **{
             name: (functools.partial(analyses.analysed, each), name)
             for name, each in ANALYSES.items()

@@ -6,7 +6,7 @@ from pathlib import Path
 from experiments import report
 from experiments.common import plots
 from experiments.common.config import configuration_hash, preset, with_options
-from experiments.tables import babyai, puzzles
+from experiments.tables import analyses, babyai, puzzles
 from leapjax.babyai.levels import LEVELS
 
 
@@ -187,3 +187,13 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     }
     plots.iterations_by_level(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0
+
+
+def test_each_way_of_the_properties_is_in_one_of_their_tables():
+    of, rows = analyses.ANALYSES["properties"], report.rows_of(Path(), "properties")
+    parts = [analyses.analysed(of, rows, kind).splitlines() for kind in report.PROPERTIES]
+    kept = [line.split(" | ")[:3] for part in parts for line in part[2:]]
+    whole = analyses.analysed(of, rows).splitlines()[2:]
+    assert kept == [line.split(" | ")[:3] for line in whole]
+    watched = [" | violations" in part[0] for part in parts]
+    assert watched == [True, False, False, True]  # where there is a constraint

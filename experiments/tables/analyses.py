@@ -24,11 +24,16 @@ def uses(row: Row) -> bool:
     )
 
 
-def analysed(of: Analysis, rows: Sequence[Row]) -> str:
-    """Every way to plan of every case, beside the paper's number; the best of a case in bold."""
-    watched = any(row["violations"] is not None for row in rows)
+def analysed(of: Analysis, rows: Sequence[Row], kind: str = "") -> str:
+    """Every way to plan of every case, beside the paper's number; the best of a case in bold.
+
+    Of a kind of cases alone, if one is given: those whose names begin with it.
+    """
+    cases = [case for case in of.cases if case.name.startswith(kind)]
+    names = {case.name for case in cases}
+    watched = any(row["violations"] is not None for row in rows if row["case"] in names)
     lines = []
-    for case in of.cases:
+    for case in cases:
         found = [
             (way, preset, mine)
             for way in case.ways
