@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from minigrid.core.world_object import WorldObj
 
 from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way
+from experiments.common.analysis import Analysis, Case, Model, Way, alone
 from leapjax.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -114,7 +114,10 @@ def _is_marked(cell: WorldObj | None) -> bool:
 
 def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
     """The energy of a model that sees neither lava nor coloured cells, and penalties that do."""
+    return functools.partial(_penalised, penalties=penalties, weight=weight)
 
+
+def _penalised(energies: Sequence[Energy], penalties: Sequence[Penalty], weight: float) -> Energy:
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
         return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
@@ -122,7 +125,7 @@ def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
     def sees(context: Context) -> Context:
         return without_marks(without_lava(context))
 
-    return lambda energies: constrain(view(energies[0], sees), penalty, partial=True)
+    return constrain(view(energies[0], sees), penalty, partial=True)
 
 
 # What judges the next action alone: those that violate anything at once are removed.
@@ -131,11 +134,16 @@ masked = functools.partial(unseen, weight=math.inf)
 
 def exploring(minimise: Minimise, handling: bool = False) -> Minimise:
     """The same energy, and more for each time that the agent comes where it was (`revisits`)."""
+    return functools.partial(_explored, minimise=minimise, nats=AGAIN, handling=handling)
 
+
+def _explored(
+    energies: Sequence[Energy], minimise: Minimise, nats: float, handling: bool
+) -> Energy:
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return AGAIN * revisits(context, actions, handling)
+        return nats * revisits(context, actions, handling)
 
-    return lambda energies: constrain(minimise(energies), penalty, partial=True)
+    return constrain(minimise(energies), penalty, partial=True)
 
 
 def left_to_right(trained: GibbsConfig) -> GibbsConfig:
@@ -271,11 +279,6 @@ def _errand(name: str, model: Model, level: str, budget: int) -> Case:
     )
 
 
-def alone(energies: Sequence[Energy]) -> Energy:
-    """What the one model of a case says."""
-    return energies[0]
-
-
 def _plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> list[Way]:
     leap, dt, iql = paper
     return [
@@ -287,13 +290,14 @@ def _plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> lis
     ]
 
 
+def doors_as_empty(energies: Sequence[Energy]) -> Energy:
+    """What the one model of a case says where open doors are shown as empty cells."""
+    return view(energies[0], without_open_doors)
+
+
 def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
     """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
-
-    def told(energies: Sequence[Energy]) -> Energy:
-        return view(energies[0], without_open_doors)
-
-    views = _plain(paper, told)
+    views = _plain(paper, doors_as_empty)
     named = [way._replace(name=f"{way.name}, open doors seen as empty") for way in views]
     return [*_plain(paper), *named]
 

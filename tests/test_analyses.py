@@ -11,6 +11,7 @@ from experiments.common.analysis import Analysis, Options, Way
 from experiments.common.run import write_metrics
 from experiments.tables import analyses
 from leapjax import pretrained
+from leapjax.babyai import constraints
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
 
@@ -152,7 +153,7 @@ def test_rows_are_named_by_all_that_matters():
     case = case_of("adaptation-medium")
     of, options = properties.ANALYSIS, Options()
 
-    def name(way=case.ways[1], seed=0, options=options):
+    def name(way=case.ways[1], seed=0, options=options, case=case):
         settings = [analysis.training_config(of, m, way.method, seed, options) for m in case.models]
         return analysis.row_name(of, case, way, settings, seed, options)
 
@@ -160,9 +161,24 @@ def test_rows_are_named_by_all_that_matters():
         name(case.ways[0]), name(seed=1), name(options=Options(episodes=100)),
         name(options=Options(preset="paper")), name(options=Options(validation=True)),
         name(case.ways[1]._replace(executed=1)), name(case.ways[1]._replace(search=lambda g: g)),
+        name(case.ways[1]._replace(minimise=analysis.alone)),
+        name(case.ways[1]._replace(minimise=properties.unseen(constraints.lava, weight=1.0))),
+        name(case.ways[1]._replace(minimise=properties.unseen(constraints.left_turns))),
+        name(case.ways[1]._replace(remembers=True)),
+        name(case=case._replace(adapter=None)),
     ]  # fmt: skip
-    assert len({name(), *others}) == 8
+    assert len({name(), *others}) == 13
     assert name(options=Options(force=True, record=True)) == name()
+    same = properties.unseen(constraints.lava, weight=properties.WEIGHT)
+    assert name(case.ways[1]._replace(minimise=same)) == name()
+
+
+@pytest.mark.parametrize("program", ALL, ids=lambda program: program.ANALYSIS.name)
+def test_what_a_way_minimises_can_be_told_by_its_name(program):
+    for case in program.ANALYSIS.cases:
+        for function in (case.adapter, *(way.minimise for way in case.ways)):
+            said = json.dumps(analysis.described(function))
+            assert "<" not in said  # a function without a name, or what it is bound to unseen
 
 
 def test_options_of_a_method_are_for_it_alone_and_for_ours():

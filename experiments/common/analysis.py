@@ -47,13 +47,18 @@ class Model(NamedTuple):
     more: Mapping[str, Mapping[str, Any]] = {}  # of them, by method
 
 
+def alone(energies: Sequence[Energy]) -> Energy:
+    """What the one model of a case says."""
+    return energies[0]
+
+
 class Way(NamedTuple):
     """A way to ask what was trained for plans."""
 
     name: str
     method: str = "leap"
-    minimise: Callable[[Sequence[Energy]], Energy] = lambda energies: energies[0]
-    # (energies of the case's models) -> what the planner minimises
+    minimise: Callable[[Sequence[Energy]], Energy] = alone
+    # (energies of the case's models) -> what the planner minimises; see `described`
     search: Callable[[Any], PlannerConfig] = lambda trained: trained
     # (settings that it was trained with) -> settings of how it searches
     executed: int | None = None  # actions before replanning; None: all
@@ -70,7 +75,7 @@ class Case(NamedTuple):
     level: str
     ways: Sequence[Way]
     adapter: Callable[[str], Adapter] | None = None
-    # makes one of a level; its `violations`, a number, are counted over all episodes
+    # makes one of a level; its `violations`, a number, are counted over all episodes; `described`
 
 
 class Analysis(NamedTuple):
@@ -277,19 +282,35 @@ def row_name(
 ) -> str:
     """Twelve hexadecimal digits that name a row: what was trained, how it plans, and where.
 
-    Of the planner what differs from its defaults alone, so that a setting that is added later
-    changes no name.
+    Of the planner, and of what is asked for, what differs from the defaults alone, so that a
+    setting that is added later changes no name.
     """
     search = way.search(settings[0].planner)
     planner = differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
-    described = {
+    asked = {
+        "minimise": described(way.minimise), "remembers": way.remembers,
+        "adapter": described(case.adapter),
+    }  # fmt: skip
+    plain = {"minimise": described(alone), "remembers": False, "adapter": None}
+    named = {
         "experiment": analysis.name, "case": case.name, "way": way.name, "method": way.method,
         "level": case.level, "seed": seed, "executed": way.executed,
         "episodes": options.episodes, "first": options.played[0],
         "planner": {"kind": type(search).__name__, **planner},
         "trained": [configuration_hash(each, seed) for each in settings],
+        **differences(asked, plain),
     }  # fmt: skip
-    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def described(what: Any) -> Any:
+    """A function as its name and all that it is bound to (`functools.partial`), for JSON."""
+    if isinstance(what, functools.partial):
+        bound = {name: described(each) for name, each in what.keywords.items()}
+        return [described(what.func), *map(described, what.args), bound]
+    if isinstance(what, tuple):
+        return [described(each) for each in what]
+    return what.__qualname__ if callable(what) else what
 
 
 def models_of(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
