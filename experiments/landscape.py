@@ -9,7 +9,7 @@ import contextlib
 import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +30,10 @@ from experiments.common.run import Run
 from leapjax import files
 from leapjax.batching import compile_planner
 from leapjax.data import seeds, windows
-from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import Pretrained
-from leapjax.rollouts import History, stack_contexts
-from leapjax.types import Context, Energy, Params
+from leapjax.types import Context, Energy, Params, Window
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
 EXPERIMENT = Experiment("landscape", "babyai")
@@ -118,7 +116,13 @@ def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
 
 def landscape(this: Run, count: int) -> dict[str, Any]:
     """One training, watched; and plans of what was learned."""
-    measure = energies_of(this, count)
+    firsts = beginnings(this, count)
+    end = this.domain.num_actions - 1
+
+    def measure(energy: Energy, params: Params) -> dict[str, float]:
+        found = {n: mean_energy(energy, params, firsts, n / 100, end) for n in CORRUPTED}
+        return {f"random_{share}": float(mean) for share, mean in found.items()}
+
     with contextlib.ExitStack() as stack:
         played = seeds.validation_seeds(0, count)
         planner, metrics = experiment.train(this, played, stack, measure, plays=False)
@@ -132,74 +136,76 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
         "seed": this.seed,
         "trajectories": count,
         "training": watched,
-        "planning": refinement(planner, this.domain, played),
+        "planning": refinement(planner, firsts.context),
         "versions": results.versions(),
         "date": results.today(),
     }
 
 
-def energies_of(this: Run, count: int) -> Callable[[Energy, Params], dict[str, float]]:
-    """A function that takes the mean energy of demonstrations, corrupted more and more.
+def beginnings(this: Run, count: int) -> Window:
+    """The beginnings `[B]` of demonstrations of another training seed.
 
-    They are of another training seed, each from its beginning, and as long as a plan: to some
-    models the end of an episode is no action.
+    Of those that are as long as a plan: to some models the end of an episode is no action.
 
     Raises:
         UserError: none is.
     """
     domain, specification = this.domain, this.specification
+    horizon = specification.planner.horizon
     data = accuracy.others(domain, specification.origin, count)
-    data = [each for each in data if len(each.actions) >= specification.planner.horizon]
+    data = [each for each in data if len(each.actions) >= horizon]
     if not data:
         raise UserError(
             f"--trajectories {count}: none of these demonstrations has as many actions as a plan, "
-            f"{specification.planner.horizon}: give more"
+            f"{horizon}: give more"
         )
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
-    begins = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
-    end, horizon = domain.num_actions - 1, specification.planner.horizon
-
-    def corrupted(key: jax.Array, actions: jax.Array, share: float) -> jax.Array:
-        where_key, action_key = jax.random.split(key)
-        wrong = jax.random.uniform(where_key, actions.shape) < share
-        # Never the end action: no demonstration ends here.
-        return jnp.where(wrong, jax.random.randint(action_key, actions.shape, 0, end), actions)
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def mean(energy: Energy, params: Params, share: float) -> jax.Array:
-        def one(place: jax.Array, begin: jax.Array) -> jax.Array:
-            window = windows.window(steps, begin, specification.context, horizon, end)
-            actions = corrupted(jax.random.key(place), window.actions, share)
-            return energy.total(params, energy.encode(params, window.context), actions)
-
-        return jax.vmap(one)(jnp.arange(len(begins)), begins).mean()
-
-    def measure(energy: Energy, params: Params) -> dict[str, float]:
-        return {f"random_{n}": float(mean(energy, params, n / 100)) for n in CORRUPTED}
-
-    return measure
+    indices = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
+    end = domain.num_actions - 1
+    return jax.vmap(
+        lambda index: windows.window(steps, index, specification.context, horizon, end)
+    )(indices)
 
 
-def refinement(planner: Pretrained, domain: Domain, played: range) -> dict[str, list[Any]]:
-    """The energy of plans after every iteration, with the paper's N: their mean, and some."""
+def corrupted(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax.Array:
+    """Actions `[T]`, each random with a probability, but never the end action.
+
+    Where a demonstration goes on, the end is not one of its actions.
+    """
+    where_key, action_key = jax.random.split(key)
+    wrong = jax.random.uniform(where_key, actions.shape) < share
+    return jnp.where(wrong, jax.random.randint(action_key, actions.shape, 0, end), actions)
+
+
+@functools.partial(jax.jit, static_argnames=("energy", "end"))
+def mean_energy(
+    energy: Energy, params: Params, begins: Window, share: float, end: int
+) -> jax.Array:
+    """The mean energy `[]` of what was done in windows `[B]`, a share of it replaced at random."""
+
+    def one(place: jax.Array, window: Window) -> jax.Array:
+        actions = corrupted(jax.random.key(place), window.actions, share, end)
+        return energy.total(params, energy.encode(params, window.context), actions)
+
+    return jax.vmap(one)(jnp.arange(len(begins.actions)), begins).mean()
+
+
+def refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
+    """The energy of plans after every iteration, with the paper's N: their mean, and some.
+
+    Plans of what demonstrations began with, so that their energies compare.
+    """
     trained = planner.specification.planner
     assert isinstance(trained, GibbsConfig)  # as of every energy over plans of several actions
     config = dataclasses.replace(trained, iterations=max(10, trained.iterations), score_trace=True)
     plan = compile_planner(planner.energy, config, run.CHUNK_SIZES)
-    contexts = firsts(domain, played, planner.specification.context)
-    plans = plan(planner.params, jax.random.split(jax.random.key(0), len(played)), contexts)
+    keys = jax.random.split(jax.random.key(0), len(jax.tree.leaves(contexts)[0]))
+    plans = plan(planner.params, keys, contexts)
     energies = np.asarray(plans.trace_energies)  # [B, N]
     return {
         "mean": energies.mean(axis=0).tolist(),
         "single": energies[:8].tolist(),
     }
-
-
-def firsts(domain: Domain, played: range, length: int) -> Context:
-    """The contexts, of K = `length`, that episodes begin with."""
-    adapter = domain.make_adapter()
-    histories = [History(adapter.reset(seed), length, domain.num_actions) for seed in played]
-    return stack_contexts(histories)
 
 
 def table(found: Sequence[dict[str, Any]]) -> Table:

@@ -2,7 +2,9 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
@@ -273,7 +275,8 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert [entry["step"] for entry in found["training"]] == [20, 40]
     last = found["training"][-1]
     assert last["random_0"] > 0 and last["random_100"] > 0
-    assert len(found["planning"]["mean"]) == 10 and len(found["planning"]["single"]) == 8
+    energies = found["planning"]
+    assert len(energies["mean"]) == 10 and 0 < len(energies["single"]) <= 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
     for curve in (place / "runs").rglob("metrics.csv"):
         curve.unlink()  # trained before, and its curve is gone
@@ -289,6 +292,16 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert json.loads(path.read_text()) == [again]  # still there
     landscape.keep(path, [{**again, "preset": "paper"}, again])
     assert [each["preset"] for each in json.loads(path.read_text())] == ["leapjax", "paper"]
+
+
+def test_a_share_of_actions_is_replaced_by_any_but_the_end():
+    actions = jnp.full(7000, 2)
+    for share in (0.0, 0.25, 1.0):
+        found = np.asarray(landscape.corrupted(jax.random.key(1), actions, share, end=6))
+        counts = np.bincount(found, minlength=7)
+        assert counts[6] == 0
+        assert counts[[0, 1, 3, 4, 5]] == pytest.approx(share * 7000 / 6, abs=120)  # 4 deviations
+    assert (landscape.corrupted(jax.random.key(1), actions, 0.0, end=6) == actions).all()
 
 
 def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):
