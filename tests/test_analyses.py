@@ -16,6 +16,7 @@ from leapjax import pretrained
 from leapjax.babyai import constraints
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
+from tests.programs import only_long
 
 TOY = {  # nothing is learned: gradients take long to compile
     "demos": 6, "steps": 0, "batch": 4, "width": 16, "heads": 2, "layers": 1, "channels": 4,
@@ -83,6 +84,20 @@ def test_two_models_are_composed(place):
     (row,) = rows(place, "properties")
     assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
     assert row["train_seconds"] == 0  # for no step
+
+
+@only_long
+@pytest.mark.parametrize("program", ALL, ids=lambda program: program.ANALYSIS.name)
+def test_every_way_of_every_program_runs(place, monkeypatch, program):
+    """Of its first case; every method of its own."""
+    of = program.ANALYSIS
+    case = of.cases[0]
+    for method in analysis.methods_of(case):
+        plans = {} if method in ("leap", "classifier") else {"horizon": 1}
+        toy = of._replace(cases=[case], changes={**TOY, **plans})
+        monkeypatch.setattr(program, "ANALYSIS", toy)
+        assert program.main(["--methods", method, *SHORT]) == 0
+    assert {row["way"] for row in rows(place, of.name)} == {way.name for way in case.ways}
 
 
 def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):

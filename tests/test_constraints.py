@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.properties import DETOUR_TURNS, FEW_TURNS, WatchedErrand, exploring
+from experiments.properties import (
+    DETOUR_TURNS,
+    FEW_TURNS,
+    Watched,
+    WatchedErrand,
+    WatchedTurns,
+    exploring,
+)
 from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -252,6 +259,21 @@ def test_beams_go_around_what_left_to_right_stands_in_front_of():
     assert (far[BeamConfig] <= far[GibbsConfig]).all()
     around = (far[BeamConfig] == 0) & (far[GibbsConfig] > 0)
     assert around.sum() >= 3
+
+
+@pytest.mark.parametrize("kind", [Watched, WatchedTurns])
+def test_what_breaks_a_constraint_is_counted(kind):
+    adapter, rng, deaths, turns = kind("GoToLavaHard"), np.random.default_rng(0), 0, 0
+    for seed in range(20):
+        adapter.reset(seed)
+        for action in rng.choice([LEFT, RIGHT, FORWARD, FORWARD, FORWARD, FORWARD], 60).tolist():
+            transition = adapter.step(action)
+            deaths += transition.terminated and not transition.success
+            turns += action == LEFT
+            if transition.terminated or transition.truncated:
+                break
+    assert deaths > 2
+    assert adapter.violations == deaths + (turns if kind is WatchedTurns else 0)
 
 
 def test_turns_over_the_budget_are_counted_in_each_episode():

@@ -19,7 +19,10 @@ from leapjax.types import Array, Context
 
 
 def lava(context: Context, actions: jax.Array) -> jax.Array:
-    """Steps onto lava, of the whole plan."""
+    """Steps onto lava, of the whole plan, where nothing but the agent moves: see `roll`.
+
+    Where a plan moves things or shuts doors, and goes on there, it can be wrong either way.
+    """
     return _lava_steps(context.observation, actions)
 
 
@@ -137,7 +140,10 @@ def without_open_doors(context: Context) -> Context:
 
 
 def half_of_obstacles(context: Context, part: int) -> Context:
-    """A context in which every second object that is not the goal is seen: part 0 or 1."""
+    """A context in which every second object that is not the goal is seen: part 0 or 1.
+
+    In reading order: where one is taken away, those that come after it change parts.
+    """
     return _hiding(context, lambda grid, goal: in_half(grid, goal, 1 - part))
 
 

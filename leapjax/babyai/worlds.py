@@ -8,7 +8,7 @@ from minigrid.envs.babyai import GoTo, GoToLocal
 from minigrid.envs.babyai.core.roomgrid_level import RejectSampling, RoomGridLevel
 from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc, PickupInstr
 
-from leapjax.babyai.observations import Cell, agent_cell
+from leapjax.babyai.observations import Cell, agent_cell, path_lengths
 
 MOST_LAVA = 5  # cells, of the medium one
 
@@ -137,15 +137,5 @@ class PickUp(GoTo):
 
 def require_a_way(env: RoomGridLevel, to: Cell) -> None:
     """Refuses levels, while they are made, where lava or objects are on every way to a cell."""
-    start = agent_cell(env)
-    reached, stack = {start}, [start]
-    while stack:
-        x, y = stack.pop()
-        for near in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
-            if near == to:
-                return
-            cell = env.grid.get(*near)
-            if near not in reached and (cell is None or cell.type == "door"):
-                reached.add(near)
-                stack.append(near)
-    raise RejectSampling("something is on every way")
+    if to not in path_lengths(env.grid, agent_cell(env), through_objects=False):
+        raise RejectSampling("something is on every way")
