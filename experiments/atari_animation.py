@@ -9,7 +9,6 @@ from PIL import Image, ImageDraw
 from experiments.common.episodes import watched
 from experiments.common.pictures import Frame, save_animation
 from experiments.common.run import Run
-from leapjax.atari.adapter import AtariAdapter
 from leapjax.pretrained import Pretrained
 from leapjax.types import Plan
 
@@ -21,6 +20,8 @@ WHITE, BLACK, GREY, BLUE = (255, 255, 255), (0, 0, 0), (150, 150, 150), (40, 110
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws the beginning of one game, every second decision of it."""
+    from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
+
     adapter = run.domain.make_adapter()
     assert isinstance(adapter, AtariAdapter)
     actions, title = run.domain.actions, run.domain.level

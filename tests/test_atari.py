@@ -30,6 +30,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.pretrained import Origin
 from leapjax.types import Demonstration, Energy
 from tests.parameters import random_like
+from tests.programs import ROOT
 
 PONG, BREAKOUT = GAMES["Pong"], GAMES["Breakout"]
 MODEL = ModelConfig(width=16, layers=1, heads=1, dropout=0.0)
@@ -295,6 +296,22 @@ def test_without_ale_py_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(domain.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'leapjax\[atari\]'"):
         domain.make("Pong", domain.Settings())
+
+
+def test_without_ale_py_every_command_says_so_in_one_line():
+    program = (
+        "import sys\n"
+        "sys.modules['ale_py'] = None\n"
+        "from experiments import atari\n"
+        "commands = [], ['collect']\n"
+        "sys.exit(any(atari.main([*each, '--game', 'Pong']) != 2 for each in commands))\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT
+    )
+    assert ended.returncode == 0
+    said = "error: Atari needs ale-py, which is missing: pip install 'leapjax[atari]'"
+    assert ended.stderr.splitlines() == [said, said]
 
 
 def test_a_normalised_score_is_between_random_and_a_gamer():
