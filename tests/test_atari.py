@@ -530,3 +530,14 @@ def test_a_step_that_was_begun_is_waited_for():
     adapter.begin(1)
     with pytest.raises(ValueError, match="action 1 was begun, not 2"):
         adapter.step(2)
+
+
+def test_what_a_game_was_busy_with_is_not_of_the_next_one():
+    adapter, other = AtariAdapter(BREAKOUT, 0.0, 27_000), AtariAdapter(BREAKOUT, 0.0, 27_000)
+    adapter.reset(3)
+    adapter.begin(1)
+    frame = adapter.reset(4)
+    np.testing.assert_array_equal(frame, other.reset(4))
+    for action in [2, 1, 0, 3, 1]:
+        np.testing.assert_array_equal(adapter.step(action)[0], other.step(action)[0])
+    assert adapter.score == other.score

@@ -30,6 +30,9 @@ class AtariAdapter:
 
     def reset(self, seed: int) -> np.ndarray:
         """Starts the game of a seed: the frame `[84, 84]` uint8."""
+        if self._begun is not None:  # what it is busy with is of the game before
+            self._env.recv()
+            self._begun = None
         observations, _ = self._env.reset(seed=seed)
         self.frame, self.score = np.array(observations[0, -1]), 0.0
         return self.frame
