@@ -37,7 +37,6 @@ class PlayedGame(NamedTuple):
     frames: np.ndarray  # [n, 84, 84] uint8: before each action
     actions: np.ndarray  # [n] int32: as executed
     rewards: np.ndarray  # [n] float32, not clipped
-    over: bool  # it came to an end of its own
 
     @property
     def score(self) -> float:
@@ -69,9 +68,7 @@ def play(game: Game, seed: int, noise: float, most_steps: int = MAX_STEPS) -> Pl
             action = int(noises.integers(emulator.num_actions))
         actions.append(action)
         rewards.append(emulator.step(action))
-    return PlayedGame(
-        np.stack(frames), np.array(actions, np.int32), np.array(rewards, np.float32), emulator.over
-    )
+    return PlayedGame(np.stack(frames), np.array(actions, np.int32), np.array(rewards, np.float32))
 
 
 def make_demonstrator(game: Game) -> Demonstrator:
