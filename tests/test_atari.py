@@ -72,6 +72,15 @@ def test_a_game_is_the_same_for_the_same_seed_alone():
     assert (first != other).any()
 
 
+def test_sticky_actions_make_another_game():
+    one, again, sticky = (
+        play(AtariAdapter(BREAKOUT, sticky, 27_000), 3, 60)[0] for sticky in (0.0, 0.0, 1.0)
+    )
+    np.testing.assert_array_equal(one, again)
+    np.testing.assert_array_equal(one[0], sticky[0])  # its start is the same
+    assert (one != sticky).any()
+
+
 def test_a_game_is_cut_off_where_it_is_asked_to_be():
     seen, transitions = play(AtariAdapter(PONG, 0.0, 40), 0, 100)
     assert transitions[-1].truncated and not transitions[-1].terminated
