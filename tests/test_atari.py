@@ -441,6 +441,43 @@ def test_games_of_other_demonstrators_are_not_taken_for_todays(collected, monkey
     assert "other shares of random actions than today's" in capsys.readouterr().err
 
 
+def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypatch, capsys):
+    folder, arguments = collected
+    shutil.copytree(folder, tmp_path / "copy")
+    arguments = [*arguments, "--folder", str(tmp_path / "copy")]
+    path = replay.replay_logs(tmp_path / "copy", BREAKOUT, 1) / "manifest.0.json"
+    manifest = json.loads(path.read_text())
+    assert (manifest["demonstrator"], manifest["rules"]) == ("Paddle", 1)
+    path.write_text(json.dumps({**manifest, "demonstrator": "Somebody"}))
+    assert atari.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "of the demonstrator Somebody with rules 1, and today's is Paddle with rules 1" in error
+    assert error.count("\n") == 1
+    # What was made before manifests said so was made by the first rules.
+    old = {name: manifest[name] for name in manifest if name not in ("demonstrator", "rules")}
+    path.write_text(json.dumps(old))
+    assert atari.main(arguments) == 0
+    monkeypatch.setitem(collect.demonstrators._RULES, "Breakout", 2)
+    assert atari.main(arguments) == 2
+    assert "with rules 1, and today's is Paddle with rules 2" in capsys.readouterr().err
+    # To learn from them is another matter.
+    assert collect.shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
+
+
+@pytest.mark.parametrize(("game", "run"), [("Pong", 1), ("Breakout", 2)])
+def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
+    folder, arguments = collected
+    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
+    where = ["--folder", str(tmp_path), "--game", game, "--run", str(run)]
+    assert atari.main([*arguments, *where]) == 2
+    error = capsys.readouterr().err
+    assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
+    assert error.count("\n") == 1
+    settings = domain.Settings(transitions=100, replay_run=run)
+    with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
+        domain.source(GAMES[game], settings).load(str(tmp_path), 0)
+
+
 def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path):
     folder, _ = collected
     copy = tmp_path / "atari"

@@ -1,4 +1,5 @@
 import functools
+import json
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ pytest.importorskip("ale_py")  # an extra
 from ale_py.vector_env import AtariVectorEnv
 
 from leapjax.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
+from leapjax.atari.domain import LONGEST
 from leapjax.atari.emulator import Emulator
 from leapjax.atari.games import GAMES
+from tests.programs import ROOT
 
 games = pytest.mark.parametrize("name", GAMES)
 
@@ -82,6 +85,15 @@ def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
     assert game.score == game.rewards.sum()
     assert same(game, play(GAMES[name], 0, 0.5, 12))
     assert not same(game, played(name, seed=1, noise=0.5))
+
+
+@games
+def test_recorded_games_are_played_again(name):
+    """If this fails because a rule was changed, `_RULES` is to be raised."""
+    recorded = json.loads((ROOT / "results/atari-data.json").read_text())[name]
+    shortest = min(recorded, key=lambda game: game["transitions"])
+    game = play(GAMES[name], shortest["seed"], shortest["noise"], LONGEST)
+    assert (len(game.actions), game.score) == (shortest["transitions"], shortest["score"])
 
 
 @games

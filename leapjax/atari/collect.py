@@ -58,16 +58,19 @@ def collect(
         What is in each file: its games, with their scores.
 
     Raises:
-        UserError: there are files of somebody else, or games of another length, or a process died.
+        UserError: there are files of somebody else or of another game, or games of another length
+            or by another demonstrator, or a process died.
     """
     logs = replay.replay_logs(folder, game, run)
     workers = workers or len(os.sched_getaffinity(0))
     with files.only_process_in(logs):
         _claim(logs)
         files.check_room(logs, transitions * BYTES)
-        made = _made(logs, transitions, longest)
+        made = _made(folder, game, run, transitions, longest)
         if _count(made) < transitions:  # else no process needs to be started
-            waiting = (n for n in itertools.count() if _known(logs, n, longest) is None)
+            waiting = (
+                n for n in itertools.count() if _known(folder, game, run, n, longest) is None
+            )
             with _processes(workers) as pool:
                 running: list[Future[Manifest]] = []
                 while _count(made) < transitions:
@@ -76,7 +79,7 @@ def collect(
                         shard = folder, game.name, run, next(waiting), longest
                         running.append(pool.submit(make_shard, *shard))
                     time.sleep(POLL)
-                    made = _made(logs, transitions, longest, made)
+                    made = _made(folder, game, run, transitions, longest, made)
                     progress(min(_count(made), transitions))
     progress(transitions)
     files.write_text(logs.parent / "manifest.json", json.dumps(made, indent=1) + "\n")
@@ -84,14 +87,21 @@ def collect(
 
 
 def is_whole(folder: Path, game: Game, transitions: int, run: int, longest: int) -> bool:
-    """Whether `collect` has nothing left to do."""
-    made = _made(replay.replay_logs(folder, game, run), transitions, longest)
-    return _count(made) >= transitions
+    """Whether `collect` has nothing left to do.
+
+    Raises:
+        UserError: what is there is not what it would make.
+    """
+    return _count(_made(folder, game, run, transitions, longest)) >= transitions
 
 
 def shards(folder: Path, game: Game, transitions: int, run: int) -> range | None:
-    """The files that so many transitions are in, whatever else was made; None: not made here."""
-    made = _made(replay.replay_logs(folder, game, run), transitions)
+    """The files that so many transitions are in, whatever else was made; None: not made here.
+
+    Raises:
+        UserError: they are of another game or run.
+    """
+    made = _made(folder, game, run, transitions)
     return range(len(made)) if _count(made) >= transitions else None
 
 
@@ -130,7 +140,8 @@ def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> 
         )  # fmt: skip
     replay.write_shard(logs, number, played)
     manifest = {
-        "game": name, "run": run, "shard": number, "longest": longest, "games": games,
+        "game": name, "run": run, "shard": number, "longest": longest,
+        **demonstrators.rules_of(game), "games": games,
         "versions": {each: metadata.version(each) for each in ("leapjax", "ale-py", "numpy")},
     }  # fmt: skip
     # Last: a file without its manifest is made again.
@@ -142,37 +153,67 @@ def _manifest(logs: Path, number: int) -> Path:
     return logs / f"manifest.{number}.json"
 
 
-def _known(logs: Path, number: int, longest: int | None = None) -> Manifest | None:
-    """What is in a file that was made here, of games of some length; None if it was not."""
+def _known(
+    folder: Path, game: Game, run: int, number: int, longest: int | None = None
+) -> Manifest | None:
+    """What is in a file that was made here; None if it was not.
+
+    With `longest` it is to be gone on with: then it must be as it would be made today.
+
+    Raises:
+        UserError: it is damaged, of another game or run, or not as it would be made today.
+    """
+    logs = replay.replay_logs(folder, game, run)
     path = _manifest(logs, number)
     if not path.exists() or not replay.has_shard(logs, number):
         return None
     try:
         manifest = json.loads(files.read_text(path))
         _count([manifest])
-        noises = [game["noise"] for game in manifest["games"]]
-        game = find_game(manifest["game"])
+        noises = [each["noise"] for each in manifest["games"]]
+        of = manifest["game"], manifest.get("run", run)
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
+    if of != (game.name, run):
+        raise UserError(
+            f"{logs} holds games of {of[0]}, run {of[1]}, not of {game.name}, run {run}: give the "
+            "folder its own name again, or name another one"
+        )
     if longest is None:
         return manifest
+    another = "remove them, or name another folder"
     found = manifest.get("longest", longest)
     if found != longest:
         raise UserError(
             f"{logs} holds games that were cut off after {found} decisions, not after {longest}: "
-            "remove them, or name another folder"
+            f"{another}"
         )
-    today = [demonstrators.noise_of(game, number + index) for index in range(len(noises))]
-    if noises != today:
+    rules = demonstrators.rules_of(game)
+    # Manifests that do not say were written when all demonstrators had their first rules.
+    played = {"demonstrator": rules["demonstrator"], "rules": 1} | {
+        name: manifest[name] for name in rules if name in manifest
+    }
+    if played != rules:
+        raise UserError(
+            f"{logs} holds games of the demonstrator {played['demonstrator']} with rules "
+            f"{played['rules']}, and today's is {rules['demonstrator']} with rules "
+            f"{rules['rules']}: {another}"
+        )
+    if noises != [demonstrators.noise_of(game, number + index) for index in range(len(noises))]:
         raise UserError(
             f"{logs} holds games with other shares of random actions than today's demonstrators "
-            "have: remove them, or name another folder"
+            f"have: {another}"
         )
     return manifest
 
 
 def _made(
-    logs: Path, transitions: int, longest: int | None = None, before: Sequence[Manifest] = ()
+    folder: Path,
+    game: Game,
+    run: int,
+    transitions: int,
+    longest: int | None = None,
+    before: Sequence[Manifest] = (),
 ) -> list[Manifest]:
     """What is in the files that were made here, up to so many transitions, or to a gap.
 
@@ -180,7 +221,7 @@ def _made(
     """
     made = list(before)
     while _count(made) < transitions:
-        manifest = _known(logs, len(made), longest)
+        manifest = _known(folder, game, run, len(made), longest)
         if manifest is None:
             break
         made.append(manifest)

@@ -5,12 +5,12 @@ a tree of hops in the emulator.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from leapjax.atari.emulator import MOST_NOOPS, SCREEN, Emulator
-from leapjax.atari.games import MAX_STEPS, Game
+from leapjax.atari.games import GAMES, MAX_STEPS, Game
 
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
 # what to do now; leaves the emulator as it found it. One plays one game, from its start on.
@@ -22,6 +22,10 @@ _NOISES = (0.1, 0.3, 0.5)
 # Who learns from more noise in Seaquest scores as much, though its demonstrator scores less.
 _MORE_NOISE = {"Seaquest": (0.3, 0.5, 0.7)}
 
+# By game; raised whenever what its demonstrator does changes: nobody then goes on with games that
+# the one before has begun to play.
+_RULES = dict.fromkeys(GAMES, 1)
+
 _NOOP = 0  # in every game
 
 
@@ -29,6 +33,13 @@ def noise_of(game: Game, number: int) -> float:
     """How probable a random action is in one of the games that are played for data."""
     noises = _MORE_NOISE.get(game.name, _NOISES)
     return noises[number % len(noises)]
+
+
+def rules_of(game: Game) -> dict[str, Any]:
+    """Who plays a game, and by which version of its rules, as a manifest says it."""
+    player = make_demonstrator(game)
+    name = getattr(player, "__name__", type(player).__name__)
+    return {"demonstrator": name.strip("_"), "rules": _RULES[game.name]}
 
 
 class PlayedGame(NamedTuple):
