@@ -25,7 +25,9 @@ from leapjax.atari.games import Game, find_game
 from leapjax.data.seeds import TRAINING_START, TRAINING_STRIDE
 from leapjax.errors import UserError
 
-SHARD = 1_000  # transitions of a file, at least: what a killed program loses at most of each core
+# Transitions of a file, at least. A killed program loses the unfinished file of each core: at most
+# this and one more game.
+SHARD = 1_000
 GAMES = 1_000  # of a file, at most
 BYTES = 200  # of a transition on the disk, more or less
 POLL = 0.2  # seconds
