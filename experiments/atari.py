@@ -38,8 +38,8 @@ class Collect:
     """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
     """Where to; a game that was begun there goes on."""
-    run: int = 1
-    """Number of the run: each has games of its own."""
+    replay_run: int = 1
+    """Number of the run, as DQN-Replay has five of each game: each has games of its own."""
     longest: int = LONGEST
     """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
@@ -63,7 +63,7 @@ def run(options: Collect) -> None:
     Raises:
         UserError: an unknown game, or numbers that cannot be.
     """
-    for name in ("transitions", "run", "longest", "workers"):
+    for name in ("transitions", "replay_run", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
@@ -73,7 +73,7 @@ def run(options: Collect) -> None:
     transitions = options.transitions or preset(options.game, "leapjax")["transitions"]
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
-            options.folder, find_game(options.game), transitions, options.run,
+            options.folder, find_game(options.game), transitions, options.replay_run,
             options.longest, options.workers, meter.update,
         )  # fmt: skip
     games = [game for manifest in made for game in manifest["games"]]

@@ -468,7 +468,7 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
 def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
     folder, arguments = collected
     shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
-    where = ["--folder", str(tmp_path), "--game", game, "--run", str(run)]
+    where = ["--folder", str(tmp_path), "--game", game, "--replay-run", str(run)]
     assert atari.main([*arguments, *where]) == 2
     error = capsys.readouterr().err
     assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
@@ -525,6 +525,7 @@ def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys,
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "unknown game 'Pongg'"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
+        (["collect", "--game", "Pong", "--replay-run", "0"], "--replay-run must be at least 1"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):

@@ -326,6 +326,7 @@ def test_no_such_game_or_run(tmp_path):
     assert f"no data of Breakout in {tmp_path}, only of Pong" in message
     assert "no run 1 of Pong" in refused(tmp_path) and "only 2" in refused(tmp_path)
     assert len(read(tmp_path, run=2).demonstrations) == 1
+    assert "collect --game Pong --replay-run 3`" in refused(tmp_path, run=3)
 
 
 def test_no_shards(tmp_path):

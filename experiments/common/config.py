@@ -41,7 +41,8 @@ class Config(Generic[M, D, P]):
     planner: Annotated[P, tyro.conf.arg(name="")]
     domain: Annotated[str, tyro.conf.Suppress]
     level: str
-    """A level of the domain by its name or id, or "all" for those of the paper."""
+    """A level of the domain by its name or id, or "all" for those of the paper. --game means the
+    same to experiments.atari, and --env to experiments.gymnasium."""
     method: str = "leap"
     """How to learn and to act: a line of the table in leapjax/methods.py, or "all" of them."""
     preset: str = "leapjax"
@@ -340,7 +341,8 @@ def check_counts(options: object, *names: str) -> None:
     """
     for name in names:
         if getattr(options, name) < 1:
-            raise UserError(f"--{name} must be at least 1, got {getattr(options, name)}")
+            option = name.replace("_", "-")
+            raise UserError(f"--{option} must be at least 1, got {getattr(options, name)}")
 
 
 def check_executed(executed: int | None, horizon: int, of: str = "") -> None:

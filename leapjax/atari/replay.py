@@ -210,10 +210,11 @@ def _existing_logs(folder: Path, game: Game, run: int) -> Path:
     logs = replay_logs(folder, game, run)
     if logs.is_dir():
         return logs
+    other = "" if run == 1 else f" --replay-run {run}"
     expected = (
         f"expected the shards of DQN-Replay in {logs}: copy them from "
         "gs://atari-replay-datasets, or make such data with "
-        f"`python -m experiments.atari collect --game {game.name}`"
+        f"`python -m experiments.atari collect --game {game.name}{other}`"
     )
     if not folder.is_dir():
         raise UserError(f"no folder {folder}; {expected}")
