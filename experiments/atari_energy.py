@@ -100,7 +100,7 @@ def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -
     means, returns = [], []
     for game in games:
         places = random.integers(len(game.actions) - horizon + 1, size=count)
-        steps = jax.tree.map(jnp.asarray, windows.padded(windows.concatenate([game])))
+        steps = jax.tree.map(jnp.asarray, windows.concatenate([game], padded=True))
         means.append(float(energies(planner.energy, planner.params, steps, jnp.asarray(places))))
         returns.append(float(game.rewards.sum()))
     if len(set(returns)) < 2:

@@ -1,4 +1,5 @@
 import functools
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -370,7 +371,7 @@ def test_by_start_every_demonstration_counts_the_same_and_none_but_its_first_ste
 
 def test_padding_changes_no_window():
     steps = laid_out(toy_demonstrations())
-    padded = windows.padded(steps)
+    padded = windows.concatenate(toy_demonstrations(), extras=way, padded=True)
     assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
     assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
     # JAX's CPU devices share what begins so, and each copies what does not.
@@ -378,6 +379,34 @@ def test_padding_changes_no_window():
     for by in windows.SAMPLINGS:
         same = [draw(jax.random.key(0), on_device(data), 64, 2, 5, by) for data in (steps, padded)]
         jax.tree.map(np.testing.assert_array_equal, *same)
+    # What a run learns from has the name that it would have without padding.
+    jax.tree.map(np.testing.assert_array_equal, windows.unpadded(padded), steps)
+    assert windows.fingerprint(windows.unpadded(padded)) == windows.fingerprint(steps)
+    assert windows.fingerprint(padded) != windows.fingerprint(steps)
+
+
+def test_frames_that_are_mapped_are_in_memory_once(tmp_path):
+    rows, side = 128, 84
+    stored = np.arange(2 * rows * side * side).astype(np.uint8).reshape(2 * rows, side, side)
+    np.save(tmp_path / "frames.npy", stored)
+    frames = np.load(tmp_path / "frames.npy", mmap_mode="r")
+    games = [
+        Demonstration(
+            frames[first : first + rows], np.zeros(rows - 1, np.int32),
+            np.zeros(rows - 1, np.float32), True, False, -1,
+        )
+        for first in (0, rows)
+    ]  # fmt: skip
+    tracemalloc.start()
+    try:
+        steps = windows.concatenate(games, padded=True)
+        name = windows.fingerprint(windows.unpadded(steps))
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert stored.nbytes < most < 1.1 * stored.nbytes
+    np.testing.assert_array_equal(steps.observations, stored)
+    assert name == windows.fingerprint(windows.concatenate(games))
 
 
 def test_another_way_to_draw_is_refused():

@@ -214,12 +214,13 @@ def fit(
         watch: measures more of what is being learned, whenever its progress is reported.
     """
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
-    examples: Any = windows.concatenate(data, run.domain.extras) if data else ()
-    check_data(folder, windows.fingerprint(examples), [each.seed for each in data])
+    # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
+    steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
+    named = windows.fingerprint(windows.unpadded(steps) if data else ())
+    check_data(folder, named, [each.seed for each in data])
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
-    steps = sharding.replicate(windows.padded(examples) if data else (), mesh)
-    del examples  # of Atari, as large as all frames
+    steps = sharding.replicate(steps, mesh)
     compiling = time.perf_counter()
     if total:  # the one program that depends on how many demonstrations there are
         jax.block_until_ready(step.draw(key, state.step, steps))

@@ -23,7 +23,7 @@ SAMPLINGS = ("episode", "step", "start")
 class Steps(NamedTuple):
     """All steps of all demonstrations, one after the other: M steps of E episodes.
 
-    Behind them the arrays may be padded (see `padded`).
+    Behind them the arrays may be padded (see `concatenate`).
     """
 
     observations: PyTree  # [M + E, ...] the states of each episode, its last one included
@@ -54,54 +54,63 @@ def fingerprint(steps: PyTree) -> str:
 def concatenate(
     demonstrations: Sequence[Demonstration],
     extras: Callable[[Demonstration], PyTree] = lambda demonstration: (),
+    padded: bool = False,
 ) -> Steps:
     """Lays demonstrations out for `window`.
 
     Args:
         demonstrations: at least one.
         extras: of a demonstration, `[n, ...]` (`Domain.extras`).
+        padded: to arrays whose lengths are powers of two. Programs are compiled for lengths: those
+            for one training seed then serve most others.
     """
     lengths = np.array([len(d.actions) for d in demonstrations], np.int32)
     episode = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
     step = np.concatenate([np.arange(n, dtype=np.int32) for n in lengths])
     last = step == lengths[episode] - 1
-
-    def join(parts: Sequence[PyTree]) -> PyTree:
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
+    actions = np.concatenate([d.actions for d in demonstrations]).astype(np.int32)
     rewards = [np.asarray(d.rewards, np.float32) for d in demonstrations]
+    before = np.concatenate([np.cumsum(np.append(0, r))[:-1] for r in rewards]).astype(np.float32)
+    terminated = last & np.array([d.terminated for d in demonstrations])[episode]
+
+    def join(*parts: PyTree) -> PyTree:
+        return jax.tree.map(lambda *leaves: _joined(leaves, padded), *parts)
+
     return Steps(
-        observations=join([d.observations for d in demonstrations]),
-        state=np.arange(len(step), dtype=np.int32) + episode,
-        actions=np.concatenate([d.actions for d in demonstrations]).astype(np.int32),
-        rewards=np.concatenate(rewards),
-        return_so_far=np.concatenate([np.cumsum(np.append(0, r))[:-1] for r in rewards]).astype(
-            np.float32
-        ),
-        terminated=last & np.array([d.terminated for d in demonstrations])[episode],
-        step=step,
-        remaining=lengths[episode] - step,
+        observations=join(*(d.observations for d in demonstrations)),
+        state=join(np.arange(len(step), dtype=np.int32) + episode),
+        actions=join(actions),
+        rewards=join(*rewards),
+        return_so_far=join(before),
+        terminated=join(terminated),
+        step=join(step),
+        remaining=join(lengths[episode] - step),
         starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32),
         lengths=lengths,
         count=np.int32(len(step)),
-        extras=join([extras(d) for d in demonstrations]),
+        extras=join(*(extras(d) for d in demonstrations)),
     )
 
 
-def padded(steps: Steps) -> Steps:
-    """The same steps, in arrays whose lengths are powers of two.
+def unpadded(steps: Steps) -> Steps:
+    """The same steps without what is behind them: views, nothing is copied."""
+    count, episodes = int(steps.count), len(steps.starts)
+    whole = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
+    observations = jax.tree.map(lambda leaf: leaf[: count + episodes], steps.observations)
+    rest = steps._replace(**dict.fromkeys(whole, ()), observations=())
+    rest = jax.tree.map(lambda leaf: leaf[:count], rest)
+    return rest._replace(**whole, observations=observations)
 
-    Programs are compiled for lengths: those for one training seed then serve most others.
-    """
 
-    def lengthen(leaf: Array) -> Array:
-        longer = _zeros((1 << (len(leaf) - 1).bit_length(), *leaf.shape[1:]), leaf.dtype)
-        longer[: len(leaf)] = leaf
-        return longer
-
-    kept = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
-    lengthened = jax.tree.map(lengthen, steps._replace(**dict.fromkeys(kept, ())))
-    return lengthened._replace(**kept)
+def _joined(parts: Sequence[Array], padded: bool) -> np.ndarray:
+    """Arrays one after the other, copied once: the frames of games are gigabytes, in a file."""
+    if not padded:
+        return np.concatenate(parts)
+    arrays = [np.asarray(part) for part in parts]
+    length, dtype = sum(map(len, arrays)), np.result_type(*{array.dtype for array in arrays})
+    longer = _zeros((1 << (length - 1).bit_length(), *arrays[0].shape[1:]), dtype)
+    np.concatenate(arrays, out=longer[:length])
+    return longer
 
 
 def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
