@@ -30,7 +30,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.pretrained import Origin
 from leapjax.types import Demonstration, Energy
 from tests.parameters import random_like
-from tests.programs import ROOT
+from tests.programs import ROOT, only_long
 
 PONG, BREAKOUT = GAMES["Pong"], GAMES["Breakout"]
 MODEL = ModelConfig(width=16, layers=1, heads=1, dropout=0.0)
@@ -350,15 +350,51 @@ def test_what_was_collected_is_what_was_played(collected):
     assert max(game["score"] for game in games) > 0
 
 
-def test_there_is_nothing_to_compare_with_one_reward():
-    games = [demonstration(6)._replace(rewards=np.zeros(6, np.float32))] * 3
+def cost_planner(horizon):
+    """An action costs its number and the steps before its window cost 100 each, times `params`."""
     specification = SimpleNamespace(
-        level="Pong", context=0, planner=SimpleNamespace(horizon=2), origin=Origin("", 0, 0, None)
+        level="Pong",
+        context=0,
+        planner=SimpleNamespace(horizon=horizon),
+        origin=Origin("", 0, 0, None),
     )
-    energy = Energy(lambda params, context: context, None, lambda *given: jnp.zeros(()), 5)
-    planner = SimpleNamespace(specification=specification, energy=energy, params=())
+
+    def total(params, step, actions):
+        return params * (actions + 100 * step).sum()
+
+    energy = Energy(lambda params, context: context.step, None, total, 5)
+    return SimpleNamespace(specification=specification, energy=energy, params=jnp.float32(2))
+
+
+def game_of(actions, reward):
+    """A game whose last step is rewarded."""
+    count = len(actions)
+    rewards = np.zeros(count, np.float32)
+    rewards[-1] = reward
+    return Demonstration(frames(count + 1), np.array(actions, np.int32), rewards, True, False, -1)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_energies_of_games_are_those_of_their_windows(sign):
+    # Games as long as a plan have one window each; one that is shorter has none.
+    played = [[0, 1, 2], [3, 3, 0], [2, 3, 3], [1, 0, 0], [3, 3]]
+    means = [2 * sum(actions) / 3 for actions in played[:4]]
+    rewards = [*(sign * mean for mean in means), 50.0]
+    games = [game_of(*each) for each in zip(played, rewards, strict=True)]
+    found = atari_energy.correlate(cost_planner(3), games, 4)
+    np.testing.assert_allclose(found["energies"], means, rtol=1e-6)
+    np.testing.assert_allclose(found["returns"], rewards[:4], rtol=1e-6)
+    assert found["correlation"] == pytest.approx(sign)
+    # A longer one has as many as asked for, each within it: from its first step or its second.
+    longer = game_of([1, 1, 1, 1], 1.0)
+    found = atari_energy.correlate(cost_planner(3), [longer, games[0]], 64)
+    assert 40 < (found["energies"][0] - 2) / 2 < 60
+
+
+def test_there_is_nothing_to_compare_with_one_reward():
+    games = [game_of([0, 1, 2], 0.0)] * 3
     with pytest.raises(UserError, match="all 3 trajectories of Pong have one reward"):
-        atari_energy.correlate(planner, games, 2)
+        atari_energy.correlate(cost_planner(2), games, 2)
 
 
 def test_collecting_goes_on_where_it_was_stopped(collected):
@@ -516,6 +552,32 @@ def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys,
     assert len(found["energies"]) == len(found["returns"]) > 8
     assert -1 <= found["correlation"] <= 1 and min(found["energies"]) > 0
     assert "rank correlation" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "--method dt",
+        "--method cql",
+        pytest.param("--method bc", marks=only_long),
+        pytest.param("--method qr_dqn", marks=only_long),
+        pytest.param("--method rem", marks=only_long),
+        pytest.param("--preset paper --run 2 --context 4", marks=only_long),
+    ],
+)
+def test_every_way_to_learn_trains_and_plays(
+    collected, tmp_path, monkeypatch, quick_begin, options
+):
+    folder, _ = collected
+    monkeypatch.chdir(tmp_path)
+    toy = (
+        f"--game Breakout --demonstrations {folder} --transitions 400 --steps 2 --batch 4 "
+        "--episodes 1 --max-steps 30 --layers 1 --width 16 --heads 1 --features 2 --no-pictures"
+    )
+    assert atari.main([*toy.split(), *options.split()]) == 0
+    (row,) = [json.loads(line) for line in Path("runs/atari.jsonl").read_text().splitlines()]
+    assert row["train_steps"] == 2 and np.isfinite(row["mean_return"])
+    assert row["plans"] == row["mean_length"] > 0  # each executes one action
 
 
 @pytest.mark.parametrize(
