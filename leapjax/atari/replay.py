@@ -39,7 +39,7 @@ from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration
 
 PADDING = 3  # rows before each episode
-TRAJECTORIES_PER_VISIT = 10  # as the Decision Transformer's loader has it
+TRAJECTORIES_PER_VISIT = 10  # what the Decision Transformer's loader is told; it takes one more
 CUT_BEFORE, CUT_AFTER = "cut by the beginning of a file", "cut by the end of a file"
 
 _STORED: dict[str, tuple[np.dtype, tuple[int, ...]]] = {  # by name: the type, the shape of a row
@@ -158,11 +158,12 @@ def read(
     run: int = 1,
     shards: Sequence[int] | None = None,
 ) -> Collection:
-    """Samples whole trajectories as the Decision Transformer's loader does.
+    """Samples whole trajectories nearly as the Decision Transformer's loader does.
 
     A random shard at a time gives up to ten trajectories, from where it was left before, until
-    there are enough. Padding is left out wherever it is: a maker of data may write none, but
-    then nobody knows whether the first trajectory of a shard is whole, and it counts as cut.
+    there are enough; docs/deviations.md says what differs. Padding is left out wherever it is: a
+    maker of data may write none, but then nobody knows whether the first trajectory of a shard is
+    whole, and it counts as cut.
 
     The frames are unpacked once, into a memory-mapped file beside the data (in a temporary
     folder, where that is read-only). A later call with the same arguments only opens it, until
