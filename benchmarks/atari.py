@@ -1,8 +1,9 @@
 """What playing and training cost on Atari: `python -m benchmarks.atari`.
 
-Training steps as `benchmarks.training` measures them; states encoded per second; decisions per
-second for some games that are played together, by what they are made of: the games themselves,
-the encoder, and the iterations over the plan.
+Training steps as `benchmarks.training` measures them; decisions per second for some games that are
+played together, by what they are made of: the games themselves, the encoder, and the iterations
+over the plan; states encoded per second, and what that is of the matrix-multiply peak measured in
+the same run, as for training.
 """
 
 import dataclasses
@@ -22,9 +23,10 @@ from rich.table import Table
 from benchmarks import training
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
-from benchmarks.timing import Row, check_writable, fastest, write_rows
+from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
+from experiments.tables.atari import encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
@@ -108,6 +110,8 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
     energy = agent.energy
     params = jax.jit(agent.init)(jax.random.key(0)).params
     encode = jax.vmap(energy.encode, in_axes=(None, 0))
+    tokens = config.training.batch * config.planner.horizon
+    peak = matmul_peak(tokens, config.model.width, seconds)
     rows: list[Row] = []
     for batch in batches:
         plan = compile_planner(energy, config.planner, (batch,))
@@ -139,6 +143,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
                 "encoding_seconds": fastest(encoding, seconds),
                 "playing_seconds": playing_seconds(domain, batch),
                 "encoding_flops": matmul_flops(encode, params, contexts),
+                "peak_gflops": peak,
             }
         )
     return rows
@@ -162,8 +167,9 @@ def playing_seconds(domain: Domain, batch: int) -> float:
 
 def table(rows: Sequence[Row]) -> Table:
     """The rows for a terminal."""
-    columns = ("game", "preset", "games", "ms/decision", "planner", "of it encoder")
-    result = Table(*columns, "past encoded anew", "emulator", "decisions/s", "contexts encoded/s")
+    columns = ["game", "preset", "games", "ms/decision", "planner", "of it encoder"]
+    columns += ["past encoded anew", "emulator", "decisions/s"]
+    result = Table(*columns, "states encoded/s", "encoder GFLOP/s", "of the peak")
     for row in rows:
         whole = row["planning_seconds"] + row["playing_seconds"]
         result.add_row(
@@ -176,7 +182,7 @@ def table(rows: Sequence[Row]) -> Table:
             f"{1e3 * row['anew_seconds']:.1f}",
             f"{1e3 * row['playing_seconds']:.1f}",
             f"{row['batch'] / whole:.0f}",
-            f"{row['batch'] / row['encoding_seconds']:.0f}",
+            *encoding(row),
         )
     return result
 

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
 from experiments.common.config import configuration_hash, preset
-from experiments.tables.atari import played
+from experiments.tables.atari import ENCODED, encoding, played
 from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
 from leapjax.atari.emulator import Emulator
@@ -147,6 +148,23 @@ def test_encoders_see_what_they_should(architecture):
             np.testing.assert_array_equal(differs, expected)
         else:
             assert differs.all() if changed >= 3 else not differs.any()
+
+
+@pytest.mark.parametrize(("name", "past"), [("paper", 25), ("leapjax", 3)])
+def test_as_many_states_are_encoded_while_playing_as_the_tables_say(name, past):
+    encoder = domain.make("Breakout", domain.Settings()).encoders[name](MODEL, past)
+    alone, whole = (window(past, context=n, length=30).context for n in (0, past))
+    if name == "paper":  # which knows the tokens of the states before
+        whole = whole._replace(encoded=jnp.zeros((past, MODEL.width)))
+    params = jax.eval_shape(encoder.init, jax.random.key(0), alone)
+    one, many = (matmul_flops(encoder.apply, params, context) for context in (alone, whole))
+    assert many == ENCODED[name] * one > 0
+
+
+def test_the_table_of_decisions_says_what_is_encoded():
+    row = {"preset": "paper", "batch": 16, "encoding_flops": 3e9, "encoding_seconds": 0.025}
+    assert encoding({**row, "peak_gflops": 300.0}) == ["2,560", "120", "40%"]
+    assert encoding({**row, "preset": "leapjax"}) == ["640", "120", "-"]
 
 
 def test_without_a_past_the_whole_frame_has_changed():

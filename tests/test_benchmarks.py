@@ -136,6 +136,7 @@ def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkey
     # The convolutions alone: 20 * 20, 9 * 9 and 7 * 7 places, of 2, 4 and 4 features.
     products = 400 * 64 * 2 + 81 * 32 * 4 + 49 * 36 * 4
     assert row["encoding_flops"] > 2 * 2 * products
+    assert row["peak_gflops"] > 0
 
 
 def test_the_benchmark_of_games_refuses_to_write_what_it_does_not_measure(tmp_path, capsys):

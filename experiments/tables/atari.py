@@ -9,6 +9,7 @@ from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
+from leapjax.atari.encoders import STACK
 from leapjax.atari.games import GAMES
 
 COLUMNS = {
@@ -116,6 +117,19 @@ def energy(found: Mapping[str, Any]) -> str:
     return table("game | trajectories | rank correlation of energy and reward | p", lines)
 
 
+# States that are encoded for a decision while playing. Of 26, preset `paper` reads the new one and
+# those that see black frames before the context now; the tokens of the others it knows.
+ENCODED = {"leapjax": 1, "paper": STACK}
+
+
+def encoding(row: Row) -> list[str]:
+    """What is encoded while playing: states a second, GFLOP/s, their fraction of the peak."""
+    states = row["batch"] * ENCODED[row["preset"]] / row["encoding_seconds"]
+    gflops = row["encoding_flops"] / row["encoding_seconds"] / 1e9
+    peak = row.get("peak_gflops")  # older rows have none
+    return [f"{states:,.0f}", f"{gflops:.0f}", "-" if peak is None else f"{gflops / peak:.0%}"]
+
+
 def decisions(rows: Sequence[Row]) -> str:
     """What decisions are made of in games that are played together, in milliseconds."""
     lines = []
@@ -124,6 +138,7 @@ def decisions(rows: Sequence[Row]) -> str:
         spent = [row[f"{part}_seconds"] for part in parts]
         rate = row["batch"] / (row["planning_seconds"] + row["playing_seconds"])
         cells = [f"{1e3 * seconds:.1f}" for seconds in spent]
-        lines.append([f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}"])
+        cells = [f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}", *encoding(row)]
+        lines.append(cells)
     header = "preset | games | planner | of it encoder | past encoded anew | emulator | decisions/s"
-    return table(header, lines)
+    return table(f"{header} | states encoded/s | encoder GFLOP/s | of the peak", lines)
