@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from minigrid.core.world_object import WorldObj
 
 from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way, alone
+from experiments.common.analysis import NOISE, Analysis, Case, Model, Way, alone, drawn_at
 from leapjax.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.babyai.constraints import (
     goal_before_visit,
@@ -156,13 +156,10 @@ def beams(trained: GibbsConfig) -> BeamConfig:
     return BeamConfig(horizon=trained.horizon, beams=16)
 
 
-def noisily(trained: GibbsConfig, temperature: float = 2.0) -> GibbsConfig:
-    """Where models disagree the likeliest plan leads nowhere: noise leads out of it."""
-    return dataclasses.replace(trained, temperature=temperature)
-
-
+# Where models disagree the likeliest plan leads nowhere: noise leads out of it.
+noisily = drawn_at(2.0)
 # Of what is left where the likeliest action is removed, the likeliest leads to and fro.
-wandering = functools.partial(noisily, temperature=5.0)
+wandering = drawn_at(5.0)
 
 
 def refined(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
@@ -291,6 +288,8 @@ def _plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> lis
         Way("leap, three actions of each plan", minimise=minimise, executed=3, paper=leap),
         Way("dt", "dt", minimise, paper=dt),
         Way("iql", "iql", minimise, paper=iql),
+        Way("dt, with noise", "dt", minimise, NOISE),
+        Way("iql, with noise", "iql", minimise, NOISE),
         *_explorers("leap", minimise),
     ]
 
@@ -343,6 +342,11 @@ CASES = (
             *_composed(halves, (83.5, 58.0, 42.5)),
             Way("one half alone", minimise=one_half, search=noisily),
             *_explorers("sum", halves),
+            Way(
+                "sum, exploring, replanned after each action, not gone over",
+                minimise=exploring(halves), search=left_to_right, executed=1,
+                remembers=True, explores=True,
+            ),
         ],
     ),
     Case(

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way
+from experiments.common.analysis import NOISE, Analysis, Case, Model, Way
 
 
 def _case(level: str, leap: float, dt: float) -> Case:
@@ -19,6 +19,7 @@ def _case(level: str, leap: float, dt: float) -> Case:
             Way("whole plans", paper=leap),
             Way("replanned after each action", executed=1, paper=leap),
             Way("dt", "dt", paper=dt),
+            Way("dt, with noise", "dt", search=NOISE),
         ],
     )
 

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way
+from experiments.common.analysis import NOISE, Analysis, Case, Model, Way
 from leapjax.planners import GibbsConfig
 
 # The paper's success of LEAP and DT, from optimal demonstrations and from others.
@@ -31,6 +31,7 @@ def _case(level: str, suffix: str, leap: float, dt: float) -> Case:
         whole = whole._replace(search=calmly)
     three = whole._replace(name="three actions of each plan", executed=3)
     ways = [whole, three, Way("dt", "dt", paper=dt)]
+    ways.append(Way("dt, with noise", "dt", search=NOISE))
     return Case(f"{level}{suffix}", [Model(f"{level}{suffix}")], level, ways)
 
 

@@ -67,6 +67,15 @@ class Way(NamedTuple):
     explores: bool = False  # coming back costs: beyond what the paper asks for
 
 
+def drawn_at(temperature: float) -> Callable[[Any], PlannerConfig]:
+    """The search of a way: as trained, but for the temperature that actions are drawn at."""
+    return lambda trained: dataclasses.replace(trained, temperature=temperature)
+
+
+# Who takes the likeliest of single actions walks to and fro, and noise leads out of it.
+NOISE = drawn_at(4.0)
+
+
 class Case(NamedTuple):
     """Models, and the level that they are asked to plan on."""
 
