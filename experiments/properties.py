@@ -288,6 +288,7 @@ def _plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> lis
         Way("leap, three actions of each plan", minimise=minimise, executed=3, paper=leap),
         Way("dt", "dt", minimise, paper=dt),
         Way("iql", "iql", minimise, paper=iql),
+        Way("leap, with noise", minimise=minimise, search=drawn_at(4.0), executed=1),
         Way("dt, with noise", "dt", minimise, drawn_at(8.0)),
         Way("iql, with noise", "iql", minimise, drawn_at(12.0)),
         *_explorers("leap", minimise),
