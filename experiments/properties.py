@@ -315,6 +315,9 @@ def _composed(
         Way("sum", minimise=minimise, search=noisily, paper=leap),
         Way("dt", "dt", minimise, noisily, paper=dt),
         Way("iql", "iql", minimise, noisily, paper=iql),
+        Way("sum, with more noise", minimise=minimise, search=drawn_at(4.0), executed=1),
+        Way("dt, with more noise", "dt", minimise, drawn_at(8.0)),
+        Way("iql, with more noise", "iql", minimise, drawn_at(8.0)),
     ]
 
 
