@@ -95,7 +95,7 @@ def run(options: Options) -> None:
     playing = [
         row for config in configs for row in measure(config, options.batches, options.seconds)
     ]
-    console.print(table(playing))
+    console.print(*tables(playing), sep="\n")
     write_rows(options.json, playing)
     if options.training:
         trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
@@ -165,26 +165,22 @@ def playing_seconds(domain: Domain, batch: int) -> float:
     return (time.perf_counter() - begun) / DECISIONS
 
 
-def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
-    columns = ["game", "preset", "games", "ms/decision", "planner", "of it encoder"]
-    columns += ["past encoded anew", "emulator", "decisions/s"]
-    result = Table(*columns, "states encoded/s", "encoder GFLOP/s", "of the peak")
+def tables(rows: Sequence[Row]) -> tuple[Table, Table]:
+    """The rows for a terminal: what decisions take, in milliseconds, and what is encoded."""
+    taken = Table(
+        "game", "preset", "games", "ms", "planner", "of it encoder", "past anew", "emulator",
+        "decisions/s",
+    )  # fmt: skip
+    encoded = Table("game", "preset", "games", "states/s", "encoder GFLOP/s", "of the peak")
     for row in rows:
         whole = row["planning_seconds"] + row["playing_seconds"]
-        result.add_row(
-            row["level"],
-            row["preset"],
-            str(row["batch"]),
-            f"{1e3 * whole:.1f}",
-            f"{1e3 * row['planning_seconds']:.1f}",
-            f"{1e3 * row['encoding_seconds']:.1f}",
-            f"{1e3 * row['anew_seconds']:.1f}",
-            f"{1e3 * row['playing_seconds']:.1f}",
-            f"{row['batch'] / whole:.0f}",
-            *encoding(row),
-        )
-    return result
+        name = row["level"], row["preset"], str(row["batch"])
+        parts = ("planning", "encoding", "anew", "playing")
+        spent = [whole, *(row[f"{part}_seconds"] for part in parts)]
+        milliseconds = (f"{1e3 * seconds:.1f}" for seconds in spent)
+        taken.add_row(*name, *milliseconds, f"{row['batch'] / whole:.0f}")
+        encoded.add_row(*name, *encoding(row))
+    return taken, encoded
 
 
 if __name__ == "__main__":
