@@ -167,19 +167,15 @@ def playing_seconds(domain: Domain, batch: int) -> float:
 
 def tables(rows: Sequence[Row]) -> tuple[Table, Table]:
     """The rows for a terminal: what decisions take, in milliseconds, and what is encoded."""
-    taken = Table(
-        "game", "preset", "games", "ms", "planner", "of it encoder", "past anew", "emulator",
-        "decisions/s",
-    )  # fmt: skip
-    encoded = Table("game", "preset", "games", "states/s", "encoder GFLOP/s", "of the peak")
+    taken = Table("game", "preset", "games", "ms", "planner", "of it encoder", "emulator", "per s")
+    encoded = Table("game", "preset", "games", "past anew", "states/s", "GFLOP/s", "of the peak")
     for row in rows:
         whole = row["planning_seconds"] + row["playing_seconds"]
         name = row["level"], row["preset"], str(row["batch"])
-        parts = ("planning", "encoding", "anew", "playing")
-        spent = [whole, *(row[f"{part}_seconds"] for part in parts)]
+        spent = (whole, *(row[f"{part}_seconds"] for part in ("planning", "encoding", "playing")))
         milliseconds = (f"{1e3 * seconds:.1f}" for seconds in spent)
         taken.add_row(*name, *milliseconds, f"{row['batch'] / whole:.0f}")
-        encoded.add_row(*name, *encoding(row))
+        encoded.add_row(*name, f"{1e3 * row['anew_seconds']:.1f}", *encoding(row))
     return taken, encoded
 
 
