@@ -162,7 +162,7 @@ def test_ways_and_methods_can_be_chosen():
         ("adaptation-hard", ["whole plan"]), ("composition-easy", ["sum"]),
     ]  # fmt: skip
     assert chosen(only=both, methods=("dt",)) == [
-        (name, ["dt", "dt, exploring"]) for name in reversed(both)
+        (name, ["dt", "dt, with more noise", "dt, exploring"]) for name in reversed(both)
     ]
 
 

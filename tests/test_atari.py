@@ -576,7 +576,7 @@ def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys,
     "options",
     [
         "--method dt",
-        "--method cql",
+        pytest.param("--method cql", marks=only_long),
         pytest.param("--method bc", marks=only_long),
         pytest.param("--method qr_dqn", marks=only_long),
         pytest.param("--method rem", marks=only_long),
