@@ -113,6 +113,7 @@ def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place,
     assert "training" not in capsys.readouterr().out
 
 
+@only_long
 def test_a_damaged_end_of_training_is_learned_again(place, capsys):
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
     assert analysis.main(of, SHORT) == 0

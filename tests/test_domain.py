@@ -12,7 +12,7 @@ from leapjax.data import storage
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from tests import frozen_lake
-from tests.programs import LONG
+from tests.programs import LONG, only_long
 
 LAKE = Experiment("lake", "frozen_lake")
 EVERY = (
@@ -83,6 +83,7 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quic
         assert message in capsys.readouterr().err
 
 
+@only_long
 def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace, quick_begin):
     arguments = [*EVERY, *"--demos 2 --episodes 2 --steps 4 --method classifier".split()]
     leaps = [*EVERY, *"--demos 2 --episodes 2 --steps 0".split()]

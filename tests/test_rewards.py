@@ -72,8 +72,8 @@ def test_cloning_does_what_was_done_most_often():
 @pytest.mark.parametrize(
     ("name", "architecture", "past"),
     [
-        ("bcq", "leapjax", 0),
-        ("iql", "leapjax", 0),
+        pytest.param("bcq", "leapjax", 0, marks=only_long),
+        pytest.param("iql", "leapjax", 0, marks=only_long),
         ("mopo", "leapjax", 0),
         pytest.param("bcq", "paper", 2, marks=only_long),
     ],
@@ -172,7 +172,7 @@ def test_the_target_network_follows_slowly():
 @pytest.mark.parametrize(
     ("module", "settings"),
     [
-        (dt, dt.Settings),
+        pytest.param(dt, dt.Settings, marks=only_long),
         (leap, functools.partial(leap.Settings, masking="random", end=False, returns=True)),
     ],
     ids=["dt", "leap"],
