@@ -160,11 +160,10 @@ def beginnings(this: Run, count: int) -> Window:
             f"{horizon}: give more"
         )
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
-    indices = jnp.cumsum(jnp.array([0, *(len(d.actions) for d in data[:-1])]))
     end = domain.num_actions - 1
     return jax.vmap(
         lambda index: windows.window(steps, index, specification.context, horizon, end)
-    )(indices)
+    )(steps.starts)
 
 
 def corrupted(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax.Array:

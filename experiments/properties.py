@@ -221,6 +221,12 @@ def _explorers(
     return [way._replace(remembers=True, explores=True) for way in ways]
 
 
+def _noisier(minimise: Minimise, temperature: float) -> list[Way]:
+    """Methods of one action, drawn as preset `paper` asks for."""
+    search = drawn_at(temperature)
+    return [Way(f"{name}, with more noise", name, minimise, search) for name in ("dt", "iql")]
+
+
 def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
     leap, dt, iql = paper
     at_once = masked(immediate_lava)
@@ -233,8 +239,7 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
             Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
             Way("dt", "dt", at_once, wandering, paper=dt),
             Way("iql", "iql", at_once, wandering, paper=iql),
-            Way("dt, with more noise", "dt", at_once, drawn_at(12.0)),
-            Way("iql, with more noise", "iql", at_once, drawn_at(12.0)),
+            *_noisier(at_once, 12.0),
             *_explorers("whole plan", masked(lava), at_once, left_to_right),
         ],
         Watched,
@@ -251,8 +256,7 @@ def _constraints(name: str, model: Model, level: str) -> Case:
             Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
-            Way("dt, with more noise", "dt", both, drawn_at(12.0)),
-            Way("iql, with more noise", "iql", both, drawn_at(12.0)),
+            *_noisier(both, 12.0),
             *_explorers("whole plan", never, both, left_to_right),
             Way(
                 "whole plan, exploring, beam search", minimise=exploring(never), search=beams,
@@ -320,8 +324,7 @@ def _composed(
         Way("dt", "dt", minimise, noisily, paper=dt),
         Way("iql", "iql", minimise, noisily, paper=iql),
         Way("sum, with more noise", minimise=minimise, search=drawn_at(4.0), executed=1),
-        Way("dt, with more noise", "dt", minimise, drawn_at(8.0)),
-        Way("iql, with more noise", "iql", minimise, drawn_at(8.0)),
+        *_noisier(minimise, 8.0),
     ]
 
 

@@ -93,6 +93,7 @@ def documents(root: Path) -> dict[Path, str]:
         **{
             name: (functools.partial(analyses.analysed, each), name)
             for name, each in ANALYSES.items()
+            if name != "properties"
         },
     }
     written = {}
