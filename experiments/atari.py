@@ -20,6 +20,7 @@ from experiments.common import experiment, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
+from experiments.tables.atari import data_name
 from leapjax.atari.domain import FOLDER, LONGEST, Settings, make, preset
 from leapjax.atari.games import find_game
 
@@ -79,7 +80,7 @@ def run(options: Collect) -> None:
     games = [game for manifest in made for game in manifest["games"]]
     console.print(scores_table(games))
     if options.record:
-        results.add(RECORDED, options.game, games)
+        results.add(RECORDED, data_name(options.game, transitions), games)
 
 
 def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:

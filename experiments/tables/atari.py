@@ -9,8 +9,9 @@ from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
+from leapjax.atari.domain import LONGEST, preset
 from leapjax.atari.encoders import STACK
-from leapjax.atari.games import GAMES
+from leapjax.atari.games import GAMES, Game
 
 COLUMNS = {
     "LEAP": Setting("LEAP", "leapjax"),
@@ -22,11 +23,26 @@ COLUMNS = {
     "REM": Setting("REM", "leapjax", "rem"),
     "random": Setting("random", "leapjax", "random"),
 }
+# The same at the paper's scale, where it has been run: as docs/results.md says.
+SCALE = {"max_steps": LONGEST}
+IN_RUNS = {**SCALE, "run": 16}
+AT_SCALE = {
+    "LEAP": Setting("LEAP", "paper", options=IN_RUNS),
+    "LEAP without return": Setting("LEAP", "paper", options={**IN_RUNS, "returns": False}),
+    "BC": Setting("BC", "paper", "bc", SCALE),
+    "DT": Setting("DT", "paper", "dt", SCALE),
+}
 
 
 def uses(row: Row) -> bool:
     """Whether a row is in a table."""
-    return any(setting.has(row) for setting in COLUMNS.values())
+    return any(setting.has(row) for setting in (*COLUMNS.values(), *AT_SCALE.values()))
+
+
+def data_name(game: str, transitions: int) -> str:
+    """What the data of a game are recorded as: by its name, where they are of the usual size."""
+    usual = preset(game, "leapjax")["transitions"]
+    return game if transitions == usual else f"{game}, {transitions:,} transitions"
 
 
 def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
@@ -38,28 +54,42 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     lines = []
     for name, game in GAMES.items():
         ours = [row for row in rows if row["level"] == name]
-        of = {title: of_setting(ours, setting) for title, setting in COLUMNS.items()}
         theirs = {"LEAP without return": game.paper_without_return} | {
             title: game.paper[setting.method]
             for title, setting in COLUMNS.items()
             if setting.method in game.paper and not setting.options
         }
-        scale = game.human - game.random
-        cells = {title: _mean_score(found) for title, found in of.items() if found}
-        normal = {
-            title: _with_error(game.normalised(mean), error and 100 * error / scale)
-            for title, (mean, error) in cells.items()
-        }
-        raw = {title: _with_error(*each) for title, each in cells.items()}
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
-        if cells and name in data:
-            reached = float(np.mean([each["score"] for each in data[name]]))
-            normal |= {"the data": f"{game.normalised(reached):.1f}"}
-            raw |= {"the data": f"{reached:.1f}"}
-        for what, by_title in {"paper": papers, "ours": normal, "our score": raw}.items():
+        normal, raw = _scores(ours, game, COLUMNS, data.get(name, ()))
+        large = data.get(data_name(name, preset(name, "paper")["transitions"]), ())
+        found = {"paper": papers, "ours": normal, "our score": raw}
+        found["preset `paper`"], found["its score"] = _scores(ours, game, AT_SCALE, large)
+        for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
     return table("game | | " + " | ".join(columns), lines)
+
+
+def _scores(
+    rows: Sequence[Row],
+    game: Game,
+    settings: Mapping[str, Setting],
+    games: Sequence[Mapping[str, Any]],
+) -> tuple[dict[str, str], dict[str, str]]:
+    """By column: normalised scores, and as they are, of settings and of the games learned from."""
+    of = {title: of_setting(rows, setting) for title, setting in settings.items()}
+    cells = {title: _mean_score(found) for title, found in of.items() if found}
+    scale = game.human - game.random
+    normal = {
+        title: _with_error(game.normalised(mean), error and 100 * error / scale)
+        for title, (mean, error) in cells.items()
+    }
+    raw = {title: _with_error(*each) for title, each in cells.items()}
+    if cells and games:
+        reached = float(np.mean([each["score"] for each in games]))
+        normal |= {"the data": f"{game.normalised(reached):.1f}"}
+        raw |= {"the data": f"{reached:.1f}"}
+    return normal, raw
 
 
 def _mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
@@ -85,8 +115,7 @@ def _with_error(mean: float, error: float | None) -> str:
 def data(found: Mapping[str, Any]) -> str:
     """What the demonstrators reached, whose games are learned from."""
     lines = []
-    for name in GAMES:
-        games = found.get(name, [])
+    for name, games in sorted(found.items(), key=lambda each: _place(each[0])):
         if not games:
             continue
         reached = np.array([game["score"] for game in games])
@@ -105,6 +134,11 @@ def data(found: Mapping[str, Any]) -> str:
             ]
         )
     return table("game | games | transitions | mean score | range | by random actions", lines)
+
+
+def _place(name: str) -> tuple[int, int]:
+    """Where data of a name stand: with their game, as `data_name` calls them."""
+    return [*GAMES].index(name.partition(",")[0]), len(name)
 
 
 def energy(found: Mapping[str, Any]) -> str:
