@@ -22,7 +22,7 @@ test-long: $(READY)
 		tests/test_analyses.py tests/test_atari.py tests/test_babyai.py tests/test_benchmarks.py \
 		tests/test_by_hand.py tests/test_domain.py tests/test_models.py tests/test_once.py \
 		tests/test_published.py tests/test_replay.py tests/test_rewards.py tests/test_runs.py \
-		tests/test_training.py $(ARGS)
+		tests/test_sudoku.py tests/test_training.py $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -278,7 +278,10 @@ def test_plans_stand_beside_single_actions():
     ]  # fmt: skip
 
 
-def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
+@pytest.fixture
+def toy_landscape(place, monkeypatch):
+    """Learns the landscape of a toy; what was measured, and the arguments."""
+
     def toy(domain, level, method, name):
         config = analysis.configs.with_options(preset(domain, level, method, name), TOY)
         return analysis.configs.with_options(config, {"steps": 40})
@@ -288,26 +291,36 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     arguments = ["--presets", "leapjax", "--trajectories", "8"]
     assert landscape.main(arguments) == 0
     (found,) = json.loads((place / "runs" / "landscape.json").read_text())
+    return found, arguments
+
+
+def test_the_landscape_is_watched_while_it_forms(toy_landscape, place):
+    found, arguments = toy_landscape
     assert [entry["step"] for entry in found["training"]] == [20, 40]
     last = found["training"][-1]
     assert last["random_0"] > 0 and last["random_100"] > 0
     energies = found["planning"]
     assert len(energies["mean"]) == 10 and 0 < len(energies["single"]) <= 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
-    for curve in (place / "runs").rglob("metrics.csv"):
-        curve.unlink()  # trained before, and its curve is gone
-    monkeypatch.setattr(landscape, "refinement", lambda *arguments: found["planning"])
-    assert landscape.main(arguments) == 0
-    (again,) = json.loads((place / "runs" / "landscape.json").read_text())
-    assert again["training"][-1]["random_0"] == pytest.approx(found["training"][-1]["random_0"])
     assert landscape.main([*arguments, "--trajectories", "0"]) == 2
     assert landscape.main([*arguments, "--steps", "0"]) == 2
     assert landscape.main(["--presets"]) == 2
     assert landscape.main([*arguments, "--record", "--steps", "3"]) == 2
     path = place / "runs" / "landscape.json"
-    assert json.loads(path.read_text()) == [again]  # still there
-    landscape.keep(path, [{**again, "preset": "paper"}, again])
+    assert json.loads(path.read_text()) == [found]  # still there
+    landscape.keep(path, [{**found, "preset": "paper"}, found])
     assert [each["preset"] for each in json.loads(path.read_text())] == ["leapjax", "paper"]
+
+
+@only_long
+def test_a_landscape_whose_curve_is_gone_is_learned_again(toy_landscape, place, monkeypatch):
+    found, arguments = toy_landscape
+    for curve in (place / "runs").rglob("metrics.csv"):
+        curve.unlink()
+    monkeypatch.setattr(landscape, "refinement", lambda *arguments: found["planning"])
+    assert landscape.main(arguments) == 0
+    (again,) = json.loads((place / "runs" / "landscape.json").read_text())
+    assert again["training"][-1]["random_0"] == pytest.approx(found["training"][-1]["random_0"])
 
 
 def test_a_share_of_actions_is_replaced_by_any_but_the_end():

@@ -18,8 +18,8 @@ import pytest
 
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
-from experiments.common.config import configuration_hash, preset
-from experiments.tables.atari import ENCODED, encoding, played
+from experiments.common.config import configuration_hash, preset, with_options
+from experiments.tables.atari import ENCODED, data, data_name, encoding, played
 from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
 from leapjax.atari.emulator import Emulator
@@ -643,6 +643,32 @@ def test_the_table_has_normalised_scores():
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
     table = played([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
+
+
+def test_the_table_has_the_papers_scale_beside_ours():
+    config = preset("atari", "Breakout", "leap", "paper")
+    large = with_options(config, {"run": 16, "max_steps": 5_000, "returns": False})
+    row = {
+        "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
+        "method": "leap", "preset": "paper", "hash": configuration_hash(large, 0),
+        "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
+        "configuration": {"planner": {"temperature": 1.0}},
+    }  # fmt: skip
+    games = {"Breakout": [{"score": 1.7}], "Breakout, 500,000 transitions": [{"score": 16.1}]}
+    table = played([row], games)
+    none = "- | - | - | - | - | -"
+    assert f"| Breakout | preset `paper` | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
+    assert f"| Breakout | its score | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
+    assert "| Breakout | ours |" not in table  # nothing was learned from these few
+    assert [data_name("Seaquest", 200_000), data_name("Breakout", 500_000)] == [
+        "Seaquest", "Breakout, 500,000 transitions",
+    ]  # fmt: skip
+    games = {
+        name: [{"score": 1.0, "noise": 0.1, "transitions": 7}]
+        for name in ("Pong", "Breakout, 500,000 transitions", "Breakout")
+    }
+    names = [line.split(" | ")[0] for line in data(games).splitlines()[2:]]
+    assert names == ["| Breakout", "| Breakout, 500,000 transitions", "| Pong"]
 
 
 def test_a_step_that_was_begun_is_waited_for():

@@ -22,6 +22,7 @@ from leapjax.sudoku.domain import BoardTokens, Settings, make
 from leapjax.sudoku.rules import rules
 from leapjax.types import pad_token
 from tests.parameters import random_like
+from tests.programs import only_long
 
 SMALL, LARGE = Size(4, 6), Size(9, 36)
 SIZES = pytest.mark.parametrize("size", [SMALL, LARGE], ids=str)
@@ -297,12 +298,6 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
     assert sudoku.main([*toy, "--method", "rules"]) == 0
-    # Planned anew after every few digits, and only as far: the rules go on where the board is.
-    again = ["--executed", "4", "--runs", "again"]
-    for less in ([], ["--horizon", "5", "--iterations", "5"]):
-        assert sudoku.main([*toy, "--method", "rules", *again, *less]) == 0
-    whole, short = results.read(tmp_path / "again" / "sudoku.jsonl")[::2]
-    assert whole["successes"] >= 6 and short["successes"] >= 3
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
     found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
     assert found == [
@@ -313,6 +308,20 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     # Eight clues leave little open. What two steps have learned is next to nothing.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]
     assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
+
+
+@only_long
+def test_rules_go_on_where_the_board_is(tmp_path, monkeypatch):
+    """Planned anew after every few digits, and only as far."""
+    monkeypatch.chdir(tmp_path)
+    few = [search for search in searches.SEARCHES if search.name == "all at once"]
+    monkeypatch.setattr(searches, "SEARCHES", few)
+    monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
+    toy = "--level Sudoku4x8 --episodes 8 --no-pictures --method rules --executed 4".split()
+    for less in ([], ["--horizon", "5", "--iterations", "5"]):
+        assert sudoku.main([*toy, *less]) == 0
+    whole, short = results.read(tmp_path / "runs" / "sudoku.jsonl")[::2]
+    assert whole["successes"] >= 6 and short["successes"] >= 3
 
 
 @pytest.mark.parametrize(
