@@ -48,13 +48,18 @@ class Meter:
         now = time.monotonic()
         rate = (done - self._first) / max(now - self._begun, 1e-9)
         if self._bar:
-            self._bar.update(self._task, completed=done, note=f"{rate:.1f}/s {note}")
+            self._bar.update(self._task, completed=done, note=f"{speed(rate)} {note}")
             return
         if now - self._shown < LOG_INTERVAL and done != self._total:
             return
         self._shown = now
         left = f"{(self._total - done) / rate:.0f}s" if rate else "unknown"
         self._console.print(
-            f"{self._title} {done}/{self._total}  {rate:.1f}/s  ETA {left}  {note}",
+            f"{self._title} {done}/{self._total}  {speed(rate)}  ETA {left}  {note}",
             highlight=False,
         )
+
+
+def speed(rate: float) -> str:
+    """How many a second; how long each takes, where that says more."""
+    return f"{rate:.1f}/s" if rate >= 0.1 or rate == 0 else f"{1 / rate:.0f}s each"

@@ -32,11 +32,14 @@ AT_SCALE = {
     "BC": Setting("BC", "paper", "bc", SCALE),
     "DT": Setting("DT", "paper", "dt", SCALE),
 }
+COLD = 0.1  # the temperature of preset `leapjax`, where the paper's is 1
 
 
 def uses(row: Row) -> bool:
     """Whether a row is in a table."""
-    return any(setting.has(row) for setting in (*COLUMNS.values(), *AT_SCALE.values()))
+    settings = (*COLUMNS.values(), *AT_SCALE.values())
+    cold = (setting.has(row, temperature=COLD) for setting in AT_SCALE.values())
+    return any(setting.has(row) for setting in settings) or any(cold)
 
 
 def data_name(game: str, transitions: int) -> str:
@@ -60,10 +63,12 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
             if setting.method in game.paper and not setting.options
         }
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
-        normal, raw = _scores(ours, game, COLUMNS, data.get(name, ()))
         large = data.get(data_name(name, preset(name, "paper")["transitions"]), ())
-        found = {"paper": papers, "ours": normal, "our score": raw}
+        found = {"paper": papers}
+        found["ours"], found["our score"] = _scores(ours, game, COLUMNS, data.get(name, ()))
         found["preset `paper`"], found["its score"] = _scores(ours, game, AT_SCALE, large)
+        cold = _scores(ours, game, AT_SCALE, large, temperature=COLD)
+        found[f"at temperature {COLD}"], found["that score"] = cold
         for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
@@ -75,9 +80,10 @@ def _scores(
     game: Game,
     settings: Mapping[str, Setting],
     games: Sequence[Mapping[str, Any]],
+    **options: Any,
 ) -> tuple[dict[str, str], dict[str, str]]:
     """By column: normalised scores, and as they are, of settings and of the games learned from."""
-    of = {title: of_setting(rows, setting) for title, setting in settings.items()}
+    of = {title: of_setting(rows, setting, **options) for title, setting in settings.items()}
     cells = {title: _mean_score(found) for title, found in of.items() if found}
     scale = game.human - game.random
     normal = {
