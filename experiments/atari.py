@@ -20,9 +20,9 @@ from experiments.common import experiment, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
-from experiments.tables.atari import data_name
-from leapjax.atari.domain import FOLDER, LONGEST, Settings, make, preset
+from leapjax.atari.domain import FOLDER, LONGEST, Settings, data_name, make, preset
 from leapjax.atari.games import find_game
+from leapjax.errors import UserError
 
 RECORDED = Path("results/atari-data.json")
 EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
@@ -46,7 +46,8 @@ class Collect:
     workers: int | None = None
     """Processes; None: one on each core."""
     record: bool = False
-    """Write what demonstrators have reached to results/, which is committed."""
+    """Write what demonstrators have reached to results/, which is committed, beside data of
+    another size."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,6 +68,10 @@ def run(options: Collect) -> None:
     for name in ("transitions", "replay_run", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
+    if options.record and (options.replay_run, options.longest) != (1, LONGEST):
+        raise UserError(
+            f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
+        )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 

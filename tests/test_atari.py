@@ -19,7 +19,7 @@ import pytest
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
 from experiments.common.config import configuration_hash, preset, with_options
-from experiments.tables.atari import ENCODED, data, data_name, encoding, played
+from experiments.tables.atari import ENCODED, data, encoding, played, uses
 from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
 from leapjax.atari.emulator import Emulator
@@ -629,15 +629,15 @@ def test_the_table_has_normalised_scores():
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
-    assert f"| Breakout | our score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
+    assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
     # Seeds that happen to agree say no more than their games do.
     second = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second})
-    assert "| Breakout | our score | - | - | 30.5 ± 2.0 |" in played(rows, {})
+    assert "| Breakout | score | - | - | 30.5 ± 2.0 |" in played(rows, {})
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
-    assert "| Breakout | our score | - | - | 35.5 ± 5.0 |" in played(rows[:2] + rows[3:], {})
+    assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows[:2] + rows[3:], {})
     # Who always takes the best action plays four games, however often.
     name = configuration_hash(preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
@@ -646,29 +646,45 @@ def test_the_table_has_normalised_scores():
 
 
 def test_the_table_has_the_papers_scale_beside_ours():
-    config = preset("atari", "Breakout", "leap", "paper")
-    large = with_options(config, {"run": 16, "max_steps": 5_000, "returns": False})
-    row = {
-        "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0, "episodes": 10,
-        "method": "leap", "preset": "paper", "hash": configuration_hash(large, 0),
-        "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
-        "configuration": {"planner": {"temperature": 1.0}},
-    }  # fmt: skip
+    def row_of(mean, **options):
+        again = {"checkpoint": Path()} if "temperature" in options else {}
+        config = with_options(preset("atari", "Breakout", "leap", "paper"), options)
+        return {
+            "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0,
+            "method": "leap", "preset": "paper", "mean_return": mean, "return_error": 2.88,
+            "hash": configuration_hash(dataclasses.replace(config, **again), 0),
+            "train_steps": 10, "configuration": {"planner": {"temperature": 1.0}},
+        }  # fmt: skip
+
+    large = {"run": 16, "max_steps": 5_000, "returns": False}
+    rows = [row_of(30.5, **large), row_of(16.1, **large, temperature=0.1), row_of(9.0, run=16)]
+    assert [uses(row) for row in rows] == [True, True, False]  # the last may play for longer
     games = {"Breakout": [{"score": 1.7}], "Breakout, 500,000 transitions": [{"score": 16.1}]}
-    table = played([row], games)
+    table = played(rows, games)
     none = "- | - | - | - | - | -"
-    assert f"| Breakout | preset `paper` | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
+    assert f"| Breakout | ours, preset `paper` | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | its score | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
+    assert f"| Breakout | the same, temperature 0.1 | - | 50.0 ± 10.0 | {none} | 50.0 |" in table
+    assert f"| Breakout | that score | - | 16.1 ± 2.9 | {none} | 16.1 |" in table
     assert "| Breakout | ours |" not in table  # nothing was learned from these few
-    assert [data_name("Seaquest", 200_000), data_name("Breakout", 500_000)] == [
-        "Seaquest", "Breakout, 500,000 transitions",
-    ]  # fmt: skip
-    games = {
-        name: [{"score": 1.0, "noise": 0.1, "transitions": 7}]
-        for name in ("Pong", "Breakout, 500,000 transitions", "Breakout")
-    }
-    names = [line.split(" | ")[0] for line in data(games).splitlines()[2:]]
-    assert names == ["| Breakout", "| Breakout, 500,000 transitions", "| Pong"]
+
+
+def test_data_of_another_size_are_recorded_beside_the_usual(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(atari, "RECORDED", tmp_path / "data.json")
+    game = {"score": 3.0, "noise": 0.1, "transitions": 7}
+    monkeypatch.setattr(collect, "collect", lambda *arguments: [{"games": [game]}])
+    record = ["collect", "--game", "Breakout", "--record"]
+    for size in ("500000", "50000"):
+        assert atari.main([*record, "--transitions", size]) == 0
+    assert atari.main(["collect", "--game", "Pong", "--record"]) == 0
+    for other in ("--replay-run", "--longest"):
+        assert atari.main([*record, other, "2"]) == 2
+    assert "--record is for data that are learned from" in capsys.readouterr().err
+    recorded = json.loads((tmp_path / "data.json").read_text())
+    names = ("Breakout", "Breakout, 500,000 transitions", "Pong")
+    assert recorded == {name: [game] for name in names}
+    lines = data(recorded).splitlines()[2:]
+    assert lines == [f"| {name} | 1 | 7 | 3.0 | 3 .. 3 | 3.0 (10%) |" for name in names]
 
 
 def test_a_step_that_was_begun_is_waited_for():

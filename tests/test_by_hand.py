@@ -121,6 +121,7 @@ def many(module):
     return lambda params, contexts: call(params, "__call__", contexts)
 
 
+@only_long  # its values are those of value iteration: test_rewards.py
 def test_bcq():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = around(case.batch)
@@ -172,8 +173,7 @@ def test_iql():
     assert_is(case, loss)
 
 
-@only_long
-@pytest.mark.parametrize("share", [1.0, 0.5])
+@pytest.mark.parametrize("share", [pytest.param(1.0, marks=only_long), 0.5])
 def test_mopo(share):
     """Of the data alone; and of what is imagined, two steps far, too."""
     settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)

@@ -135,5 +135,5 @@ def test_a_log_says_how_long_it_will_take_once_that_is_known(monkeypatch):
 
 
 def test_what_is_slow_says_how_long_each_takes():
-    said = [progress.speed(rate) for rate in (0.0, 1234.56, 0.1, 0.02)]
-    assert said == ["0.0/s", "1234.6/s", "0.1/s", "50s each"]
+    said = [progress.speed(rate) for rate in (0.0, 1234.56, 1.0, 0.4, 0.02)]
+    assert said == ["0.0/s", "1234.6/s", "1.0/s", "2.5s each", "50.0s each"]

@@ -61,5 +61,5 @@ class Meter:
 
 
 def speed(rate: float) -> str:
-    """How many a second; how long each takes, where that says more."""
-    return f"{rate:.1f}/s" if rate >= 0.1 or rate == 0 else f"{1 / rate:.0f}s each"
+    """How many a second; of less than one, how long each takes."""
+    return f"{rate:.1f}/s" if rate >= 1 or rate == 0 else f"{1 / rate:.1f}s each"

@@ -1,5 +1,6 @@
 """The Atari tables: scores, the data, energies against rewards, the price of a decision."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,7 +10,7 @@ from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
-from leapjax.atari.domain import LONGEST, preset
+from leapjax.atari.domain import LONGEST, data_name, game_of, preset
 from leapjax.atari.encoders import STACK
 from leapjax.atari.games import GAMES, Game
 
@@ -23,29 +24,22 @@ COLUMNS = {
     "REM": Setting("REM", "leapjax", "rem"),
     "random": Setting("random", "leapjax", "random"),
 }
-# The same at the paper's scale, where it has been run: as docs/results.md says.
-SCALE = {"max_steps": LONGEST}
-IN_RUNS = {**SCALE, "run": 16}
-AT_SCALE = {
-    "LEAP": Setting("LEAP", "paper", options=IN_RUNS),
-    "LEAP without return": Setting("LEAP", "paper", options={**IN_RUNS, "returns": False}),
-    "BC": Setting("BC", "paper", "bc", SCALE),
-    "DT": Setting("DT", "paper", "dt", SCALE),
+# At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
+RUNS = {"run": 16, "max_steps": LONGEST}
+LARGE = {
+    "LEAP": Setting("LEAP", "paper", options=RUNS),
+    "LEAP without return": Setting("LEAP", "paper", options={**RUNS, "returns": False}),
 }
-COLD = 0.1  # the temperature of preset `leapjax`, where the paper's is 1
+COLD = {
+    title: dataclasses.replace(setting, options={**setting.options, "temperature": 0.1})
+    for title, setting in LARGE.items()
+}
 
 
 def uses(row: Row) -> bool:
     """Whether a row is in a table."""
-    settings = (*COLUMNS.values(), *AT_SCALE.values())
-    cold = (setting.has(row, temperature=COLD) for setting in AT_SCALE.values())
-    return any(setting.has(row) for setting in settings) or any(cold)
-
-
-def data_name(game: str, transitions: int) -> str:
-    """What the data of a game are recorded as: by its name, where they are of the usual size."""
-    usual = preset(game, "leapjax")["transitions"]
-    return game if transitions == usual else f"{game}, {transitions:,} transitions"
+    settings = (*COLUMNS.values(), *LARGE.values(), *COLD.values())
+    return any(setting.has(row) for setting in settings)
 
 
 def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
@@ -63,12 +57,14 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
             if setting.method in game.paper and not setting.options
         }
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
-        large = data.get(data_name(name, preset(name, "paper")["transitions"]), ())
+        few, many = (
+            data.get(data_name(name, preset(name, each)["transitions"]), ())
+            for each in ("leapjax", "paper")
+        )
         found = {"paper": papers}
-        found["ours"], found["our score"] = _scores(ours, game, COLUMNS, data.get(name, ()))
-        found["preset `paper`"], found["its score"] = _scores(ours, game, AT_SCALE, large)
-        cold = _scores(ours, game, AT_SCALE, large, temperature=COLD)
-        found[f"at temperature {COLD}"], found["that score"] = cold
+        found["ours"], found["score"] = _scores(ours, game, COLUMNS, few)
+        found["ours, preset `paper`"], found["its score"] = _scores(ours, game, LARGE, many)
+        found["the same, temperature 0.1"], found["that score"] = _scores(ours, game, COLD, many)
         for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
@@ -80,10 +76,9 @@ def _scores(
     game: Game,
     settings: Mapping[str, Setting],
     games: Sequence[Mapping[str, Any]],
-    **options: Any,
 ) -> tuple[dict[str, str], dict[str, str]]:
     """By column: normalised scores, and as they are, of settings and of the games learned from."""
-    of = {title: of_setting(rows, setting, **options) for title, setting in settings.items()}
+    of = {title: of_setting(rows, setting) for title, setting in settings.items()}
     cells = {title: _mean_score(found) for title, found in of.items() if found}
     scale = game.human - game.random
     normal = {
@@ -121,30 +116,26 @@ def _with_error(mean: float, error: float | None) -> str:
 def data(found: Mapping[str, Any]) -> str:
     """What the demonstrators reached, whose games are learned from."""
     lines = []
-    for name, games in sorted(found.items(), key=lambda each: _place(each[0])):
-        if not games:
-            continue
-        reached = np.array([game["score"] for game in games])
-        by_noise = {
-            noise: np.mean([game["score"] for game in games if game["noise"] == noise])
-            for noise in sorted({game["noise"] for game in games})
-        }
-        lines.append(
-            [
-                name,
-                str(len(games)),
-                str(sum(game["transitions"] for game in games)),
-                f"{reached.mean():.1f}",
-                f"{reached.min():g} .. {reached.max():g}",
-                ", ".join(f"{mean:.1f} ({noise:.0%})" for noise, mean in by_noise.items()),
-            ]
-        )
+    for game in GAMES:
+        for name in sorted(each for each in found if game_of(each) == game):
+            lines.append([name, *_reached(found[name])])
     return table("game | games | transitions | mean score | range | by random actions", lines)
 
 
-def _place(name: str) -> tuple[int, int]:
-    """Where data of a name stand: with their game, as `data_name` calls them."""
-    return [*GAMES].index(name.partition(",")[0]), len(name)
+def _reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many there are, and their scores."""
+    reached = np.array([game["score"] for game in games])
+    by_noise = {
+        noise: np.mean([game["score"] for game in games if game["noise"] == noise])
+        for noise in sorted({game["noise"] for game in games})
+    }
+    return [
+        str(len(games)),
+        str(sum(game["transitions"] for game in games)),
+        f"{reached.mean():.1f}",
+        f"{reached.min():g} .. {reached.max():g}",
+        ", ".join(f"{mean:.1f} ({noise:.0%})" for noise, mean in by_noise.items()),
+    ]
 
 
 def energy(found: Mapping[str, Any]) -> str:

@@ -154,6 +154,17 @@ def preset(name: str, preset: str) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
+def data_name(game: str, transitions: int) -> str:
+    """What data of a game are recorded as: its name, where there are as many as usual."""
+    usual = preset(game, "leapjax")["transitions"]
+    return game if transitions == usual else f"{game}, {transitions:,} transitions"
+
+
+def game_of(data_name: str) -> str:
+    """The game of data that are called so."""
+    return data_name.partition(",")[0]
+
+
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
     """What a game changes of a method's own options."""
     game = find_game(name)
