@@ -15,14 +15,10 @@ babyai: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-# The long form of the tests that have one: docs/reliability.md.
+# The files with tests that have a long form, in that form: docs/reliability.md.
 test-long: $(READY)
 	LEAPJAX_TEST_LONG=1 $(BIN)/python -m pytest -rA --durations=10 \
-		tests/test_interruption.py tests/test_processes.py tests/test_fuzz.py tests/test_soak.py \
-		tests/test_analyses.py tests/test_atari.py tests/test_babyai.py tests/test_benchmarks.py \
-		tests/test_by_hand.py tests/test_domain.py tests/test_models.py tests/test_once.py \
-		tests/test_published.py tests/test_replay.py tests/test_rewards.py tests/test_runs.py \
-		tests/test_sudoku.py tests/test_training.py $(ARGS)
+		$$(grep -lw 'only_long\|LONG' tests/test_*.py) $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

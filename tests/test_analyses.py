@@ -100,6 +100,7 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
     assert {row["way"] for row in rows(place, of.name)} == {way.name for way in case.ways}
 
 
+@only_long
 def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):
     """Metrics are written first, and a kill may come before the checkpoint is."""
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)

@@ -17,6 +17,7 @@ from leapjax.babyai.settings import Settings
 from leapjax.data import windows
 from tests.dynamics import FRONT, stepped
 from tests.oracles import slow_path_lengths
+from tests.programs import only_long
 
 EMPTY, KEY, BALL, BOX = 1, 5, 6, 7
 GRID_WORDS = augmentation.GridWords(
@@ -342,7 +343,7 @@ def test_a_false_start_leads_to_where_the_window_began():
     assert set(lengths) == set(range(1, 7))
 
 
-@pytest.mark.parametrize("name", ["false_start", "detour"])
+@pytest.mark.parametrize("name", ["false_start", pytest.param("detour", marks=only_long)])
 def test_what_begins_earlier_never_steps_on_lava(name):
     """Demonstrations walk around it: what is added to them must too."""
     options = {"false_start": (1.0,), "detour": (1.0, GRID_WORDS)}[name]

@@ -97,6 +97,7 @@ def test_methods_take_turns_and_an_action_costs_its_share_of_a_plan(tmp_path, mo
     assert all(row["plans_per_second"] > 0 and row["batch"] == 2 for row in rows)
 
 
+@only_long
 def test_a_plan_of_a_method_is_measured_as_the_method_plans(monkeypatch):
     monkeypatch.setattr(methods, "preset", tiny_preset)
     plan = methods.make_call("GoToLocalS7N5", "bc", 2)()

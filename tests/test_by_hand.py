@@ -154,6 +154,7 @@ def iql_loss(value, qs, least, logits, returns, taken):
     )
 
 
+@only_long  # it learns in test_rewards.py
 def test_iql():
     case = make_case(iql, iql.Settings(**IQL))
     steps, params = around(case.batch), case.state.params["params"]

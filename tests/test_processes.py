@@ -72,6 +72,7 @@ def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
     place.check_same_end("one stopped")
 
 
+@only_long
 def test_what_one_process_refuses_is_refused_by_all_before_any_work(place):
     runs = start_two(place, "refused", "--batch", "5")
     errors = [run.communicate(timeout=100)[1] for run in runs]

@@ -15,6 +15,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Agent, TrainState
 from tests import mixed
+from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
 
@@ -76,7 +77,7 @@ def energies(case):
     return np.asarray(of_place(mixed.contexts(0)))
 
 
-@pytest.mark.parametrize("case", ["cql", "qr_dqn", "rem"])
+@pytest.mark.parametrize("case", ["cql", "qr_dqn", pytest.param("rem", marks=only_long)])
 def test_the_best_policy_is_found(case):
     found = energies(case)
     np.testing.assert_array_equal(found.argmin(axis=1), mixed.best_actions())

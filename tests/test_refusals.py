@@ -22,7 +22,7 @@ from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import ROOT, TOY_RUN
+from tests.programs import ROOT, TOY_RUN, only_long
 
 
 @pytest.fixture(autouse=True)
@@ -301,6 +301,7 @@ def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
     assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
 
 
+@only_long
 def test_output_that_nobody_reads_any_more_is_one_line():
     """As in `--help | head -1`."""
     code = """

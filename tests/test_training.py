@@ -238,6 +238,7 @@ def entropy_of_positions(data) -> float:
     return float(-(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=0).mean())
 
 
+@only_long
 def test_it_learns_a_few_demonstrations_by_heart(local_demonstrations):
     agent = leap.make_agent(setup(LEVEL, EXACT))
     step = training.make_train_step(agent)
