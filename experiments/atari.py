@@ -63,7 +63,7 @@ def run(options: Collect) -> None:
     """Makes data.
 
     Raises:
-        UserError: an unknown game, or numbers that cannot be.
+        UserError: an unknown game, numbers that cannot be, or data that are not to be recorded.
     """
     for name in ("transitions", "replay_run", "longest", "workers"):
         if getattr(options, name) is not None:

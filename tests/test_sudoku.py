@@ -287,16 +287,21 @@ def test_data_that_solve_no_board_are_refused():
             domain.check(wrong, "here")
 
 
-def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypatch, quick_begin):
+@pytest.fixture
+def one_search(tmp_path, monkeypatch):
+    """An empty folder to run in, and no more ways to search than one."""
     monkeypatch.chdir(tmp_path)
-    few = [search for search in searches.SEARCHES if search.name == "all at once"]
-    monkeypatch.setattr(searches, "SEARCHES", few)
+    (only,) = (search for search in searches.SEARCHES if search.name == "all at once")
+    monkeypatch.setattr(searches, "SEARCHES", (only,))
+    monkeypatch.setattr(searches, "BEST_OF_MANY", only)
+
+
+def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_search, quick_begin):
     toy = "--level Sudoku4x8 --episodes 8 --no-pictures".split()
     network = "--steps 2 --demos 2 --batch 2 --width 8 --heads 2 --layers 1".split()
     assert sudoku.main([*toy, *network]) == 0
     (folder,) = (path for path in (tmp_path / "runs").glob("sudoku-*"))
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
-    monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
     assert sudoku.main([*toy, "--method", "rules"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
     found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
@@ -314,12 +319,8 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     ("less", "solved"),
     [pytest.param("", 6, marks=only_long), ("--horizon 5 --iterations 5", 3)],
 )
-def test_rules_go_on_where_the_board_is(less, solved, tmp_path, monkeypatch):
+def test_rules_go_on_where_the_board_is(less, solved, tmp_path, one_search):
     """Planned anew after every few digits, and only as far."""
-    monkeypatch.chdir(tmp_path)
-    few = [search for search in searches.SEARCHES if search.name == "all at once"]
-    monkeypatch.setattr(searches, "SEARCHES", few)
-    monkeypatch.setattr(searches, "BEST_OF_MANY", few[0])
     toy = "--level Sudoku4x8 --episodes 8 --no-pictures --method rules --executed 4"
     assert sudoku.main([*toy.split(), *less.split()]) == 0
     row, _ = results.read(tmp_path / "runs" / "sudoku.jsonl")

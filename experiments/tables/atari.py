@@ -57,10 +57,8 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
             if setting.method in game.paper and not setting.options
         }
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
-        few, many = (
-            data.get(data_name(name, preset(name, each)["transitions"]), ())
-            for each in ("leapjax", "paper")
-        )
+        few = data.get(name, ())
+        many = data.get(data_name(name, preset(name, "paper")["transitions"]), ())
         found = {"paper": papers}
         found["ours"], found["score"] = _scores(ours, game, COLUMNS, few)
         found["ours, preset `paper`"], found["its score"] = _scores(ours, game, LARGE, many)

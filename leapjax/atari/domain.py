@@ -160,9 +160,9 @@ def data_name(game: str, transitions: int) -> str:
     return game if transitions == usual else f"{game}, {transitions:,} transitions"
 
 
-def game_of(data_name: str) -> str:
-    """The game of data that are called so."""
-    return data_name.partition(",")[0]
+def game_of(name: str) -> str:
+    """The game of data that `data_name` calls so."""
+    return name.partition(",")[0]
 
 
 def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
