@@ -26,14 +26,3 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     lowered = {candidate.lower(): candidate for candidate in known}
     near = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)
     return f"; did you mean {', '.join(lowered[match] for match in near)}?" if near else ""
-
-
-def check_at_least(config: object, least: int, *names: str) -> None:
-    """Refuses a configuration some of whose numbers are too small.
-
-    Raises:
-        ValueError: says which, and what is possible.
-    """
-    for name in names:
-        if getattr(config, name) < least:
-            raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")

@@ -12,7 +12,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from leapjax.errors import check_at_least
+from leapjax.checks import check_at_least
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number

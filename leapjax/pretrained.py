@@ -14,9 +14,10 @@ from jax.sharding import Mesh
 from leapjax import checkpoints, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
+from leapjax.checks import check_at_least
 from leapjax.domain import Domain
 from leapjax.domains import find_domain
-from leapjax.errors import UserError, check_at_least
+from leapjax.errors import UserError
 from leapjax.files import write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig

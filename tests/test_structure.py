@@ -48,25 +48,26 @@ def test_the_library_never_imports_experiments():
 def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/types.py")
     may_import("leapjax/errors.py")
+    may_import("leapjax/checks.py", "errors")
     may_import("leapjax/schedules.py")
-    may_import("leapjax/energy.py", "types")
+    may_import("leapjax/energy.py", "types", "checks")
     may_import("leapjax/sharding.py", "types")
-    may_import("leapjax/planners.py", "types", "errors")
-    may_import("leapjax/batching.py", "types", "planners", "sharding")
-    may_import("leapjax/scores.py")
+    may_import("leapjax/planners.py", "types", "checks")
+    may_import("leapjax/batching.py", "types", "checks", "planners", "sharding")
+    may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
-    may_import("leapjax/environments.py", "types")
+    may_import("leapjax/environments.py", "types", "checks")
     may_import("leapjax/data/windows.py", "types")
     may_import("leapjax/models/linear.py")
     may_import("leapjax/models/dropout.py")
     may_import("leapjax/models/transformer.py", "models.dropout", "models.linear")
     may_import(
         "leapjax/models/trajectory.py",
-        *("types", "errors", "models.dropout", "models.transformer"),
+        *("types", "checks", "errors", "models.dropout", "models.transformer"),
     )
     may_import(
         "leapjax/domain.py",
-        *("types", "errors", "environments", "models.trajectory"),
+        *("types", "checks", "errors", "environments", "models.trajectory"),
     )
 
 

@@ -13,11 +13,12 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax import sharding
+from leapjax.checks import check_at_least
 from leapjax.data import windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
 from leapjax.energy import single_action
-from leapjax.errors import UserError, check_at_least
+from leapjax.errors import UserError
 from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import GibbsConfig

@@ -22,7 +22,7 @@ from jax.sharding import Mesh
 from leapjax.agents import iql, learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
-from leapjax.errors import check_at_least
+from leapjax.checks import check_at_least
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from leapjax.agents import losses, q_learning
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
-from leapjax.errors import check_at_least
+from leapjax.checks import check_at_least
 from leapjax.types import Agent
 
 

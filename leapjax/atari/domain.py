@@ -14,9 +14,10 @@ from leapjax.atari import replay
 from leapjax.atari.augmentation import mirrored, shifted
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
 from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
+from leapjax.checks import check_at_least
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
-from leapjax.errors import UserError, check_at_least
+from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from

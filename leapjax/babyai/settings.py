@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from leapjax.babyai.levels import Level, find_level
-from leapjax.errors import check_at_least
+from leapjax.checks import check_at_least
 
 
 @dataclasses.dataclass(frozen=True)

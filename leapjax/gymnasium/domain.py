@@ -11,9 +11,10 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from leapjax.checks import check_at_least
 from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter, Transition
-from leapjax.errors import UserError, check_at_least, did_you_mean, first_line
+from leapjax.errors import UserError, did_you_mean, first_line
 from leapjax.gymnasium.observations import StateTokens, blank_of, check_choices, parts_of
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree

@@ -13,7 +13,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from leapjax.errors import UserError, check_at_least
+from leapjax.checks import check_at_least
+from leapjax.errors import UserError
 from leapjax.models.dropout import Dropout
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
