@@ -5,7 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr
+
+Jaxpr = Any  # JAX gives its programs no public type
 
 
 def matmul_flops(function: Callable[..., Any], *arguments: Any) -> float:
@@ -40,18 +41,18 @@ def _count(jaxpr: Jaxpr) -> float:
             times = params["length"]
         elif name == "shard_map":
             times = params["mesh"].size
-        total += times * sum(map(_count, _inner(list(params.values()))))
+        total += times * sum(map(_count, inner_programs(list(params.values()))))
     return total
 
 
-def _inner(values: list[Any]) -> list[Jaxpr]:
-    """The programs among the parameters of an operation."""
+def inner_programs(values: list[Any]) -> list[Jaxpr]:
+    """Finds the programs among the parameters of an operation, closed over constants or not."""
     found = []
     for value in values:
-        if isinstance(value, ClosedJaxpr):
+        if isinstance(value, tuple | list):
+            found += inner_programs(list(value))
+        elif hasattr(value, "jaxpr"):  # with its constants
             found.append(value.jaxpr)
-        elif isinstance(value, Jaxpr):
+        elif hasattr(value, "eqns"):
             found.append(value)
-        elif isinstance(value, (tuple, list)):
-            found += _inner(list(value))
     return found

@@ -10,7 +10,7 @@ from pathlib import Path
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
 # Several devices, as on a machine with several cores or GPUs: batches are split over them.
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "8")

@@ -58,7 +58,7 @@ def assert_is(case, loss):
     found = update(case.state, case.batch, KEY)
     expected, gradient = quick_jit(jax.value_and_grad(loss))(case.state.params)
     assert float(found["loss"]) == pytest.approx(float(expected), rel=1e-4)
-    norm = float(optax.global_norm(gradient))
+    norm = float(optax.tree.norm(gradient))
     assert float(found["gradient_norm"]) == pytest.approx(norm, rel=1e-3)
 
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.flops import inner_programs
 from leapjax.models.linear import linear, rows_times_matrix
 
 KEY = jax.random.key(0)
@@ -40,7 +41,7 @@ def contracted(jaxpr):
         if equation.primitive.name == "dot_general":
             (axes, _), _ = equation.params["dimension_numbers"]
             yield len(axes), *(operand.aval.ndim for operand in equation.invars)
-        for inner in jax.core.jaxprs_in_params(equation.params):
+        for inner in inner_programs(list(equation.params.values())):
             yield from contracted(inner)
 
 

@@ -281,7 +281,7 @@ def make_update(
         (loss, metrics), gradients = mean_gradient(state.params, state.extra, batch, key)
         updates, opt_state = optimizer.update(gradients, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        norm = optax.global_norm(gradients)
+        norm = optax.tree.norm(gradients)
         extra = next_extra(state.extra, params)
         state = TrainState(params, opt_state, state.step + 1, extra)
         if mesh is not None:  # where it was: the next step is then the same program
