@@ -1,19 +1,8 @@
 """What several tests share."""
 
 import gc
-import os
 import shutil
 from pathlib import Path
-
-# Tests compile much and compute little: without optimisations they take a fraction of the time.
-# XLA reads this when JAX starts, so it comes before every import of JAX.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_parallel_codegen_split_count=1",
-)
-# Several devices, as on a machine with several cores or GPUs: batches are split over them.
-os.environ.setdefault("JAX_NUM_CPU_DEVICES", "8")
 
 import jax
 import pytest
