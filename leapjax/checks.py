@@ -111,6 +111,30 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
     return tuple(indices)
 
 
+def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
+    """Returns the same numbers in another type; only floats are rounded.
+
+    Args:
+        name: of the numbers, for the message.
+        values: an array of booleans, integers or floats, or what NumPy makes one of.
+        dtype: the type.
+
+    Raises:
+        UserError: no numbers, numbers that the type does not have, or NaN or infinite.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise UserError(f"{name}: numbers expected, got {array.dtype}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        narrow = array.astype(dtype)
+    wrong = ~np.isfinite(narrow) if narrow.dtype.kind == "f" else narrow != array
+    if wrong.any():
+        raise UserError(
+            f"{name}: numbers that do not fit {dtype}, or are not finite, such as {array[wrong][0]}"
+        )
+    return narrow
+
+
 def check_at_least(config: object, least: int, *names: str, most: int = MOST) -> None:
     """Checks fields of a configuration that are integers.
 

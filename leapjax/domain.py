@@ -19,6 +19,9 @@ from leapjax.errors import UserError, did_you_mean
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window
 
+Statistics = tuple[tuple[tuple[float, ...], ...], ...]
+# what a network must know of its training data, kept with its checkpoint: by array of an
+# observation, by column of it
 Augmentation = Callable[[jax.Array, Window], Window]
 # (key, window) -> window: one training example as it could have been
 
@@ -77,6 +80,11 @@ def _nothing_to_check(observations: PyTree, where: str) -> None:
     del observations, where
 
 
+def _no_statistics(demonstrations: Sequence[Demonstration]) -> Statistics:
+    del demonstrations
+    return ()
+
+
 def _no_extras(demonstration: Demonstration) -> PyTree:
     del demonstration
     return ()
@@ -97,6 +105,10 @@ class Domain(NamedTuple):
     # by architecture, (model, K) -> module; see leapjax.models.trajectory. One of `paper` may have
     # `of_all` as well, (B contexts) -> tokens [B, K + 1, D], where training is faster with it
     augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
+    measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
+    # what encoders must know of the training data
+    with_statistics: Callable[[Statistics], "Domain"] | None = None
+    # the same level, with encoders that know so much; None: theirs need to know nothing
     extras: Callable[[Demonstration], PyTree] = _no_extras
     # what augmentations must know of each step, [n, ...]; no model sees it
     check: Callable[[PyTree, str], None] = _nothing_to_check
@@ -130,6 +142,15 @@ class DomainType(NamedTuple):
     # (level, preset) -> options by name, whatever the method; the method's own come after
     tuned: Callable[[str, str, str], Mapping[str, Any]] = lambda level, method, preset: {}
     # (level, method, preset) -> options that a level changes of the method's own
+
+
+def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
+    """Returns a level with encoders that know statistics of their training data, if they need any.
+
+    Raises:
+        UserError: the statistics are not of this level's observations.
+    """
+    return domain.with_statistics(statistics) if domain.with_statistics and statistics else domain
 
 
 def blank_context(domain: Domain, length: int) -> Context:

@@ -15,7 +15,7 @@ from leapjax import checkpoints, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
 from leapjax.checks import check_at_least
-from leapjax.domain import Domain
+from leapjax.domain import Domain, Statistics, apply_statistics
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
 from leapjax.files import write_text
@@ -56,6 +56,7 @@ class Specification:
     domain_settings: Any
     signature: dict  # of the domain, when it was trained
     origin: Origin
+    statistics: Statistics = ()  # of what it learned from, as far as its network needs them
 
     def __post_init__(self) -> None:
         check_at_least(self, 0, "context")
@@ -75,10 +76,11 @@ class Pretrained:
         return self.plan(self.params, keys, contexts)
 
 
-def make_domain(specification: Specification) -> Domain:
-    """The level that a planner was trained for."""
+def make_domain(specification: Specification, level: str | None = None) -> Domain:
+    """The level that a planner was trained for, or another one for the same network."""
     kind = find_domain(specification.domain)
-    return kind.make(specification.level, specification.domain_settings)
+    domain = kind.make(level or specification.level, specification.domain_settings)
+    return apply_statistics(domain, specification.statistics)
 
 
 def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None = None) -> Agent:
@@ -101,6 +103,8 @@ def identity(specification: Specification) -> str:
     values = dataclasses.asdict(specification)
     changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
     changed["training"] = without_unnamed(changed["training"])
+    if not specification.statistics:  # as before there were any
+        del values["statistics"]
     return json.dumps(values | changed, sort_keys=True)
 
 
@@ -225,8 +229,7 @@ def load(
         if specification.signature.get(name) != value:
             raise UserError(f"{folder}: trained with another {name}; train it again")
     if level is not None:
-        kind = find_domain(specification.domain)
-        other = kind.make(level, specification.domain_settings)
+        other = make_domain(specification, level)
         for name, value in other.signature.items():
             if domain.signature.get(name) != value:
                 raise UserError(

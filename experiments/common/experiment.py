@@ -216,9 +216,11 @@ def train(
     mesh = run.training_mesh(this.config)
     begun = functools.cache(lambda: run.compile_ahead(this, mesh, plays))
     if run.must_collect(this):
-        begun()  # programs compile meanwhile
+        if this.domain.with_statistics is None:  # a network that needs none of what is collected
+            begun()  # programs compile meanwhile
         run.collect(this)
     data = run.load(this)
+    this = run.measured(this, data)
     seeds.check_disjoint([d.seed for d in data], played)
     processes.first_does(lambda: stack.enter_context(files.only_process_in(this.folder)))
     return run.fit(this, data, mesh, lambda: begun()(), watch)

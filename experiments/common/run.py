@@ -32,7 +32,7 @@ from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
-from leapjax.domain import Domain, Source, blank_context
+from leapjax.domain import Domain, Source, apply_statistics, blank_context
 from leapjax.energy import compose
 from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
@@ -195,6 +195,16 @@ def load(run: Run) -> list[Demonstration]:
             "with rewards, or another method"
         )
     return data
+
+
+def measured(run: Run, data: Sequence[Demonstration]) -> Run:
+    """A run whose network knows the statistics of what it learns from, if it needs any."""
+    statistics = run.domain.measure(data)
+    return dataclasses.replace(
+        run,
+        domain=apply_statistics(run.domain, statistics),
+        specification=dataclasses.replace(run.specification, statistics=statistics),
+    )
 
 
 def fit(
@@ -363,7 +373,7 @@ def _training_settings(specification: Specification) -> dict[str, Any]:
         return found
 
     settings = flat(dataclasses.asdict(specification), "")
-    asked = {"method_settings.target_return"} | {
+    asked = {"method_settings.target_return", "statistics"} | {
         name for name in settings if name.startswith(("planner.", "signature."))
     }
     return {

@@ -4,7 +4,6 @@ A data set of the user's own, of the same observations, is read in the same way.
 are a dictionary by field, or one array where they are an array.
 """
 
-import functools
 import json
 import math
 import os
@@ -27,6 +26,7 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from leapjax import files
+from leapjax.checks import check_fits
 from leapjax.domain import Collection, Domain, Recording, Source
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
@@ -335,9 +335,8 @@ def _demonstration(
     observations = _like(domain.blank, episode.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
     domain.check(observations, where)
-    narrow = functools.partial(_narrowed, where=where)
     return Demonstration(
-        jax.tree.map(narrow, domain.blank, observations),
+        jax.tree.map(lambda x, like: check_fits(where, x, like.dtype), observations, domain.blank),
         actions.astype(np.int32),
         rewards,
         bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),
@@ -446,7 +445,7 @@ def _rewards(values: Any, where: str, steps: int) -> np.ndarray:
     rewards = _numbers(np.zeros((), np.float32), values, f"{where}: rewards")
     if rewards.shape != (steps,):
         raise UserError(f"{where}: rewards have shape {rewards.shape}, expected ({steps},)")
-    return _narrowed(np.zeros((), np.float32), rewards, f"{where}: rewards")
+    return check_fits(f"{where}: rewards", rewards, np.dtype(np.float32))
 
 
 def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") -> PyTree:
@@ -473,7 +472,8 @@ def _numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
     if np.issubdtype(blank.dtype, np.integer):
         if not np.issubdtype(array.dtype, np.integer):
             raise UserError(f"{what} must be integers, got {array.dtype}")
-        return array.astype(np.int64)  # wide enough for what the range check must still see
+        # Wide enough for what the range check must still see.
+        return array if array.dtype == np.uint64 else array.astype(np.int64)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise UserError(f"{what} must be numbers, got {array.dtype}")
     return array.astype(np.float64)
@@ -488,16 +488,6 @@ def _check_shapes(observations: PyTree, domain: Domain, states: int, where: str)
                 f"{where}: {name} has shape {array.shape}, level {domain.level} needs "
                 f"{(states, *blank.shape)}"
             )
-
-
-def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
-    """An array in the type of `blank`, if it fits."""
-    with np.errstate(over="ignore"):
-        narrow = array.astype(blank.dtype)
-    exact = not np.issubdtype(blank.dtype, np.floating)
-    if not (np.array_equal(narrow, array) if exact else np.isfinite(narrow).all()):
-        raise UserError(f"{where}: numbers that do not fit {blank.dtype}, or are not finite")
-    return narrow
 
 
 def exists(name: str) -> bool:

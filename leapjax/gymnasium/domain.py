@@ -11,11 +11,19 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from leapjax.checks import check_at_least
-from leapjax.domain import Domain, DomainType
+from leapjax.checks import check_at_least, check_fits
+from leapjax.domain import Domain, DomainType, Statistics
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError, did_you_mean, first_line
-from leapjax.gymnasium.observations import StateTokens, blank_of, check_choices, parts_of
+from leapjax.gymnasium.observations import (
+    StateTokens,
+    blank_of,
+    check_choices,
+    check_precision,
+    check_statistics,
+    measure_parts,
+    parts_of,
+)
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
@@ -81,7 +89,11 @@ class CheckedAdapter(GymnasiumAdapter):
                 f"{self._name} gave an observation of shape {shapes}; its observation space says "
                 f"{self._shapes}"
             )
-        return jax.tree.map(lambda x, like: np.asarray(x, like.dtype), observation, self._blank)
+        where = f"an observation of {self._name}"
+        fit = functools.partial(check_fits, where)
+        narrow = jax.tree.map(lambda x, like: fit(x, like.dtype), observation, self._blank)
+        check_choices(self.env.observation_space, narrow, where)
+        return narrow
 
 
 def _plain(observation: Any) -> PyTree:
@@ -137,11 +149,25 @@ def make(name: str, options: Settings) -> Domain:
     space = env.observation_space
     blank, parts = blank_of(space, f"the observation of {name}"), parts_of(space)
 
-    def tokens(num_actions: int, model: ModelConfig, context: int) -> nn.Module:
-        del context
-        return StateTokens(parts, model.width, num_actions, model.dtype)
+    def check(observations: PyTree, where: str) -> None:
+        check_choices(space, observations, where)
+        check_precision(space, observations, where)
 
-    return Domain(
+    def encoders(statistics: Statistics) -> dict[str, Callable[[ModelConfig, int], nn.Module]]:
+        def tokens(num_actions: int, model: ModelConfig, context: int) -> nn.Module:
+            del context
+            return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
+
+        return {
+            "paper": functools.partial(tokens, 0),  # it embeds actions itself
+            "leapjax": functools.partial(tokens, int(actions.n) + 1),
+        }
+
+    def with_statistics(statistics: Statistics) -> Domain:
+        check_statistics(statistics, parts, blank)
+        return domain._replace(encoders=encoders(statistics))
+
+    domain = Domain(
         level=name,
         make_adapter=lambda: CheckedAdapter(
             make_environment(name, options), name, blank, options.success_return
@@ -150,14 +176,14 @@ def make(name: str, options: Settings) -> Domain:
         actions=(*(str(action) for action in range(actions.n)), "end"),
         max_steps=_longest(env) or 0,
         blank=blank,
-        check=functools.partial(check_choices, space),
+        check=check,
         arguments=_arguments(env),
-        encoders={
-            "paper": functools.partial(tokens, 0),  # it embeds actions itself
-            "leapjax": functools.partial(tokens, int(actions.n) + 1),
-        },
+        encoders=encoders(()),
+        measure=functools.partial(measure_parts, parts),
+        with_statistics=with_statistics,
         signature={"parts": [list(part) for part in parts]},
     )
+    return domain
 
 
 def preset(name: str, preset: str) -> Mapping[str, Any]:
