@@ -112,7 +112,7 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
 
 
 def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
-    """Returns the same numbers in another type; only floats are rounded.
+    """Returns the same numbers in another type; a type of floats rounds them.
 
     Args:
         name: of the numbers, for the message.

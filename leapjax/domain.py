@@ -145,7 +145,7 @@ class DomainType(NamedTuple):
 
 
 def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
-    """Returns a level with encoders that know statistics of their training data, if they need any.
+    """Returns a level whose encoders know statistics of their training data, if they need any.
 
     Raises:
         UserError: the statistics are not of this level's observations.

@@ -33,6 +33,22 @@ def test_what_is_no_finite_number_is_refused(value):
         checks.check_number("weight", value)
 
 
+def test_numbers_fit_another_type_or_are_refused():
+    assert checks.check_fits("it", [1.0, -2.0], np.dtype(np.int8)).tolist() == [1, -2]
+    assert checks.check_fits("it", np.uint64(2**31 - 1), np.dtype(np.int32)) == 2**31 - 1
+    assert checks.check_fits("it", np.array([0, 1]), np.dtype(bool)).tolist() == [False, True]
+    for value, kind in [
+        (2**32 + 2, np.int32), (2**31, np.int32), (np.uint64(2**64 - 5), np.int32), (-1, np.uint8),
+        (0.5, np.int32), (math.nan, np.int32), (2, bool), (1e39, np.float32),
+        (-math.inf, np.float32), (math.nan, np.float32),
+    ]:  # fmt: skip
+        with pytest.raises(UserError, match="it: numbers that do not fit"):
+            checks.check_fits("it", [0, value], np.dtype(kind))
+    for value in ("1", None, 1j):
+        with pytest.raises(UserError, match="it: numbers expected"):
+            checks.check_fits("it", value, np.dtype(np.float32))
+
+
 def test_a_seed_is_one_of_those_that_jax_tells_apart():
     assert checks.check_seed(2**32 - 1) == 2**32 - 1
     for wrong in (-1, 2**32, 2**64, 5.0, True):

@@ -114,10 +114,10 @@ def test_spaces_become_blank_observations_and_parts():
     space = Corridor.observation_space
     blank = blank_of(space, "it")
     assert [leaf.shape for leaf in jax.tree.leaves(blank)] == [(2,), (), (WAY, 3, 3)]
-    assert parts_of(space) == (Part("numbers"), Part("choices", 3), Part("image"))
+    assert parts_of(space) == (Part("vector"), Part("choices", 3), Part("picture"))
     several = spaces.MultiDiscrete([4, 9], start=[1, 1])
     assert parts_of(several) == (Part("choices", 10),) and blank_of(several, "it").shape == (2,)
-    assert parts_of(spaces.MultiBinary(3)) == (Part("numbers"),)
+    assert parts_of(spaces.MultiBinary(3)) == (Part("vector"),)
     with pytest.raises(UserError, match=r"it\['said'\] is a Text: expected Box"):
         blank_of(spaces.Dict(said=spaces.Text(5)), "it")
 

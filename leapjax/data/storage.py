@@ -335,8 +335,13 @@ def _demonstration(
     observations = _like(domain.blank, episode.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
     domain.check(observations, where)
+
+    def narrowed(path: Any, values: np.ndarray, like: np.ndarray) -> np.ndarray:
+        name = jax.tree_util.keystr(path, simple=True) or "observations"
+        return check_fits(f"{where}: {name}", values, like.dtype)
+
     return Demonstration(
-        jax.tree.map(lambda x, like: check_fits(where, x, like.dtype), observations, domain.blank),
+        jax.tree.map_with_path(narrowed, observations, domain.blank),
         actions.astype(np.int32),
         rewards,
         bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),

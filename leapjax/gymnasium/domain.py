@@ -90,8 +90,11 @@ class CheckedAdapter(GymnasiumAdapter):
                 f"{self._shapes}"
             )
         where = f"an observation of {self._name}"
-        fit = functools.partial(check_fits, where)
-        narrow = jax.tree.map(lambda x, like: fit(x, like.dtype), observation, self._blank)
+
+        def narrowed(path: Any, values: Any, like: np.ndarray) -> np.ndarray:
+            return check_fits(f"{where}{jax.tree_util.keystr(path)}", values, like.dtype)
+
+        narrow = jax.tree.map_with_path(narrowed, observation, self._blank)
         check_choices(self.env.observation_space, narrow, where)
         return narrow
 

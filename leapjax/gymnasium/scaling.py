@@ -67,7 +67,11 @@ def scale_numbers(values: jax.Array, knots: Knots) -> jax.Array:
     first = np.arange(longest - 1) == 0
     last = np.arange(longest - 1) == np.array([[len(column) - 2] for column in knots])
     wide = widths > 0
-    places = _subtract(values[..., None], starts) / jnp.float32(np.where(wide, widths, 1.0))
+    # The reciprocal of 3e38 is not a number that devices have, nor is that of 1e-39.
+    factors = np.where(widths > 1, 2.0**-64, 2.0**64)
+    distances = _subtract(values[..., None], starts) * jnp.float32(factors)
+    places = distances / jnp.float32(np.where(wide, widths * factors, 1.0))
+    places = jnp.clip(places, -LARGEST, LARGEST)
     below = -jnp.log1p(jnp.maximum(-places, 0)) * first
     above = jnp.log1p(jnp.maximum(places - 1, 0)) * last
     features = jnp.where(wide, 2 * (jnp.clip(places, 0, 1) + below + above) - 1, 0)
