@@ -311,10 +311,10 @@ SPECIFICATION = config.specify(
 def test_a_damaged_specification(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("run")
     pretrained.save_specification(folder, SPECIFICATION)
-    assert pretrained.read_specification(folder) == SPECIFICATION
+    assert pretrained.parse_specification(folder) == SPECIFICATION
     path = folder / pretrained.SPECIFICATION
     path.write_bytes(data.draw(changed_json(json.loads(path.read_text()))))
-    found = outcome(lambda: pretrained.read_specification(folder))
+    found = outcome(lambda: pretrained.parse_specification(folder))
     assert found is None or isinstance(found, pretrained.Specification)
 
 

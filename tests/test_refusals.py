@@ -22,7 +22,7 @@ from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import ROOT, TOY_RUN, only_long
+from tests.programs import LONG, ROOT, TOY_RUN, only_long
 
 
 @pytest.fixture(autouse=True)
@@ -42,17 +42,51 @@ def one_line(capsys, *arguments) -> str:
 # Checkpoints.
 
 
-def test_a_folder_in_which_checkpoints_would_be_lost(workplace, capsys):
-    assert "because of '[' in its name" in one_line(capsys, "--runs", "out/run[1]")
-    assert not (workplace / "out").exists()
-    for folder in (workplace / "a[1]", workplace / "b*", workplace / "gs:/c"):
+@pytest.mark.parametrize("name", ["a\\b", "run[1]", "b*", "what?", "gs:/c", "\udc80", "a\\..\\b"])
+def test_a_folder_in_which_checkpoints_would_be_lost(name, workplace):
+    for use in (Checkpoints, lambda folder: checkpoints.restore_params(folder, {})):
         with pytest.raises(UserError, match="cannot hold checkpoints"):
-            Checkpoints(folder)
-        with pytest.raises(UserError, match="cannot hold checkpoints"):
-            checkpoints.restore_params(folder, {})
+            use(workplace / name)
+    assert list(workplace.iterdir()) == []
+
+
+def test_a_folder_of_runs_in_which_checkpoints_would_be_lost(workplace, capsys):
+    said = one_line(capsys, "--runs", "C:\\Users\\me\\My Runs")
+    assert f"TensorStore takes it for {workplace}/C:/Users/me/My Runs" in said
+    assert "takes it for a pattern, with '*', '?' or '['" in one_line(capsys, "--runs", "run[1]")
+    assert list(workplace.iterdir()) == []
     (workplace / "file").write_text("")
     with pytest.raises(UserError, match="cannot write to"):
         Checkpoints(workplace / "file")
+
+
+ODD = [
+    "a b", " a ", "a#b", "a%41b", "ü日本", "a\nb", "~a", "a.", "...", "a:b", "-a", "a'b\"c",
+    "$HOME", "{a}", "7", "1.orbax-checkpoint-tmp", "x" * 255,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ODD if LONG else ["a #%41ü\n:.{7}'$HOME"])
+def test_an_odd_name_holds_checkpoints(name, workplace):
+    saved = Checkpoints(workplace / name)
+    saved.save(small(3.0))
+    saved.close()
+    again = Checkpoints(workplace / name)
+    restored = again.restore(small(0.0), skipped=pytest.fail)
+    again.close()
+    np.testing.assert_array_equal(restored.params["w"], 3.0)
+    found = checkpoints.restore_params(workplace / name, small(0.0).params)
+    np.testing.assert_array_equal(found["w"], 3.0)
+
+
+def test_a_checkpoint_that_is_written_somewhere_else(workplace, monkeypatch):
+    """Whatever the reason: it is found out after the first, not by the next start."""
+    monkeypatch.setattr(checkpoints, "check_path", lambda folder: None)
+    saved = Checkpoints(workplace / "a\\b")
+    saved.save(small(1.0))
+    with pytest.raises(UserError, match="was written, but is not found in"):
+        saved.save(small(2.0)._replace(step=jnp.int32(2)))
+    saved.close()
 
 
 def small(value: float) -> TrainState:
