@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 import shutil
 import sys
 import traceback
@@ -34,6 +35,7 @@ IDENTITY = "identity"  # the array that says whose checkpoint it is
 PASSING = {errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM}  # not damage
 ORBAX = Path(ocp.__file__).parent
 Shapes = dict[str, tuple[int, ...]]  # by the place of an array in its tree
+NO_ROOM = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]
 T = TypeVar("T")
 
 
@@ -183,9 +185,11 @@ class Checkpoints:
         try:
             yield
         except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+            # TensorStore says it at the end of a long line.
+            said = next((text for text in NO_ROOM if text in str(error)), first_line(error))
             raise UserError(
-                f"cannot write a checkpoint to {self._folder} ({first_line(error)}); those "
-                "written before are intact: make room, and start the same command again"
+                f"cannot write a checkpoint to {self._folder} ({said}); those written before are "
+                "intact: make room, and start the same command again"
             ) from None
 
 
@@ -301,6 +305,7 @@ def restore_params(
             saved with another identity.
         Unfinished: that of `step` is not there, or cannot be read.
     """
+    hush_orbax()
     steps = _steps(folder)
     if step is not None:
         if step not in steps:

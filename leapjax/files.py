@@ -154,9 +154,7 @@ def make_private(folder: Path) -> None:
     """
     try:
         for path in (*reversed(folder.parents), folder):
-            if not path.is_dir():
-                with contextlib.suppress(FileExistsError):  # made by another process meanwhile
-                    path.mkdir(mode=0o700)
+            path.mkdir(mode=0o700, exist_ok=True)
         where = folder.resolve()
         _check_private(where, sticky=False)
         for parent in where.parents:
