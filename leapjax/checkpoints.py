@@ -8,7 +8,6 @@ import glob
 import hashlib
 import json
 import logging
-import math
 import os
 import shutil
 import sys
@@ -436,7 +435,8 @@ def _saved_shapes(checkpoint: Path) -> Shapes:
             description = json.loads(store.read(key).result().value)
             place = name.removesuffix("/.zarray").replace(".", "/")
             shapes[place] = tuple(description["shape"])
-            if math.prod(description["chunks"]) > max(1, math.prod(shapes[place])):
+            pieces = zip(description["chunks"], shapes[place], strict=True)
+            if any(piece > max(1, size) for piece, size in pieces):
                 raise ValueError(f"{place} is in pieces that are larger than it is")
     if not shapes:
         raise ValueError("it has no arrays")

@@ -119,6 +119,8 @@ def whole(path: Path) -> Iterator[Path]:
     scratch = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        scratch.unlink(missing_ok=True)
+        scratch.touch(exist_ok=False)  # ours: in a shared folder, not what another put there
         yield scratch
         flush(scratch)
         scratch.replace(path)
@@ -238,7 +240,9 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / ".lock").open("ab+", buffering=0)
+        # Not a link: what it leads to would be emptied.
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
+        file = os.fdopen(os.open(folder / ".lock", flags, 0o666), "ab+", buffering=0)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
     with file:

@@ -235,11 +235,12 @@ def _trace_parameters(
         UserError: the network is larger than what was saved, or than any can be.
     """
     largest = max((math.prod(shape) for shape in saved.values()), default=0)
-    # Each layer has arrays of its own, and one of them is as wide as the network.
     model = specification.model
-    if saved and (model.layers > len(saved) or model.width > largest):
+    # Each layer, and each round of an encoder, has arrays of its own; one is as wide as all.
+    parts = max(model.layers, getattr(specification.domain_settings, "rounds", 0))
+    if saved and (parts > len(saved) or model.width > largest):
         raise UserError(
-            f"{folder}: a network of {model.layers} layers of width {model.width}, but only "
+            f"{folder}: a network of {parts} layers or rounds, of width {model.width}, but only "
             f"{len(saved)} arrays of at most {largest} numbers were saved"
         )
     try:

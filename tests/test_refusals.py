@@ -222,22 +222,25 @@ def test_code_that_data_name(trap, monkeypatch):
     assert not trap.exists()
 
 
-SIZES = [{"layers": 100_000}, {"width": 2**40}, {"width": 2**30}]
+SIZES = [
+    ("model", {"layers": 100_000}), ("domain_settings", {"rounds": 10**6}),
+    ("model", {"width": 2**40}), ("model", {"width": 2**30}),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("size", SIZES if LONG else SIZES[:1])
-def test_a_specification_of_a_network_that_nothing_can_build(workplace, monkeypatch, size):
+@pytest.mark.parametrize(("group", "size"), SIZES if LONG else SIZES[:1])
+def test_a_specification_of_a_network_that_nothing_can_build(workplace, monkeypatch, group, size):
     """With parameters of another network: the seal is compared first. With its own: the sizes."""
     folder = untrained_run(workplace / "run")
     values = json.loads((folder / "specification.json").read_text())
-    values["model"].update(size)
+    values[group].update(size)
     (folder / "specification.json").write_text(json.dumps(values))
     monkeypatch.setattr(pretrained, "make_domain", lambda *given: pytest.fail("built"))
     with pytest.raises(UserError, match="another configuration|must be at most"):
         leap.load(folder)
     monkeypatch.undo()
-    monkeypatch.setattr(pretrained, "identity", lambda specification: json.dumps(TOY_RUN))
-    saved = Checkpoints(folder / "checkpoints", json.dumps(TOY_RUN))
+    monkeypatch.setattr(pretrained, "identity", lambda specification: "made to fit")
+    saved = Checkpoints(folder / "checkpoints", "made to fit")
     saved.save(TrainState({"w": jnp.ones((30, 30))}, (), jnp.int32(10_000)))
     saved.close()
     with pytest.raises(UserError, match="but only 1 arrays of at most 900 numbers|at most"):
@@ -281,6 +284,22 @@ def test_files_of_text_that_have_no_end(workplace):
     specification.write_text(" " * pretrained.LARGEST_SPECIFICATION + "{}")
     with pytest.raises(UserError, match="larger than 1 MiB"):
         leap.load(workplace)
+
+
+def test_links_that_were_planted_in_a_shared_folder(workplace):
+    mine, shared = workplace / "mine", workplace / "shared"
+    shared.mkdir()
+    mine.write_text("precious")
+    (shared / f".{os.getpid()}.row.json").symlink_to(mine)
+    (shared / ".lock").symlink_to(mine)
+    files.write_text(shared / "row.json", "new")
+    assert files.read_text(shared / "row.json") == "new"
+    with (
+        pytest.raises(UserError, match="cannot write to .*shared.*symbolic links"),
+        files.only_process_in(shared),
+    ):
+        pass
+    assert mine.read_text() == "precious"
 
 
 def test_a_folder_that_nobody_else_can_write_to(workplace):
