@@ -8,6 +8,7 @@ import glob
 import hashlib
 import json
 import logging
+import math
 import os
 import shutil
 import sys
@@ -269,11 +270,11 @@ def newest(folder: Path) -> list[int]:
     return sorted(steps, reverse=True)
 
 
-def check_identity(folder: Path, identity: str) -> Shapes:
+def check_identity(folder: Path, identity: str) -> list[int]:
     """Checks with which identity the newest readable checkpoint was saved, and reads no more.
 
     Returns:
-        The shapes of its parameters, by their place in the tree.
+        How many numbers each array of its parameters has.
 
     Raises:
         UserError: there is no checkpoint, or it was saved with another identity.
@@ -288,7 +289,7 @@ def check_identity(folder: Path, identity: str) -> Shapes:
             reasons.append(_cannot_be_read(path, error))
             continue
         _check_same(saved, identity, path)
-        return {place: shape for place, shape in shapes.items() if place.startswith("params/")}
+        return [math.prod(shapes[place]) for place in shapes if place.startswith("params/")]
     raise Unfinished("; ".join(reasons))
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -130,8 +129,8 @@ def read_specification(folder: Path) -> Specification:
     return _read_sealed(folder)[0]
 
 
-def _read_sealed(folder: Path) -> tuple[Specification, checkpoints.Shapes]:
-    """The specification in a folder, and the shapes of the parameters that were saved with it.
+def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
+    """The specification in a folder, and how many numbers each array saved with it has.
 
     Nothing is built, imported or unpacked before this: a specification is what a file says.
     """
@@ -221,20 +220,20 @@ def asking_for(specification: Specification, target_return: float) -> Specificat
 
 
 def _trace_parameters(
-    agent: Agent, specification: Specification, saved: checkpoints.Shapes, folder: Path
+    agent: Agent, specification: Specification, saved: Sequence[int], folder: Path
 ) -> Params:
     """The shapes and types of an agent's parameters.
 
     Args:
         agent: of the specification.
         specification: that says how large its network is.
-        saved: the shapes of the parameters that are there.
+        saved: how many numbers each array has that is there.
         folder: of both, for the message.
 
     Raises:
         UserError: the network is larger than what was saved, or than any can be.
     """
-    largest = max((math.prod(shape) for shape in saved.values()), default=0)
+    largest = max(saved, default=0)
     model = specification.model
     # Each layer, and each round of an encoder, has arrays of its own; one is as wide as all.
     parts = max(model.layers, getattr(specification.domain_settings, "rounds", 0))

@@ -1,15 +1,20 @@
 """Parameters in one small file, in half precision: what a planner is published as."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax import checkpoints, files
+from leapjax import files
 from leapjax.checkpoints import IDENTITY, identity_digest
 from leapjax.errors import UserError, first_line
 from leapjax.types import Params
+
+ITEMSIZE = 2  # bytes of a number in half precision
+HEADER = 1024  # bytes that an array takes beside its numbers, at most
 
 
 def write(path: Path, params: Params, identity: str) -> None:
@@ -34,7 +39,7 @@ def write(path: Path, params: Params, identity: str) -> None:
         )
 
 
-def check_identity(path: Path, identity: str) -> checkpoints.Shapes:
+def check_identity(path: Path, identity: str) -> list[int]:
     """Checks with which identity parameters were written, and unpacks none of them.
 
     Args:
@@ -42,24 +47,19 @@ def check_identity(path: Path, identity: str) -> checkpoints.Shapes:
         identity: that they should be of.
 
     Returns:
-        The shapes of the parameters, by their place in the tree.
+        How many numbers each array has, at most.
 
     Raises:
         UserError: the file cannot be read, or is of another configuration.
     """
-    try:
-        headers = files.read_headers(path)
-        whose = np.array([])
-        if headers.pop(IDENTITY, None) == (identity_digest("").shape, np.uint8):
-            with np.load(path, allow_pickle=False) as archive:
-                whose = archive[IDENTITY]
-    except Exception as error:  # noqa: BLE001  (zipfile, zlib and NumPy raise many kinds)
-        raise UserError(f"cannot read {path}: {first_line(error)}") from None
-    if not np.array_equal(whose, identity_digest(identity)) or any(
-        dtype != np.float16 for _, dtype in headers.values()
-    ):
-        raise UserError(f"{path} is of another configuration than the one beside it")
-    return {name: shape for name, (shape, _) in headers.items()}
+    with _reading(path):
+        sizes = files.read_sizes(path)
+        if sizes.pop(IDENTITY, 2**20) > HEADER:
+            raise _another(path)
+        with np.load(path, allow_pickle=False) as archive:
+            if not np.array_equal(archive[IDENTITY], identity_digest(identity)):
+                raise _another(path)
+    return [size // ITEMSIZE for size in sizes.values()]
 
 
 def read(path: Path, like: Params, identity: str) -> Params:
@@ -73,17 +73,35 @@ def read(path: Path, like: Params, identity: str) -> Params:
     Raises:
         UserError: the file cannot be read, or is of another configuration.
     """
+    check_identity(path, identity)
     wanted = dict(_by_name(like))
-    found = check_identity(path, identity)
-    if found != {name: leaf.shape for name, leaf in wanted.items()}:
-        raise UserError(f"{path} is of another configuration than the one beside it")
-    try:
+    with _reading(path):
+        sizes = files.read_sizes(path)
+        if sizes.keys() != wanted.keys() | {IDENTITY} or any(
+            not 0 <= sizes[name] - ITEMSIZE * leaf.size <= HEADER for name, leaf in wanted.items()
+        ):
+            raise _another(path)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in wanted}
-    except Exception as error:  # noqa: BLE001  (zipfile, zlib and NumPy raise many kinds)
-        raise UserError(f"cannot read {path}: {first_line(error)}") from None
+    for name, leaf in wanted.items():
+        if (arrays[name].shape, arrays[name].dtype) != (leaf.shape, np.float16):
+            raise _another(path)
     leaves = [jnp.asarray(array, jnp.float32) for array in arrays.values()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001  (zipfile, zlib and NumPy raise many kinds)
+        raise UserError(f"cannot read {path}: {first_line(error)}") from None
+
+
+def _another(path: Path) -> UserError:
+    return UserError(f"{path} is of another configuration than the one beside it")
 
 
 def _by_name(params: Params) -> list[tuple[str, jax.Array]]:

@@ -95,7 +95,7 @@ def test_a_damaged_file_is_one_line(tmp_path):
         path.write_bytes(whole[:size])
         with pytest.raises(UserError, match="cannot read"):
             weights.read(path, PARAMS, "mine")
-    np.savez(path, a=np.array([object()]))  # never unpickled
+    np.savez(path, identity=np.array([object()]))  # never unpickled
     with pytest.raises(UserError, match="cannot read"):
         weights.read(path, PARAMS, "mine")
 
