@@ -23,7 +23,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from experiments.common import config, results, run
-from leapjax import checkpoints, pretrained
+from leapjax import checkpoints, pretrained, weights
 from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import storage
@@ -35,7 +35,7 @@ from tests.test_storage import LEVEL, NAME, SIDE, assert_same
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
 MEBIBYTES = 512
-CASES = 600 if LONG else 25  # for each of seven kinds of input
+CASES = 600 if LONG else 25  # for each of eight kinds of input
 
 
 # The same cases every time.
@@ -311,10 +311,10 @@ SPECIFICATION = config.specify(
 def test_a_damaged_specification(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("run")
     pretrained.save_specification(folder, SPECIFICATION)
-    assert pretrained.read_specification(folder) == SPECIFICATION
+    assert pretrained.parse_specification(folder) == SPECIFICATION
     path = folder / pretrained.SPECIFICATION
     path.write_bytes(data.draw(changed_json(json.loads(path.read_text()))))
-    found = outcome(lambda: pretrained.read_specification(folder))
+    found = outcome(lambda: pretrained.parse_specification(folder))
     assert found is None or isinstance(found, pretrained.Specification)
 
 
@@ -396,7 +396,29 @@ def test_a_damaged_checkpoint(two_checkpoints, seed, whole_state):
             params = restored and restored.params
             assert restored is None or int(restored.step) in (1, 2)
         else:
+            sizes = outcome(lambda: checkpoints.check_identity(folder, ""))
+            assert sizes in (None, [30, 600])
             params = outcome(lambda: checkpoints.restore_params(folder, STATE.params))
         if params:  # not one bit of them is wrong
             for name, value in STATE.params.items():
                 np.testing.assert_array_equal(params[name], value)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """The bytes of a file of weights."""
+    path = tmp_path_factory.mktemp("published") / "weights.npz"
+    weights.write(path, STATE.params, "mine")
+    return path.read_bytes()
+
+
+@cases
+@given(seed=SEEDS)
+def test_damaged_weights(published, tmp_path_factory, seed):
+    path = tmp_path_factory.mktemp("damaged") / "weights.npz"
+    path.write_bytes(damaged(published, np.random.default_rng(seed)))
+    sizes = outcome(lambda: weights.check_identity(path, "mine"))
+    assert sizes is None or len(sizes) <= 2
+    params = outcome(lambda: weights.read(path, STATE.params, "mine"))
+    for name, value in STATE.params.items() if params else ():
+        np.testing.assert_allclose(params[name], value, rtol=1e-3)

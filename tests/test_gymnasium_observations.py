@@ -313,7 +313,7 @@ def test_statistics_are_kept_with_the_specification(tmp_path):
     assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before
     assert pretrained.identity(before) != pretrained.identity(after)
     pretrained.save_specification(tmp_path, after)
-    assert pretrained.read_specification(tmp_path) == after
+    assert pretrained.parse_specification(tmp_path) == after
     made = pretrained.make_domain(after).encoders["paper"](chosen.model, 0)
     assert made.statistics == after.statistics
     for wrong in [(), ((1.0,), (2.0,))], [((1.0, 1.0),)], [((2.0, 1.0),)], [((np.nan,),)], [((),)]:

@@ -20,7 +20,7 @@ from leapjax.data import seeds, storage
 from leapjax.data.seeds import UNSEEN
 from leapjax.data.storage import Described
 from leapjax.domain import Domain, blank_context
-from leapjax.domains import find_domain
+from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
 from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
@@ -163,6 +163,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     levels = find_domain(domain).levels
     data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
     level = chosen.level or (trained.level if trained else data.level or levels[0])
+    if not chosen.level:
+        check_imported(level, str(folder or chosen.demonstrations))
     if chosen.method == "all" and (folder is not None or chosen.pretrained):
         raise UserError("--method all: a planner that is trained already is of one method")
     configs = []

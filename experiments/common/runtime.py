@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import logging
 import os
 import platform
 import signal
@@ -13,6 +12,7 @@ from typing import NoReturn
 
 import jax
 
+from leapjax import files
 from leapjax.errors import UserError, first_line
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
@@ -61,10 +61,6 @@ def start(cluster: Cluster = Cluster()) -> None:
     """
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise UserError("leapjax computes in 32 bits: unset JAX_ENABLE_X64")
-    # Of a damaged checkpoint, or on a full disk, many parts fail at once. We say so in one line;
-    # asyncio and Orbax would log each of them that nobody asked for, with its traceback.
-    for name in ("asyncio", "absl"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
     use_every_core()
     use_compilation_cache()
     connect(cluster)
@@ -143,16 +139,17 @@ def use_compilation_cache() -> None:
     """Keeps compiled programs in the user's cache folder: a second start takes seconds.
 
     Programs are compiled for one processor, so each kind has its own folder.
-    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
+    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off". A compiled program is code that
+    this process will run: where others can write to the folder, it is not used.
     """
     choice = os.environ.get("LEAPJAX_COMPILATION_CACHE", "")
     if choice == "off":
         return
-    home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
-    folder = Path(choice) if choice else home / "leapjax" / "xla" / processor()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # JAX would say so at every program, with its traceback
+        folder = Path(choice) if choice else files.cache_folder() / "xla" / processor()
+        files.make_private(folder.absolute())
+    except UserError as error:  # JAX would say so at every program, with its traceback
+        print(f"compiled programs are not kept: {error}", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
