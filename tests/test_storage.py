@@ -368,11 +368,52 @@ def test_a_missing_part_of_an_episode(saved, minari_folder, field):
     refused()
 
 
-def test_no_episodes(saved, minari_folder):
-    path = minari_folder / NAME / "data" / "metadata.json"
-    metadata = json.loads(path.read_text())
-    path.write_text(json.dumps({**metadata, "total_episodes": 0, "total_steps": 0}))
+def test_no_episodes():
+    save([])
     assert "no episodes" in refused()
+
+
+@pytest.mark.parametrize(
+    ("announced", "says"),
+    [
+        ({"total_episodes": 4}, "4 episodes are announced, 5 are there"),
+        ({"total_episodes": 0, "total_steps": 0}, "0 episodes are announced, 5 are there"),
+        ({"total_steps": 1}, "1 steps are announced"),
+        ({"total_steps": None}, "None steps are announced"),
+    ],
+)
+def test_numbers_of_episodes_and_steps_that_are_not_so(saved, minari_folder, announced, says):
+    path = minari_folder / NAME / "data" / "metadata.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **announced}))
+    assert says in refused()
+
+
+@pytest.mark.parametrize("marks", ["terminations", "truncations"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda marks: np.arange(len(marks)) == 1, "ended with step 1, and it goes on to step"),
+        (lambda marks: np.ones_like(marks), "ended with step 0"),
+        (lambda marks: marks[:-1], "have shape"),
+        (lambda marks: np.append(marks, True), "have shape"),
+        (lambda marks: marks[-1], "have shape ()"),
+        (lambda marks: np.full(len(marks), np.nan), "must be true or false"),
+        (lambda marks: np.full(len(marks), 2), "must be true or false"),
+        (lambda marks: np.full(len(marks), b"yes"), "must be true or false"),
+    ],
+)
+def test_marks_of_the_end_that_contradict_the_episode(saved, minari_folder, marks, change, says):
+    with h5py.File(file_of(minari_folder)) as file:
+        before = file["episode_2"][marks][()]
+    replace(file_of(minari_folder), "episode_2", marks, change(before))
+    message = refused()
+    assert f"episode 2 of the Minari data set {NAME!r}: {marks}" in message and says in message
+
+
+def test_marks_of_the_end_in_numbers(saved, minari_folder):
+    ends = np.arange(len(saved[0].actions)) == len(saved[0].actions) - 1
+    replace(file_of(minari_folder), "episode_0", "terminations", ends.astype(np.float32))
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
 def test_another_level(saved):
