@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
+import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +49,8 @@ class Described(NamedTuple):
     wrappers: Sequence[Mapping[str, Any]] | None = None  # around it, the innermost first, each with
     # `name`, `entry_point` and `kwargs`; None: it does not say
     max_steps: int | None = None  # of an episode, by that environment
-    spaces: Mapping[str, str] = {}  # of its observations and actions, in JSON as Minari writes it
+    spaces: Mapping[str, gym.Space] = {}  # of each "observation" and "action", where it says more
+    # than shapes and types
 
 
 class Source(NamedTuple):

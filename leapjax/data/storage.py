@@ -94,9 +94,11 @@ def no_demonstrator(domain: Domain) -> str:
 def observation_space(blank: PyTree) -> gym.Space:
     """The Minari space of observations like `blank`: of their shapes and types."""
     if isinstance(blank, np.ndarray):
-        whole = np.issubdtype(blank.dtype, np.integer)
-        limits = np.iinfo(blank.dtype) if whole else None
-        low, high = (limits.min, limits.max) if limits else (-np.inf, np.inf)
+        low, high = -np.inf, np.inf
+        if blank.dtype == bool:
+            low, high = 0, 1
+        elif np.issubdtype(blank.dtype, np.integer):
+            low, high = np.iinfo(blank.dtype).min, np.iinfo(blank.dtype).max
         return gym.spaces.Box(low, high, blank.shape, blank.dtype.type)
     return gym.spaces.Dict({name: observation_space(x) for name, x in _fields(blank).items()})
 
@@ -261,7 +263,8 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         outlines = _inspect(folder)
     _check_arguments(name, domain)
     with _reading(name):
-        domain.check_recorded(described(name), f"the Minari data set {name!r}")
+        recorded = described(name)._replace(spaces=_spaces(folder, domain))
+        domain.check_recorded(recorded, f"the Minari data set {name!r}")
     for index, outline in enumerate(outlines):
         _check_outline(outline, domain, _place(index, name))
     with _reading(name):
@@ -389,10 +392,7 @@ def described(name: str) -> Described:
         count = metadata.get("total_episodes")
     except (OSError, ValueError, AttributeError, RecursionError):
         return Described()
-    spaces = {each: metadata[each] for each in SPACES if isinstance(metadata.get(each), str)}
-    known = Described(
-        episodes=count if isinstance(count, int) and count > 0 else None, spaces=spaces
-    )
+    known = Described(episodes=count if isinstance(count, int) and count > 0 else None)
     try:
         spec = json.loads(metadata["env_spec"])
         level, arguments, most = spec["id"], spec.get("kwargs"), spec.get("max_episode_steps")
@@ -406,6 +406,15 @@ def described(name: str) -> Described:
         wrappers=wrappers if listed else None,
         max_steps=most if isinstance(most, int) else None,
     )
+
+
+def _spaces(folder: Path, domain: Domain) -> dict[str, gym.Space]:
+    """The spaces of inspected data, but for one that `save` has made of shapes and types."""
+    metadata = _metadata(folder)
+    found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
+    if found["observation"] == observation_space(domain.blank):
+        del found["observation"]
+    return found
 
 
 def _inspect(folder: Path) -> list[PyTree]:
