@@ -23,11 +23,11 @@ from gymnasium.wrappers import (
 from minari import DataCollector
 
 from experiments import gymnasium as program
-from experiments.common import config, results
+from experiments.common import config, results, run
 from leapjax import domains
 from leapjax.data import storage, windows
 from leapjax.domain import Collection, Domain, blank_context
-from leapjax.environments import GymnasiumAdapter, Transition
+from leapjax.environments import Criterion, GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.gymnasium.observations import Part, StateTokens, blank_of, check_choices, parts_of
@@ -180,6 +180,95 @@ def test_success_is_what_the_environment_says_or_the_user():
     assert [adapter.step(0).truncated for _ in range(2)] == [False, True]
 
 
+def episode(rewards, terminated=True, truncated=False):
+    steps = len(rewards)
+    return Demonstration(
+        np.zeros(steps + 1), np.zeros(steps, np.int32), np.array(rewards, np.float32),
+        terminated, truncated, 0,
+    )  # fmt: skip
+
+
+def test_demonstrations_are_judged_as_episodes_that_are_played():
+    class Scripted(Corridor):
+        spec = None
+
+        def __init__(self, demonstration):
+            self.script = demonstration
+
+        def reset(self, *, seed=None, options=None):
+            self.place = self.count = 0
+            return self.seen(), {}
+
+        def step(self, action):
+            self.count += 1
+            d, last = self.script, self.count == len(self.script.rewards)
+            marks = last and d.terminated, last and d.truncated
+            return self.seen(), d.rewards[self.count - 1], *marks, {}
+
+    data = [
+        episode([1, 0, 0]), episode([0, 0, 1]), episode([5, -5, 1], False, True),
+        episode([-1, -1], False, True), episode([9, -9]),
+    ]  # fmt: skip
+    domain = make("Corridor-v0", Settings())
+    shares = {None: 1 / 5, 1.0: 3 / 5, 0.0: 4 / 5, -2.0: 1.0}
+    for least, share in shares.items():
+        criterion = Criterion(least, least is not None)
+        found = run.outcome(data, domain._replace(criterion=criterion))
+        assert found == {"success": share, "return": pytest.approx(0.2)}
+        played = []
+        for each in data:
+            adapter = GymnasiumAdapter(Scripted(each), least)
+            adapter.reset(0)
+            played.append([adapter.step(0).success for _ in each.rewards][-1])
+        assert np.mean(played) == share
+    assert run.outcome(data, domain._replace(criterion=None)) is None
+    assert run.outcome([], domain) is None
+
+
+def test_a_criterion_says_where_it_comes_from():
+    criteria = {
+        name: make(name, Settings(success_return=least)).criterion
+        for name, least in (("CartPole-v1", None), ("CartPole-v0", 3.0), ("Corridor-v0", None))
+    }
+    assert criteria["CartPole-v1"] == Criterion(475.0)
+    assert "475 (reward_threshold of the environment, meant" in str(criteria["CartPole-v1"])
+    assert str(criteria["CartPole-v0"]) == "a return of at least 3 (given)"
+    assert criteria["Corridor-v0"] == Criterion(None)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(UserError, match="success_return must be finite"):
+            make("CartPole-v1", Settings(success_return=wrong))
+
+
+def row_of(**more):
+    kinds = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
+    return {**kinds, "mean_return": 7.93, "paper_success": None, **more}
+
+
+def headers(*rows):
+    return [str(column.header) for column in results.success_table(rows).columns]
+
+
+def test_tables_show_the_return_first_where_nobody_has_said_what_success_is():
+    judged = {"criterion": "a return of at least 8 (x)", "data_success": 0.56, "data_return": 8.0}
+    found = row_of(**judged, criterion_given=False)
+    asked = row_of(**judged, criterion_given=True)
+    assert headers(row_of()) == headers(asked)
+    assert headers(row_of())[4:6] == ["success [95%]", "return"]
+    assert headers(asked, found)[4:6] == ["return", "success [95%]"]
+    table = results.success_table([found])
+    assert [next(iter(table.columns[n].cells)) for n in (4, 5)] == [
+        "7.93 (data: 8.00)",
+        f"{results.percent(found)} (data: 56.0%)",
+    ]
+    assert table.caption == "success: a return of at least 8 (x)"
+    assert results.success_table([row_of()]).caption is None
+    assert results.summary(found).startswith("mean return 7.93 (data: 8.00), success 100.0%")
+    assert results.summary(asked).startswith("success 100.0%")
+    assert results.summary(row_of()) == f"success {results.percent(found)}, mean length 1.0"
+    unknown = row_of(**{**judged, "data_return": None, "data_success": "x"}, criterion_given=False)
+    assert "data" not in results.summary(unknown)
+
+
 @pytest.mark.parametrize(
     ("level", "says"),
     [
@@ -246,7 +335,7 @@ def test_without_data_it_says_what_is_missing(tmp_path, monkeypatch, capsys):
     assert "Corridor-v0 has no demonstrator: name a Minari data set" in capsys.readouterr().err
 
 
-def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
+def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 4)
     (chosen,) = config.parse("gymnasium", ["--demonstrations", name])
@@ -255,6 +344,10 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
     assert program.main(["--dataset", name, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
+    assert (row["data_success"], row["data_return"], row["criterion_given"]) == (1.0, 1.0, False)
+    said = capsys.readouterr().out
+    assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(said.split())
+    assert "success: a positive reward at the end (nobody has named a return)" in said
     assert domains.find_domain("gymnasium") is GYMNASIUM
 
 
