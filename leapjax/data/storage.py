@@ -585,10 +585,19 @@ def _check_outline(outline: PyTree, domain: Domain, where: str) -> None:
         raise UserError(f"{where} has no actions")
     for part in STEPWISE[1:]:
         if np.shape(outline[part]) != steps:
-            raise UserError(f"{where}: {part} have shape {outline[part].shape}, expected {steps}")
-    if domain.replay is None:
-        observations = _like(domain.blank, outline["observations"], where)
+            raise UserError(
+                f"{where}: {part} have shape {np.shape(outline[part])}, expected {steps}"
+            )
+    stored = outline["observations"]
+    # Others may be played again.
+    if domain.replay is None or _holds_fields(domain.blank, stored):
+        observations = _like(domain.blank, stored, where)
         _check_shapes(observations, domain, steps[0] + 1, where)
+
+
+def _holds_fields(blank: PyTree, stored: Any) -> bool:
+    dictionaries = isinstance(stored, dict) and not isinstance(blank, np.ndarray)
+    return dictionaries and set(_fields(blank)) <= set(stored)
 
 
 def _check_total(folder: Path, outlines: Sequence[PyTree]) -> None:
