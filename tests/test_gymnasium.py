@@ -290,6 +290,7 @@ def test_environments_that_cannot_be_used_are_one_line(level, says, capsys):
     ("level", "says"),
     [
         ("CartPole-v9", "provides versioned environments"),
+        ("ALF/Pong-v5", "no ALF/ is registered: install the package that has it"),
         ("NoSuchFamily/Pong-v5", "no NoSuchFamily/ is registered: install the package that has it"),
         ("Broken-v0", "Box3D is not installed, run `pip install box3d`"),
         ("Absent-v0", "no module 'no_such_physics': install it"),

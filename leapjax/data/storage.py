@@ -514,12 +514,12 @@ def _outline(file: h5py.File, file_size: int) -> dict[str, Any]:
                 continue
             if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
                 raise ValueError(f"{name} is not an array of this file")
+            array = found[name] = np.broadcast_to(np.zeros((), item.dtype), item.shape)
             # gzip makes at most 1 byte of 1032.
-            if item.nbytes > 1032 * item.id.get_storage_size() + 1024:
-                raise ValueError(f"{name} claims {item.nbytes} bytes, which are not there")
-            if item.dtype.hasobject:
+            if array.nbytes > 1032 * item.id.get_storage_size() + 1024:
+                raise ValueError(f"{name} claims {array.nbytes} bytes, which are not there")
+            if array.dtype.hasobject:
                 _check_varying(item, name, file_size)
-            found[name] = np.broadcast_to(np.zeros((), item.dtype), item.shape)
     return outline
 
 

@@ -117,9 +117,7 @@ def _explain(name: str, error: Exception) -> str:
         return f"no {short!r} is registered{register}{did_you_mean(short, gym.registry)}"
     if isinstance(error, gym.error.NamespaceNotFound):
         namespace = short.partition("/")[0]
-        known = {spec.namespace for spec in gym.registry.values() if spec.namespace}
-        hint = did_you_mean(namespace, known)
-        return f"no {namespace}/ is registered: install the package that has it{register}{hint}"
+        return f"no {namespace}/ is registered: install the package that has it{register}"
     if isinstance(error, ModuleNotFoundError):  # Gymnasium's own holds Python's
         missing = error.name or getattr(error.__cause__, "name", None)
         if missing:
