@@ -18,7 +18,7 @@ import numpy as np
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
 from leapjax.models.trajectory import ModelConfig
-from leapjax.types import Context, Demonstration, Energy, PyTree, Window, plain_dicts
+from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
 
 Augmentation = Callable[[jax.Array, Window], Window]
 # (key, window) -> window: one training example as it could have been
@@ -156,7 +156,7 @@ class DomainType(NamedTuple):
 
 def blank_context(domain: Domain, length: int) -> Context:
     """A context with K = `length` of the right shapes, all zeros."""
-    blank = plain_dicts(domain.blank)
+    blank = to_plain_dicts(domain.blank)
     past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), blank)
     return Context(
         blank,

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import gymnasium as gym
 
 from leapjax.checks import check_number
-from leapjax.types import Array, PyTree, plain_dicts
+from leapjax.types import Array, PyTree, to_plain_dicts
 
 
 class Transition(NamedTuple):
@@ -57,7 +57,7 @@ class Eager(Protocol):
 
 
 class Criterion(NamedTuple):
-    """When an episode succeeds, of an environment without a measure of success.
+    """When an episode succeeds, in an environment that has no measure of success of its own.
 
     Attributes:
         least_return: that the episode has to reach; None: it has to terminate with a positive
@@ -138,7 +138,7 @@ class GymnasiumAdapter:
                 f"reset of {self.env} returned {type(found).__name__}, not (observation, info): "
                 "it is of Gym's old interface; wrap it for Gymnasium"
             )
-        return plain_dicts(found[0])
+        return to_plain_dicts(found[0])
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
@@ -146,4 +146,4 @@ class GymnasiumAdapter:
         reward = float(reward)
         self._return += reward
         success = judge_episode(self.criterion, self._return, reward, terminated, truncated)
-        return Transition(plain_dicts(observation), reward, terminated, truncated, success)
+        return Transition(to_plain_dicts(observation), reward, terminated, truncated, success)

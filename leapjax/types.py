@@ -16,12 +16,12 @@ Params = Any
 Array = Any  # a jax.Array inside a program, a NumPy array at its edges
 
 
-def plain_dicts(observation: PyTree) -> PyTree:
+def to_plain_dicts(observation: PyTree) -> PyTree:
     """Replaces mappings of any kind by dicts: to `jax.tree` each kind is another structure."""
     if isinstance(observation, Mapping):
-        return {key: plain_dicts(part) for key, part in observation.items()}
+        return {key: to_plain_dicts(part) for key, part in observation.items()}
     if isinstance(observation, tuple | list):  # which may hold mappings
-        return jax.tree.map(plain_dicts, observation, is_leaf=lambda x: isinstance(x, Mapping))
+        return jax.tree.map(to_plain_dicts, observation, is_leaf=lambda x: isinstance(x, Mapping))
     return observation
 
 

@@ -213,7 +213,7 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
     shares = {None: 1 / 5, 1.0: 3 / 5, 0.0: 4 / 5, -2.0: 1.0}
     for least, share in shares.items():
         criterion = Criterion(least, least is not None)
-        found = run.outcome(data, domain._replace(criterion=criterion))
+        found = run.judge_data(data, domain._replace(criterion=criterion))
         assert found == {"success": share, "return": pytest.approx(0.2)}
         played = []
         for each in data:
@@ -221,8 +221,8 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
             adapter.reset(0)
             played.append([adapter.step(0).success for _ in each.rewards][-1])
         assert np.mean(played) == share
-    assert run.outcome(data, domain._replace(criterion=None)) is None
-    assert run.outcome([], domain) is None
+    assert run.judge_data(data, domain._replace(criterion=None)) is None
+    assert run.judge_data([], domain) is None
 
 
 def test_a_criterion_says_where_it_comes_from():
@@ -262,11 +262,11 @@ def test_tables_show_the_return_first_where_nobody_has_said_what_success_is():
     ]
     assert table.caption == "success: a return of at least 8 (x)"
     assert results.success_table([row_of()]).caption is None
-    assert results.summary(found).startswith("mean return 7.93 (data: 8.00), success 100.0%")
-    assert results.summary(asked).startswith("success 100.0%")
-    assert results.summary(row_of()) == f"success {results.percent(found)}, mean length 1.0"
+    assert results.summarize(found).startswith("mean return 7.93 (data: 8.00), success 100.0%")
+    assert results.summarize(asked).startswith("success 100.0%")
+    assert results.summarize(row_of()) == f"success {results.percent(found)}, mean length 1.0"
     unknown = row_of(**{**judged, "data_return": None, "data_success": "x"}, criterion_given=False)
-    assert "data" not in results.summary(unknown)
+    assert "data" not in results.summarize(unknown)
 
 
 @pytest.mark.parametrize(

@@ -192,7 +192,7 @@ def run_one(
                 console.print(f"pictures: {folder}", highlight=False, markup=False)
 
         processes.first_does(write)
-    console.print(results.summary(row))
+    console.print(results.summarize(row))
     return row
 
 
@@ -223,13 +223,13 @@ def train(
     return run.fit(this, data, mesh, lambda: begun()(), watch)
 
 
-def judgement(this: Run) -> dict[str, Any]:
+def describe_success(this: Run) -> dict[str, Any]:
     """What success means in a row, and how well the data do by it, where that is not plain."""
     config, criterion = this.config, this.domain.criterion
     if criterion is None:
         return {}
     same = config.play in (None, config.level)
-    data = run.noted_outcome(config.checkpoint or this.folder) if same else None
+    data = run.read_outcome(config.checkpoint or this.folder) if same else None
     return {
         "criterion": str(criterion),
         "criterion_given": criterion.given,
@@ -271,7 +271,7 @@ def make_row(
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
         "paper_success": this.domain.paper_success.get(this.config.method),
-        **judgement(this),
+        **describe_success(this),
         "date": results.today(),
         "hash": name,
         "configuration": resolved(config, this.seed),

@@ -168,32 +168,32 @@ def percent(row: Row) -> str:
     return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
 
 
-def summary(row: Row) -> str:
+def summarize(row: Row) -> str:
     """What a run has come to, in one line."""
     paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
-    parts = [f"success {success_of(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
+    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
     if "criterion" not in row:
         return ", ".join(parts)
-    total = f"mean return {return_of(row)}"
+    total = f"mean return {format_return(row)}"
     parts.insert(1 if row["criterion_given"] else 0, total)
     return f"{', '.join(parts)}; success: {row['criterion']}"
 
 
-def success_of(row: Row) -> str:
+def format_success(row: Row) -> str:
     """A success rate, and that of the data where it is known."""
-    data = _number(row, "data_success")
+    data = _find_number(row, "data_success")
     return percent(row) + ("" if data is None else f" (data: {data:.1%})")
 
 
-def return_of(row: Row) -> str:
+def format_return(row: Row) -> str:
     """A mean return, and that of the data where it is known."""
-    mean, data = _number(row, "mean_return"), _number(row, "data_return")
+    mean, data = _find_number(row, "mean_return"), _find_number(row, "data_return")
     return ("-" if mean is None else f"{mean:.2f}") + (
         "" if data is None else f" (data: {data:.2f})"
     )
 
 
-def _number(row: Row, name: str) -> float | None:
+def _find_number(row: Row, name: str) -> float | None:
     """A number that a row need not have."""
     value = row.get(name)
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
@@ -217,7 +217,7 @@ def success_table(rows: Sequence[Row]) -> Table:
 
     The mean return comes first where a row's criterion of success was not given by the user.
     """
-    measures = {"success [95%]": success_of, "return": return_of}
+    measures = {"success [95%]": format_success, "return": format_return}
     if any("criterion" in row and not row.get("criterion_given") for row in rows):
         measures = dict(reversed(measures.items()))
     criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})

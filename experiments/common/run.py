@@ -218,7 +218,7 @@ def fit(
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
     steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
     named = windows.fingerprint(windows.unpadded(steps) if data else ())
-    check_data(folder, named, [each.seed for each in data], outcome(data, run.domain))
+    check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(steps, mesh)
@@ -287,7 +287,7 @@ def training_mesh(config: AnyConfig) -> Mesh:
         raise UserError(f"--batch, --fsdp: {error}") from None
 
 
-def outcome(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
+def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
     """How well demonstrations do, by the criterion that played episodes are judged by.
 
     None where the environment has a measure of its own, which demonstrations do not keep.
@@ -303,7 +303,7 @@ def outcome(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | N
     return {"success": float(np.mean(successes)), "return": float(np.mean(totals))}
 
 
-def noted_outcome(folder: Path) -> tuple[float, float] | None:
+def read_outcome(folder: Path) -> tuple[float, float] | None:
     """Success rate and mean return of the data that a run learned from, where it noted them."""
     found = noted_of(folder).get("outcome") if (folder / DATA).exists() else None
     values = [found.get(name) for name in ("success", "return")] if isinstance(found, dict) else []
@@ -320,7 +320,7 @@ def check_data(
     """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
 
     Notes what they are, their level seeds for `demonstrated`, and their outcome for
-    `noted_outcome`.
+    `read_outcome`.
 
     Raises:
         UserError: the run was begun on others, or processes have read different ones.

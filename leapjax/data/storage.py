@@ -263,10 +263,10 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         outlines = _inspect(folder)
     _check_arguments(name, domain)
     with _reading(name):
-        recorded = described(name)._replace(spaces=_spaces(folder, domain))
+        recorded = described(name)._replace(spaces=_read_spaces(folder, domain))
         domain.check_recorded(recorded, f"the Minari data set {name!r}")
     for index, outline in enumerate(outlines):
-        _check_outline(outline, domain, _place(index, name))
+        _check_outline(outline, domain, _name_episode(index, name))
     with _reading(name):
         _check_total(folder, outlines)
     _check_memory(name, outlines[:most], domain)
@@ -275,7 +275,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     for episode, seed in _episodes(name):
         if most is not None and len(found) >= most:
             break
-        result = _demonstration(episode, seed, domain, _place(episode.id, name))
+        result = _demonstration(episode, seed, domain, _name_episode(episode.id, name))
         if isinstance(result, str):
             dropped[result] += 1
         else:
@@ -287,7 +287,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     return collection
 
 
-def _place(episode: int, name: str) -> str:
+def _name_episode(episode: int, name: str) -> str:
     return f"episode {episode} of the Minari data set {name!r}"
 
 
@@ -357,7 +357,7 @@ def _demonstration(
     actions = _actions(episode.actions, where)
     rewards = _rewards(episode.rewards, where)
     terminated, truncated = (
-        _mark(getattr(episode, marks), f"{where}: {marks}") for marks in STEPWISE[2:]
+        _read_mark(getattr(episode, marks), f"{where}: {marks}") for marks in STEPWISE[2:]
     )
     if domain.replay is not None:
         again = domain.replay(
@@ -408,9 +408,9 @@ def described(name: str) -> Described:
     )
 
 
-def _spaces(folder: Path, domain: Domain) -> dict[str, gym.Space]:
+def _read_spaces(folder: Path, domain: Domain) -> dict[str, gym.Space]:
     """The spaces of inspected data, but for one that `save` has made of shapes and types."""
-    metadata = _metadata(folder)
+    metadata = _read_metadata(folder)
     found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
     if found["observation"] == observation_space(domain.blank):
         del found["observation"]
@@ -430,7 +430,7 @@ def _inspect(folder: Path) -> list[PyTree]:
     Raises:
         ValueError: says what.
     """
-    metadata = _metadata(folder)
+    metadata = _read_metadata(folder)
     if metadata.get("data_format") != "hdf5":
         raise ValueError(f"its format is {metadata.get('data_format')!r}, expected 'hdf5'")
     for name in SPACES:
@@ -458,7 +458,7 @@ def _inspect(folder: Path) -> list[PyTree]:
     return episodes
 
 
-def _metadata(folder: Path) -> dict[str, Any]:
+def _read_metadata(folder: Path) -> dict[str, Any]:
     metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
     if not isinstance(metadata, dict):
         raise ValueError("metadata.json is not a JSON object")
@@ -607,7 +607,7 @@ def _check_total(folder: Path, outlines: Sequence[PyTree]) -> None:
         ValueError: says how long they are.
     """
     steps = sum(len(outline["actions"]) for outline in outlines)
-    announced = _metadata(folder).get("total_steps")
+    announced = _read_metadata(folder).get("total_steps")
     if announced != steps:
         raise ValueError(f"{announced} steps are announced, {steps} are there")
 
@@ -640,7 +640,7 @@ def _rewards(values: Any, where: str) -> np.ndarray:
     return _narrowed(np.zeros((), np.float32), rewards, f"{where}: rewards")
 
 
-def _mark(marks: Any, what: str) -> bool:
+def _read_mark(marks: Any, what: str) -> bool:
     """How an episode ended, from a mark `[n]` for each of its steps.
 
     Raises:

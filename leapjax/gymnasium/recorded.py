@@ -51,27 +51,26 @@ def check_recorded(recorded: Described, where: str, played: Described) -> None:
     """
     level = played.level
     if recorded.wrappers is not None and played.wrappers is not None:
-        theirs, ours = _changing(recorded.wrappers), _changing(played.wrappers)
+        theirs, ours = _select_changing(recorded.wrappers), _select_changing(played.wrappers)
         if theirs != ours:
             raise UserError(
-                f"{where} was recorded with {_listed(theirs)}, and {level} is played with "
-                f"{_listed(ours)}: write a module that registers {level} with the wrappers of the "
-                "data (gymnasium.register, additional_wrappers), and give --level "
-                f"MODULE:{level}"
+                f"{where} was recorded with {_list_wrappers(theirs)}, and {level} is played with "
+                f"{_list_wrappers(ours)}: write a module that registers {level} with the wrappers "
+                f"of the data (gymnasium.register, additional_wrappers), and play MODULE:{level}"
             )
     if None not in (recorded.max_steps, played.max_steps) and (
         recorded.max_steps != played.max_steps
     ):
         raise UserError(
             f"{where} was recorded with episodes of at most {recorded.max_steps} steps, and "
-            f"{level} ends them after {played.max_steps}: choose one with --max-steps"
+            f"{level} ends them after {played.max_steps}: choose one as max_steps"
         )
     for part, space in played.spaces.items():
         if part in recorded.spaces:
             _check_space(recorded.spaces[part], space, part, where, level)
 
 
-def _changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
+def _select_changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
     """Name and arguments of each wrapper that changes what is observed, rewarded or done."""
     return [
         (each.get("name"), each.get("kwargs"))
@@ -83,7 +82,7 @@ def _changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
     ]
 
 
-def _listed(wrappers: Sequence[tuple[Any, Any]]) -> str:
+def _list_wrappers(wrappers: Sequence[tuple[Any, Any]]) -> str:
     names = [f"{name} {json.dumps(kwargs)}" if kwargs else str(name) for name, kwargs in wrappers]
     return f"the wrappers {', '.join(names)}" if names else "no wrappers"
 
