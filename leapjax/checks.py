@@ -126,7 +126,7 @@ def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
     if array.dtype.kind not in "biuf":
         raise UserError(f"{name}: numbers expected, got {array.dtype}")
     with np.errstate(over="ignore", invalid="ignore"):
-        narrow = array.astype(dtype)
+        narrow = array.astype(dtype, copy=False)
     wrong = ~np.isfinite(narrow) if narrow.dtype.kind == "f" else narrow != array
     if wrong.any():
         raise UserError(

@@ -4,7 +4,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import gymnasium as gym
 
-from leapjax.types import Array, PyTree
+from leapjax.checks import check_number
+from leapjax.types import Array, PyTree, to_plain_dicts
 
 
 class Transition(NamedTuple):
@@ -55,6 +56,62 @@ class Eager(Protocol):
         ...
 
 
+class Criterion(NamedTuple):
+    """When an episode succeeds, in an environment that has no measure of success of its own.
+
+    Attributes:
+        least_return: that the episode has to reach; None: it has to terminate with a positive
+            reward.
+        given: by the user; otherwise by the environment's `reward_threshold`, or by nobody.
+    """
+
+    least_return: float | None
+    given: bool = False
+
+    def __str__(self) -> str:
+        """In words, with where it comes from."""
+        if self.least_return is None:
+            return "a positive reward at the end (nobody has named a return)"
+        origin = "given"
+        if not self.given:
+            origin = "reward_threshold of the environment, meant for the mean over episodes"
+        return f"a return of at least {self.least_return:g} ({origin})"
+
+
+def find_criterion(env: gym.Env, success_return: float | None = None) -> Criterion:
+    """Chooses when an episode of an environment succeeds.
+
+    Args:
+        env: whose authors may ask for a return (`reward_threshold`).
+        success_return: that the user asks for; None: what the authors ask for.
+
+    Raises:
+        UserError: `success_return` is not a finite number.
+    """
+    if success_return is not None:
+        return Criterion(check_number("success_return", success_return), given=True)
+    return Criterion(env.spec.reward_threshold if env.spec is not None else None)
+
+
+def judge_episode(
+    criterion: Criterion, total: float, reward: float, terminated: bool, truncated: bool
+) -> bool:
+    """Says whether an episode has succeeded so far.
+
+    Args:
+        criterion: to judge by.
+        total: the episode's return so far.
+        reward: of its last step.
+        terminated: with its last step.
+        truncated: with its last step.
+    """
+    if criterion.least_return is None:
+        return bool(terminated and reward > 0)
+    # So far, for who ends it early; but what is lost on the way is known at the end alone.
+    over = terminated or truncated or criterion.least_return > 0
+    return bool(over and total >= criterion.least_return)
+
+
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
@@ -69,8 +126,7 @@ class GymnasiumAdapter:
         self.env = env
         self.num_actions = int(env.action_space.n) + 1
         self._first_action = int(env.action_space.start)
-        asked = env.spec.reward_threshold if env.spec is not None else None
-        self._threshold = asked if success_return is None else success_return
+        self.criterion = find_criterion(env, success_return)
         self._return = 0.0
 
     def reset(self, seed: int) -> PyTree:
@@ -82,17 +138,12 @@ class GymnasiumAdapter:
                 f"reset of {self.env} returned {type(found).__name__}, not (observation, info): "
                 "it is of Gym's old interface; wrap it for Gymnasium"
             )
-        return found[0]
+        return to_plain_dicts(found[0])
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
         observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
         reward = float(reward)
         self._return += reward
-        if self._threshold is None:
-            success = terminated and reward > 0
-        else:
-            # So far, for who ends it early; but what is lost on the way is known at the end alone.
-            over = terminated or truncated or self._threshold > 0
-            success = over and self._return >= self._threshold
-        return Transition(observation, reward, terminated, truncated, bool(success))
+        success = judge_episode(self.criterion, self._return, reward, terminated, truncated)
+        return Transition(to_plain_dicts(observation), reward, terminated, truncated, success)

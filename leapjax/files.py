@@ -198,6 +198,26 @@ def check_room(folder: Path, needed: int) -> None:
         )
 
 
+def check_memory(needed: int, what: str) -> None:
+    """Refuses what is larger than the memory of this machine, where the system says how much it is.
+
+    Args:
+        needed: bytes, at least.
+        what: needs them.
+
+    Raises:
+        UserError: says how much would be needed.
+    """
+    if not hasattr(os, "sysconf"):  # Windows does not say
+        return
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > memory:
+        raise UserError(
+            f"{what} would need {needed / 2**30:.1f} GiB of memory at least, and this machine has "
+            f"{memory / 2**30:.1f}"
+        )
+
+
 def check_writable(folder: Path) -> None:
     """Refuses a folder in which no file could be made, whether it is there already or not.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
 from leapjax.environments import Adapter, Eager
-from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token
+from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token, to_plain_dicts
 
 
 class Episodes(NamedTuple):
@@ -138,7 +138,7 @@ def check_actions(of: str, planned: int, possible: int) -> None:
 
 def _copy(observation: PyTree) -> PyTree:
     """Environments may write the next observation into the arrays of the last."""
-    return jax.tree.map(np.array, observation)
+    return jax.tree.map(np.array, to_plain_dicts(observation))
 
 
 def kept(plans: Plan, executed: int | None) -> Array | None:

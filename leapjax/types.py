@@ -5,7 +5,7 @@ horizon), K past steps in a context, N planning iterations, P positions resample
 together, A actions (the end action included).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +14,15 @@ import jax.numpy as jnp
 PyTree = Any
 Params = Any
 Array = Any  # a jax.Array inside a program, a NumPy array at its edges
+
+
+def to_plain_dicts(observation: PyTree) -> PyTree:
+    """Replaces mappings of any kind by dicts: to `jax.tree` each kind is another structure."""
+    if isinstance(observation, Mapping):
+        return {key: to_plain_dicts(part) for key, part in observation.items()}
+    if isinstance(observation, tuple | list):  # which may hold mappings
+        return jax.tree.map(to_plain_dicts, observation, is_leaf=lambda x: isinstance(x, Mapping))
+    return observation
 
 
 class Context(NamedTuple):

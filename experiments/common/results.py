@@ -168,6 +168,37 @@ def percent(row: Row) -> str:
     return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
 
 
+def summarize(row: Row) -> str:
+    """What a run has come to, in one line."""
+    paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
+    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
+    if "criterion" not in row:
+        return ", ".join(parts)
+    total = f"mean return {format_return(row)}"
+    parts.insert(1 if row["criterion_given"] else 0, total)
+    return f"{', '.join(parts)}; success: {row['criterion']}"
+
+
+def format_success(row: Row) -> str:
+    """A success rate, and that of the data where it is known."""
+    data = _find_number(row, "data_success")
+    return percent(row) + ("" if data is None else f" (data: {data:.1%})")
+
+
+def format_return(row: Row) -> str:
+    """A mean return, and that of the data where it is known."""
+    mean, data = _find_number(row, "mean_return"), _find_number(row, "data_return")
+    return ("-" if mean is None else f"{mean:.2f}") + (
+        "" if data is None else f" (data: {data:.2f})"
+    )
+
+
+def _find_number(row: Row, name: str) -> float | None:
+    """A number that a row need not have."""
+    value = row.get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def planner_name(row: Row) -> str:
     """How a row's plans were found, as far as it says."""
     configuration = row.get("configuration", {})
@@ -182,9 +213,18 @@ def planner_name(row: Row) -> str:
 
 
 def success_table(rows: Sequence[Row]) -> Table:
-    """Success rates beside the paper's."""
-    columns = ("level", "method", "planner", "seed", "success [95%]", "return", "length", "paper")
-    result = Table(*columns)
+    """Success rates beside the paper's.
+
+    The mean return comes first where a row's criterion of success was not given by the user.
+    """
+    measures = {"success [95%]": format_success, "return": format_return}
+    if any("criterion" in row and not row.get("criterion_given") for row in rows):
+        measures = dict(reversed(measures.items()))
+    criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})
+    result = Table(
+        *("level", "method", "planner", "seed", *measures, "length", "paper"),
+        caption="\n".join(criteria) or None,
+    )
     for row in rows:
         paper = row.get("paper_success")
         result.add_row(
@@ -192,8 +232,7 @@ def success_table(rows: Sequence[Row]) -> Table:
             f"{row['method']} ({row['preset']})",
             planner_name(row),
             str(row["seed"]),
-            percent(row),
-            f"{row['mean_return']:.2f}" if "mean_return" in row else "-",
+            *(measure(row) for measure in measures.values()),
             f"{row['mean_length']:.1f}",
             "-" if paper is None else f"{paper:.1f}%",
         )

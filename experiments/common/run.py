@@ -12,7 +12,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +34,7 @@ from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
 from leapjax.domain import Domain, Source, apply_statistics, blank_context
 from leapjax.energy import compose
+from leapjax.environments import judge_episode
 from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
@@ -227,7 +228,7 @@ def fit(
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
     steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
     named = windows.fingerprint(windows.unpadded(steps) if data else ())
-    check_data(folder, named, [each.seed for each in data])
+    check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(steps, mesh)
@@ -296,10 +297,40 @@ def training_mesh(config: AnyConfig) -> Mesh:
         raise UserError(f"--batch, --fsdp: {error}") from None
 
 
-def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> None:
+def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
+    """How well demonstrations do, by the criterion that played episodes are judged by.
+
+    None where the environment has a measure of its own, which demonstrations do not keep.
+    """
+    criterion = domain.criterion
+    if criterion is None or not data:
+        return None
+    totals = [float(np.sum(d.rewards, dtype=np.float64)) for d in data]
+    successes = [
+        judge_episode(criterion, total, float(d.rewards[-1]), d.terminated, d.truncated)
+        for total, d in zip(totals, data, strict=True)
+    ]
+    return {"success": float(np.mean(successes)), "return": float(np.mean(totals))}
+
+
+def read_outcome(folder: Path) -> tuple[float, float] | None:
+    """Success rate and mean return of the data that a run learned from, where it noted them."""
+    found = noted_of(folder).get("outcome") if (folder / DATA).exists() else None
+    values = [found.get(name) for name in ("success", "return")] if isinstance(found, dict) else []
+    numbers = [float(each) for each in values if isinstance(each, float) and math.isfinite(each)]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+
+
+def check_data(
+    folder: Path,
+    fingerprint: str,
+    level_seeds: Sequence[int],
+    outcome: Mapping[str, Any] | None = None,
+) -> None:
     """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
 
-    Notes what they are, and their level seeds, for `demonstrated`.
+    Notes what they are, their level seeds for `demonstrated`, and their outcome for
+    `read_outcome`.
 
     Raises:
         UserError: the run was begun on others, or processes have read different ones.
@@ -312,7 +343,8 @@ def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> No
 
     def check() -> None:
         if not (folder / DATA).exists():
-            noted = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            noted: dict[str, Any] = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            noted |= {} if outcome is None else {"outcome": outcome}
             return files.write_text(folder / DATA, json.dumps(noted))
         before = noted_of(folder).get("fingerprint")
         if before != fingerprint:

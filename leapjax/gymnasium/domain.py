@@ -13,7 +13,7 @@ import numpy as np
 
 from leapjax.checks import check_at_least, check_fits
 from leapjax.domain import Domain, DomainType, Statistics
-from leapjax.environments import GymnasiumAdapter, Transition
+from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
 from leapjax.gymnasium.observations import (
     StateTokens,
@@ -24,6 +24,7 @@ from leapjax.gymnasium.observations import (
     measure_parts,
     parts_of,
 )
+from leapjax.gymnasium.recorded import check_recorded, describe_environment
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
@@ -82,7 +83,6 @@ class CheckedAdapter(GymnasiumAdapter):
             ) from error
 
     def _checked(self, observation: Any) -> PyTree:
-        observation = _plain(observation)
         shapes = jax.tree.map(np.shape, observation)
         if shapes != self._shapes:
             raise UserError(
@@ -99,13 +99,6 @@ class CheckedAdapter(GymnasiumAdapter):
         return narrow
 
 
-def _plain(observation: Any) -> PyTree:
-    """Dicts of any kind as plain ones: to `jax.tree` each kind is another structure."""
-    if isinstance(observation, dict):
-        return {key: _plain(part) for key, part in observation.items()}
-    return observation
-
-
 def make_environment(name: str, options: Settings) -> gym.Env:
     """An environment by its id, or by `module:id`, cut off after `max_steps`.
 
@@ -115,9 +108,8 @@ def make_environment(name: str, options: Settings) -> gym.Env:
     try:
         env = gym.make(name, options.max_steps, **json.loads(options.arguments))
     except Exception as error:  # noqa: BLE001  (it is anybody's code)
-        hint = did_you_mean(name, gym.registry)
         raise UserError(
-            f"the environment {name!r} cannot be made: {first_line(error)}{hint}"
+            f"the environment {name!r} cannot be made: {_explain(name, error)}"
         ) from None
     if _longest(env) is None:
         raise UserError(
@@ -125,6 +117,27 @@ def make_environment(name: str, options: Settings) -> gym.Env:
             "--max-steps"
         )
     return env
+
+
+def _explain(name: str, error: Exception) -> str:
+    """Says why an environment cannot be made, and what to do where that is known.
+
+    Other names are proposed only where the name is what is wrong.
+    """
+    module, _, short = name.rpartition(":")
+    register = "" if module else f"; if a module registers it, give MODULE:{name}"
+    if ":" in module:
+        return "expected its id, or MODULE:ID"
+    if isinstance(error, gym.error.NameNotFound):
+        return f"no {short!r} is registered{register}{did_you_mean(short, gym.registry)}"
+    if isinstance(error, gym.error.NamespaceNotFound):
+        namespace = short.partition("/")[0]
+        return f"no {namespace}/ is registered: install the package that has it{register}"
+    if isinstance(error, ModuleNotFoundError):  # Gymnasium's own holds Python's
+        missing = error.name or getattr(error.__cause__, "name", None)
+        if missing:
+            return f"no module {missing!r}: install it, or put its folder on PYTHONPATH"
+    return first_line(error)
 
 
 def _longest(env: gym.Env) -> int | None:
@@ -150,6 +163,9 @@ def make(name: str, options: Settings) -> Domain:
     if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
         raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
     space = env.observation_space
+    played = describe_environment(env)
+    if options.max_steps is not None:  # the user has chosen
+        played = played._replace(max_steps=None)
     blank, parts = blank_of(space, f"the observation of {name}"), parts_of(space)
 
     def check(observations: PyTree, where: str) -> None:
@@ -181,6 +197,8 @@ def make(name: str, options: Settings) -> Domain:
         blank=blank,
         check=check,
         arguments=_arguments(env),
+        check_recorded=functools.partial(check_recorded, played=played),
+        criterion=find_criterion(env, options.success_return),
         encoders=encoders(()),
         measure=functools.partial(measure_parts, parts),
         with_statistics=with_statistics,
