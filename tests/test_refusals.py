@@ -218,7 +218,7 @@ def test_a_training_curve_of_no_numbers(workplace):
 
 
 def test_the_report_where_there_are_no_rows(workplace, capsys):
-    assert report.main() == 2
+    assert report.main([]) == 2
     assert capsys.readouterr().err.startswith("error: cannot read")
 
 
@@ -296,6 +296,33 @@ def test_no_device_is_one_line(monkeypatch):
         UserError, match=r"no device with .*JAX_PLATFORMS=cuda.* \(AssertionError\)"
     ):
         runtime.check_devices()
+
+
+@only_long
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("JAX_NUM_CPU_DEVICES", "abc"), ("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_DEVICE", "cuda")],
+)
+@pytest.mark.parametrize("program", ["experiments", "experiments.stars", "benchmarks.planning"])
+def test_a_setting_that_jax_refuses_is_one_line(program, setting, value):
+    done = subprocess.run(
+        [sys.executable, "-m", program, "--help"], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, setting: value}, check=False,
+    )  # fmt: skip
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2 and line.startswith("error: cannot import JAX with ")
+    assert f"{setting}={value}" in line
+
+
+@only_long
+def test_a_terminal_of_ascii_shows_what_it_can():
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.stars", "--level", "St\u00e4r \u00b1"],
+        capture_output=True, cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"error: unknown level 'St?r ?': expected")
 
 
 @pytest.mark.parametrize("count", ["", " ", "many"])

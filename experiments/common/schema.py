@@ -63,10 +63,10 @@ def loads(text: str) -> Any:
     """The value of a JSON text.
 
     Raises:
-        ValueError: it is not JSON: NaN is not, and an object has a name once.
+        ValueError: it is not JSON, or an object names a field twice.
         RecursionError: it is nested too deeply.
     """
-    return json.loads(text, object_pairs_hook=_object, parse_constant=_no_number)
+    return json.loads(text, object_pairs_hook=_object)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -76,10 +76,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"an object names {twice!r} twice")
     return found
-
-
-def _no_number(text: str) -> Any:
-    raise ValueError(f"{text} is no number of JSON")
 
 
 def problem(value: Any, schema: Schema, name: str = "") -> str | None:
