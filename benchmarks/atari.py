@@ -79,7 +79,7 @@ def run(options: Options) -> None:
     if options.training_json and not options.training:
         raise UserError("--training-json with --no-training: there are no rows to write; drop one")
     check_writable(options.json, options.training_json)
-    runtime.use_every_core()  # and no compilation cache: compile times are real
+    runtime.start(cache=False)  # compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [
         with_options(preset("atari", game, "leap", name), {"max_steps": 1000})

@@ -32,6 +32,16 @@ def parse(*arguments):
     return found
 
 
+def test_options_of_training_are_not_for_methods_that_learn_nothing():
+    found = config.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
+    steps = {each.method: each.training.steps for each in found}
+    assert steps.pop("random") == 0 and set(steps.values()) == {5}
+    with pytest.raises(UserError, match="got 0: --steps 5 needs demonstrations"):
+        parse("--method", "random", "--steps", "5")
+    with pytest.raises(UserError, match="got -1: --steps 5 needs demonstrations"):
+        parse("--demos", "-1", "--steps", "5")
+
+
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {

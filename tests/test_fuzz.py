@@ -6,6 +6,7 @@ thousands of cases; the suite tries some.
 
 import contextlib
 import copy
+import functools
 import io
 import json
 import resource
@@ -22,7 +23,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experiments.common import config, results, run
+from experiments import report
+from experiments.common import analysis, config, results, run
+from experiments.tables import measured
 from leapjax import checkpoints, pretrained, weights
 from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
@@ -30,7 +33,7 @@ from leapjax.data import storage
 from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import LONG
+from tests.programs import LONG, ROOT
 from tests.test_storage import LEVEL, NAME, SIDE, assert_same
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
@@ -271,18 +274,96 @@ def test_the_data_set_as_it_was(data_set, local_demonstrations):
 
 # Rows, the training curve, what a checkpoint says of itself.
 
+SOURCES = [*report.EXPERIMENTS, *report.MEASURED]
+VALUES_OF_FIELDS = [
+    None, True, "", "x", "paper", -1, 0, 2, 1.5, -0.5, 1e300, 10**40, float("nan"), float("inf"),
+    [], {}, [1], {"x": 1},
+]  # fmt: skip
+GONE = object()  # instead of a value: the field is removed
+
+
+@pytest.fixture(scope="module")
+def few_results(tmp_path_factory):
+    """A folder with some of the committed rows of each experiment, and all measurements."""
+    root = tmp_path_factory.mktemp("results")
+    (root / "results").mkdir()
+    for name in report.EXPERIMENTS:
+        lines = (ROOT / "results" / f"{name}.jsonl").read_text().splitlines()
+        kept = [line for line in lines[:: len(lines) // 8] if report.is_used(json.loads(line))]
+        assert len(kept) > 2
+        (root / "results" / f"{name}.jsonl").write_text("\n".join(kept[:3]))
+    for name in report.MEASURED:
+        shutil.copy(ROOT / "results" / f"{name}.json", root / "results")
+    return root
+
+
+def tables_of(root, name, rows):
+    """Every table that is made from one of the sources, for documents and for a terminal."""
+    if name in report.MEASURED:
+        rows = {**rows, name: measured.read(root / "results" / f"{name}.json")}
+    else:
+        rows = {**rows, name: report.rows_of(root, name)}
+        shown = analysis.table if name in report.ANALYSES else results.success_table
+        assert shown(rows[name]).row_count == results.time_table(rows[name]).row_count
+        assert all(isinstance(report.is_used(row), bool) for row in rows[name])
+    rows["puzzles"] = [row for puzzle in report.PUZZLES for row in rows[puzzle]]
+    sections = report.sections_of(rows)
+    return {section: make(rows[source]) for section, (make, source) in sections.items()
+            if source == name or (source == "puzzles" and name in report.PUZZLES)
+            or (section, name) in (("price", "methods"), ("atari", "atari-data"))}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_tables_of_damaged_rows(few_results, tmp_path, name):
+    """Each field of a real row becomes each of many values: there is a table, or one line."""
+    whole = report.rows_by_source(few_results)
+    assert tables_of(few_results, name, whole)
+    suffix = "json" if name in report.MEASURED else "jsonl"
+    text = (few_results / "results" / f"{name}.{suffix}").read_text()
+    original = json.loads(text) if suffix == "json" else json.loads(text.splitlines()[0])
+    rest = [] if suffix == "json" else text.splitlines()[1:]
+    changes = [(path, value) for path in places(original) if path
+               for value in (*VALUES_OF_FIELDS, GONE)]  # fmt: skip
+    rng = np.random.default_rng(SOURCES.index(name))
+    fields = [change for change in changes if len(change[0]) < 3]  # of rows; most are deep in one
+    chosen = [fields[i] for i in rng.choice(len(fields), CASES // 2)]
+    chosen += [changes[i] for i in rng.choice(len(changes), CASES // 2)]
+    root = tmp_path / "damaged"
+    (root / "results").mkdir(parents=True)
+    refused = 0
+    for path, value in chosen:
+        changed = copy.deepcopy(original)
+        parent = functools.reduce(lambda part, key: part[key], path[:-1], changed)
+        if value is GONE:
+            del parent[path[-1]]
+        else:
+            parent[path[-1]] = value
+        line = json.dumps(changed)
+        (root / "results" / f"{name}.{suffix}").write_text("\n".join([line, *rest]))
+        try:
+            refused += outcome(functools.partial(tables_of, root, name, whole)) is None
+        except Exception as error:
+            raise AssertionError(f"{name}: {path} = {value!r}") from error
+    assert refused  # they do reach what tables read
+
+
 ROW = {
     **{name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()},
     "paper_success": 95.0,
-    "configuration": {"level": "GoToLocalS7N5", "betas": [0.9, 0.95], "demonstrations": None},
+    "configuration": {
+        "level": "GoToLocalS7N5",
+        "betas": [0.9, 0.95],
+        "planner": {"fill": "margin"},
+    },
 }
 
 
 @cases
 @given(data=st.data())
-def test_damaged_rows(tmp_path_factory, data):
+def test_damaged_lines(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("rows") / "rows.jsonl"
-    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(ROW)) + b"\n")
+    other = {**ROW, "hash": "y"}
+    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(other)) + b"\n")
     rows = outcome(lambda: results.read(path))
     if rows is not None:
         for table in (results.success_table, results.time_table):

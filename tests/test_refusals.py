@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -438,7 +439,7 @@ def test_a_training_curve_of_no_numbers(workplace):
 
 
 def test_the_report_where_there_are_no_rows(workplace, capsys):
-    assert report.main() == 2
+    assert report.main([]) == 2
     assert capsys.readouterr().err.startswith("error: cannot read")
 
 
@@ -458,12 +459,91 @@ def test_a_temperature_at_which_noise_is_no_number(temperature, capsys):
     assert "a temperature must be in 0 .. 1e+30" in one_line(capsys, "--temperature", temperature)
 
 
-def test_numbers_of_64_bits_are_refused():
-    with (
-        jax.enable_x64(True),
-        pytest.raises(UserError, match="unset JAX_ENABLE_X64"),
-    ):
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("jax_enable_x64", True),
+        ("jax_explicit_x64_dtypes", "allow"),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_threefry_partitionable", False),
+        ("jax_random_seed_offset", 5),
+        ("jax_high_dynamic_range_gumbel", True),
+        ("jax_default_matmul_precision", "bfloat16"),
+        ("jax_softmax_custom_jvp", True),
+        ("jax_disable_jit", True),
+        ("jax_no_tracing", True),
+        ("jax_no_execution", True),
+        ("jax_allow_f16_reductions", False),
+        ("jax_numpy_dtype_promotion", "strict"),
+        ("jax_numpy_rank_promotion", "raise"),
+        ("jax_debug_infs", True),
+        ("jax_default_device", "cpu"),
+        ("jax_transfer_guard_host_to_device", "disallow"),
+    ],
+)
+def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
+    monkeypatch.setattr(runtime, "connect", lambda cluster: pytest.fail("went on"))
+    before = getattr(jax.config, setting)
+    jax.config.update(setting, value)
+    try:
+        with pytest.raises(UserError, match=f"{setting} is .*unset {setting.upper()}, or use"):
+            runtime.start()
+    finally:
+        jax.config.update(setting, before)
+
+
+def test_settings_of_jax_that_break_nothing(monkeypatch):
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+    with jax.debug_nans(True), jax.numpy_rank_promotion("warn"), jax.log_compiles(True):
         runtime.start()
+
+
+@pytest.mark.parametrize("count", [0, -2, 10**6])
+def test_a_number_of_devices_that_cannot_be_made(count, monkeypatch):
+    monkeypatch.setattr(
+        runtime, "jax", SimpleNamespace(config=SimpleNamespace(jax_num_cpu_devices=count))
+    )
+    with pytest.raises(UserError, match=f"JAX_NUM_CPU_DEVICES is {count}: expected a number in 1"):
+        runtime.use_every_core()
+
+
+def test_no_device_is_one_line(monkeypatch):
+    def fail():
+        raise AssertionError  # as JAX does where JAX_PLATFORMS is cuda and no plugin is installed
+
+    monkeypatch.setattr(runtime.jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    with pytest.raises(
+        UserError, match=r"no device with .*JAX_PLATFORMS=cuda.* \(AssertionError\)"
+    ):
+        runtime.check_devices()
+
+
+@only_long
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("JAX_NUM_CPU_DEVICES", "abc"), ("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_DEVICE", "cuda")],
+)
+@pytest.mark.parametrize("program", ["experiments", "experiments.stars", "benchmarks.planning"])
+def test_a_setting_that_jax_refuses_is_one_line(program, setting, value):
+    done = subprocess.run(
+        [sys.executable, "-m", program, "--help"], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, setting: value}, check=False,
+    )  # fmt: skip
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2 and line.startswith("error: cannot import JAX with ")
+    assert f"{setting}={value}" in line
+
+
+@only_long
+def test_a_terminal_of_ascii_shows_what_it_can():
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.stars", "--level", "St\u00e4r \u00b1"],
+        capture_output=True, cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"error: unknown level 'St?r ?': expected")
 
 
 @pytest.mark.parametrize("count", ["", " ", "many"])

@@ -182,6 +182,9 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
             if trained and (trained.domain, trained.method) == (domain, one):
                 default = _as_trained(default, trained)
             given = _parse(arguments, default)
+            if method == "all" and not default.training.steps:
+                # --steps is for those that learn.
+                given = with_options(given, {"steps": 0})
             config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
             check(config)
             configs.append(config)
@@ -219,8 +222,11 @@ def check(config: AnyConfig) -> None:
         UserError: says what.
     """
     check_counts(config, "episodes")
-    if config.training.steps:  # where nothing is learned, nothing is needed to learn from
-        check_counts(config, "demos")
+    if config.training.steps and config.demos < 1:
+        raise UserError(
+            f"--demos must be at least 1, got {config.demos}: --steps {config.training.steps} "
+            "needs demonstrations to train on, and a method that learns nothing has none by default"
+        )
     if not config.seeds:
         raise UserError("--seeds needs at least one seed")
     for seed in config.seeds:
