@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import math
+import typing
 from pathlib import Path
 
 import pytest
@@ -11,11 +13,14 @@ from experiments.common import config
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from experiments.common.searches import searches
 from leapjax import checkpoints, domains, pretrained
+from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
+from leapjax.domains import DOMAINS
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
-from leapjax.planners import CrossEntropyConfig, ShootingConfig
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 
 LEVEL = "GoToLocalS7N5"
 
@@ -157,6 +162,41 @@ def test_every_program_is_known_by_name(capsys):
     assert programs.main(["babyia"]) == 2
     assert "did you mean babyai" in capsys.readouterr().err
     assert programs.main(["properties", "--only", "nothing"]) == 2  # what follows is handed on
+
+
+KINDS = [
+    *{method.settings for method in METHODS.values()}, *(d.settings for d in DOMAINS.values()),
+    ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
+]  # fmt: skip
+FIELDS = [
+    pytest.param(kind, field.name, kind_of, id=f"{kind.__module__}.{kind.__name__}.{field.name}")
+    for kind in KINDS
+    for field in dataclasses.fields(kind)
+    for kind_of in [typing.get_type_hints(kind)[field.name]]
+]
+NEVER = {
+    int: [1.0, True, "1", math.nan, -1, 2**31, 2**63],
+    float: [True, "1", math.nan, -math.inf, 10**400],
+    bool: [1, 0.0, "yes", None],
+    str: [1, None, True],
+}
+UNLIMITED = {"clip"}  # infinite: the gradient is never clipped
+
+
+@pytest.mark.parametrize(("kind", "name", "type_of"), FIELDS)
+def test_every_field_of_every_configuration_is_checked(kind, name, type_of):
+    kinds = typing.get_args(type_of) or (type_of,)
+    maybe = type(None) in kinds
+    never = [v for v in NEVER[kinds[0]] if not (maybe and v is None)]
+    if kinds[0] is float and name not in UNLIMITED:
+        never.append(math.inf)
+    pair = typing.get_origin(type_of) is tuple
+    for value in never:
+        with pytest.raises(UserError, match=name):
+            kind(**{name: (value,) * len(kinds) if pair else value})
+    assert getattr(kind(), name) == next(
+        field.default for field in dataclasses.fields(kind) if field.name == name
+    )
 
 
 @pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])

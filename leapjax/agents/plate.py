@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import NETWORK_PRESETS, Method, Setup
+from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.energy import autoregressive
 from leapjax.models.alternating import AlternatingModel
@@ -24,8 +25,8 @@ class Settings:
     state_weight: float = 1.0  # of the states' loss beside the actions'
 
     def __post_init__(self) -> None:
-        if not 0 <= self.state_weight < float("inf"):  # false for NaN too
-            raise ValueError(f"state_weight must be at least 0, got {self.state_weight}")
+        check_types(self)
+        check_within(self, 0, LARGEST, "state_weight")
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
