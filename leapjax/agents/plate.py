@@ -13,7 +13,9 @@ from leapjax.agents.learning import NETWORK_PRESETS, Method, Setup
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.energy import autoregressive
+from leapjax.errors import UserError
 from leapjax.models.alternating import AlternatingModel
+from leapjax.models.trajectory import MOST_LAYERS
 from leapjax.planners import BeamConfig
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -32,6 +34,11 @@ class Settings:
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """PlaTe as an `Agent`; its energy is the negative log-likelihood of a plan."""
     sizes, last = setup.sizes, setup.domain.num_actions - 1  # the end action
+    if setup.model.architecture != "paper" and setup.horizon > MOST_LAYERS:
+        raise UserError(
+            f"--horizon {setup.horizon}: PlaTe with architecture {setup.model.architecture} "
+            f"encodes each state of a plan by itself, so its horizon is at most {MOST_LAYERS}"
+        )
     module = AlternatingModel(setup.model, sizes, setup.encoder())
     optimizer = learning.make_optimizer(setup.training)
 

@@ -15,6 +15,7 @@ from leapjax.atari.augmentation import mirrored, shifted
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
 from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.checks import check_at_least, check_types, check_within
+from leapjax.data.seeds import MAX_TRAINING_SEED
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
@@ -41,7 +42,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_at_least(self, 1, "transitions", "replay_run")
+        check_at_least(self, 1, "transitions")
+        check_at_least(self, 1, "replay_run", most=MAX_TRAINING_SEED)  # each has seeds of its own
         check_at_least(self, 1, "features", most=10_000)
         check_at_least(self, 1, "max_steps", most=MOST_STEPS)
         check_at_least(self, 0, "shift", most=WIDTH - 1)
