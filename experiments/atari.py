@@ -66,10 +66,10 @@ def run(options: Collect) -> None:
     Raises:
         UserError: an unknown game, numbers that cannot be, or data that are not to be recorded.
     """
-    for name in ("transitions", "workers"):
+    for name in ("transitions", "replay_run", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    Settings(replay_run=options.replay_run, max_steps=options.longest)  # these are checked there
+    Settings(replay_run=options.replay_run, max_steps=options.longest)  # raises above their ranges
     memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
     if options.record and (options.replay_run, options.longest) != (1, LONGEST):
         raise UserError(

@@ -64,9 +64,12 @@ def check_number(name: str, value: Any, least: float = -LARGEST, most: float = L
         raise UserError(f"{name} must be a number, got {_shown(value)}") from None
     if not math.isfinite(number):
         raise UserError(f"{name} must be finite, got {number}")
-    if not least <= number <= most:
+    if least <= number <= most:
+        return number
+    if least > -LARGEST and most < LARGEST:
         raise UserError(f"{name} must be in {least} .. {most}, got {number}")
-    return number
+    bound = f"at least {least}" if number < least else f"at most {most:g}"
+    raise UserError(f"{name} must be {bound}, got {number}")
 
 
 def check_seed(value: Any, name: str = "seed") -> int:

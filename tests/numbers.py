@@ -65,9 +65,9 @@ def command_lines(domain: str) -> Iterator[list[str]]:
         base += ["--demos", "0", "--steps", "0"]
     for method in METHODS if domain == "babyai" else ("leap", "iql"):
         chosen = blank(domain, LEVELS[domain], method)
-        parts = [chosen.method_settings, chosen.planner, chosen.domain_settings]
+        parts = [chosen.method_settings, chosen.planner]
         if method == "leap":
-            parts += [chosen, chosen.model, chosen.training, chosen.cluster]
+            parts += [chosen, chosen.model, chosen.training, chosen.cluster, chosen.domain_settings]
         for name in METHODS[method].presets:
             for part in parts:
                 for _, given in numeric(type(part)):

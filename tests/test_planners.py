@@ -1180,9 +1180,9 @@ def test_impossible_configurations_are_refused(make, options, message):
         make(**options)
 
 
-@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan")])
+@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan"), "1", None, True])
 def test_impossible_temperatures_are_refused(temperature):
-    with pytest.raises(ValueError, match=r"temperature must be in 0 \.\. 1e\+30, got"):
+    with pytest.raises(ValueError, match="temperature must be"):
         GibbsConfig(temperature=temperature)
 
 

@@ -293,7 +293,7 @@ def test_more_than_the_machine_has(options, capsys):
 
 @pytest.mark.parametrize("temperature", ["1e39", "nan", "-1"])
 def test_a_temperature_at_which_noise_is_no_number(temperature, capsys):
-    assert "a temperature must be in 0 .. 1e+30" in one_line(capsys, "--temperature", temperature)
+    assert "temperature must be" in one_line(capsys, "--temperature", temperature)
 
 
 def test_numbers_of_64_bits_are_refused():
