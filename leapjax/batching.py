@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from leapjax import sharding
+from leapjax.checks import check_counts
 from leapjax.planners import PlannerConfig, bind
 from leapjax.types import Array, Energy, Params, Plan, PyTree
 
@@ -40,9 +41,9 @@ class CompiledPlanner:
         chunk_sizes: Sequence[int],
         devices: Sequence[jax.Device] | None,
     ) -> None:
-        self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
-        if not self.chunk_sizes or self.chunk_sizes[0] < 1:
-            raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
+        self.chunk_sizes = tuple(sorted({*check_counts("chunk sizes", chunk_sizes, 1).tolist()}))
+        if not self.chunk_sizes:
+            raise ValueError("chunk sizes: expected at least one")
         planner = bind(energy, config)
         self.num_actions = energy.num_actions
 

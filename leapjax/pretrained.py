@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from leapjax import checkpoints, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics
 from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError, first_line
@@ -41,6 +41,9 @@ class Origin:
     demos: int
     demonstrations: str | None = None
 
+    def __post_init__(self) -> None:
+        check_types(self)
+
 
 @dataclasses.dataclass(frozen=True)
 class Specification:
@@ -60,6 +63,7 @@ class Specification:
     statistics: Statistics = ()  # of what it learned from, as far as its network needs them
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 0, "context")
 
 

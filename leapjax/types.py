@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import MOST, check_integer
+
 PyTree = Any
 Params = Any
 Array = Any  # a jax.Array inside a program, a NumPy array at its edges
@@ -115,12 +117,21 @@ class Energy(NamedTuple):
 
 def mask_token(num_actions: int) -> int:
     """The token of an action that is not chosen yet."""
-    return num_actions
+    return check_num_actions(num_actions)
 
 
 def pad_token(num_actions: int) -> int:
     """The token of a past action that never was: the episode had not begun."""
-    return num_actions + 1
+    return check_num_actions(num_actions) + 1
+
+
+def check_num_actions(num_actions: int) -> int:
+    """Returns A, the end action included.
+
+    Raises:
+        UserError: not an integer, or out of range.
+    """
+    return check_integer("num_actions", num_actions, 1, MOST - 1)  # PAD is one more
 
 
 class TrainState(NamedTuple):

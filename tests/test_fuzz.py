@@ -24,16 +24,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from experiments import report
-from experiments.common import analysis, config, results, run
+from experiments.common import analysis, config, results, run, runtime
 from experiments.tables import measured
 from leapjax import checkpoints, pretrained, weights
+from leapjax.atari import collect
 from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import storage
 from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import LONG, ROOT
+from tests import numbers
+from tests.programs import LONG, ROOT, only_long
 from tests.test_storage import LEVEL, NAME, SIDE, assert_same
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
@@ -439,6 +441,60 @@ def test_any_command_line(arguments):
         assert len(config.configuration_hash(parsed, parsed.seeds[0])) == 12
         assert levels.find_level(parsed.level) and parsed.episodes > 0
         assert parsed.demos > 0 or parsed.training.steps == 0
+
+
+@only_long
+@pytest.mark.parametrize("domain", numbers.LEVELS)
+def test_any_number_that_an_option_takes(domain):
+    """An accepted one has passed every check before work, the arithmetic of memory included."""
+    accepted = 0
+    for arguments in numbers.command_lines(domain):
+        try:
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                contextlib.redirect_stderr(io.StringIO()),
+            ):
+                parsed = outcome(lambda given=arguments: config.parse(domain, given)) or []
+        except SystemExit as stopped:  # what tyro has to say
+            assert stopped.code == 2
+            parsed = []
+        for each in parsed:
+            accepted += 1
+            assert len(config.configuration_hash(each, each.seeds[0])) == 12
+            assert each.context <= config.make_domain(each).max_steps
+            numbers_in = json.dumps(config.resolved(each, each.seeds[0]))
+            assert "NaN" not in numbers_in
+    assert accepted > 50
+
+
+class Begun(Exception):
+    """A program has made all checks, and would begin to work."""
+
+
+@only_long
+@pytest.mark.parametrize("name", numbers.PROGRAMS)
+def test_any_number_that_a_program_takes(toy_run, tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+
+    def begin(*given):
+        raise Begun
+
+    for module, name_of in ((runtime, "start"), (collect, "collect")):
+        monkeypatch.setattr(module, name_of, begin)
+    main, kind, before = numbers.PROGRAMS[name]
+    given = [str(toy_run) if each == "RUN" else each for each in before]
+    for field, option in numbers.numeric(kind):
+        with bounded():
+            try:
+                assert main([*given, *option]) == 2, (field, option)
+            except Begun:
+                assert float(option[-1]) >= 0, (field, option)
+            except SystemExit as stopped:
+                assert stopped.code == 2
+                capsys.readouterr()
+                continue
+        error = capsys.readouterr().err
+        assert not error or (error.startswith("error: ") and error.count("\n") == 1)
 
 
 # Checkpoints.

@@ -1144,9 +1144,11 @@ def test_contexts_that_do_not_match_the_keys_are_refused(shape):
         batched(CONFIGS["gibbs"])(TABLE, keys, {"tilt": np.zeros(shape, np.float32)})
 
 
-@pytest.mark.parametrize("chunk_sizes", [(), (0,), (8, -1), (0, 8)])
+@pytest.mark.parametrize(
+    "chunk_sizes", [(), (0,), (8, -1), (4.0,), (True,), ("8",), 8, "8", (2**31,), (None,)]
+)
 def test_impossible_chunk_sizes_are_refused(chunk_sizes):
-    with pytest.raises(ValueError, match="chunk sizes must be positive"):
+    with pytest.raises(ValueError, match="chunk sizes"):
         compile_planner(TILTED, CONFIGS["gibbs"], chunk_sizes)
 
 
@@ -1178,9 +1180,9 @@ def test_impossible_configurations_are_refused(make, options, message):
         make(**options)
 
 
-@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan")])
+@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan"), "1", None, True])
 def test_impossible_temperatures_are_refused(temperature):
-    with pytest.raises(ValueError, match=r"temperature must be in 0 \.\. 1e\+30, got"):
+    with pytest.raises(ValueError, match="temperature must be"):
         GibbsConfig(temperature=temperature)
 
 

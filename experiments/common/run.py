@@ -21,8 +21,8 @@ import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
 
-from experiments.common import loggers, plots
-from experiments.common.config import AnyConfig, resolved
+from experiments.common import loggers, memory, plots
+from experiments.common.config import PLANS_TOGETHER, AnyConfig, resolved
 from experiments.common.interruption import Interruption
 from experiments.common.loggers import About, Log
 from experiments.common.progress import Meter
@@ -44,9 +44,7 @@ from leapjax.types import Agent, Demonstration, Energy, Params, TrainState
 
 Metrics = list[dict[str, float]]
 Watch = Callable[[Energy, Params], dict[str, float]]
-# One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
-# evaluation would rather have smaller ones.
-CHUNK_SIZES = (32,)
+CHUNK_SIZES = (PLANS_TOGETHER,)
 REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
 DATA = "data.json"  # in the folder of a run: the demonstrations that it learns from
 
@@ -114,15 +112,18 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
     like = learning.blank_steps(domain) if config.demos else ()
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    memory.check_state(state)
 
     def training_programs() -> tuple[Any, TrainStep]:
         if config.training.steps:
-            return training.compile_ahead(agent, mesh, like)
+            begin, step = training.compile_ahead(agent, mesh, like)
+            memory.check_program(step.update)
+            return begin, step
         return training.make_begin(agent, mesh), training.make_train_step(agent, mesh)
 
     def warm_planner() -> None:
-        shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
-        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), shapes)
+        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), state.params)
         blank = Pretrained(run.specification, agent.energy, params, plan)
         warm_up(blank, domain, config.episodes, config.executed)
 

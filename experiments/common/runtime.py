@@ -16,11 +16,13 @@ import jax
 
 from experiments.common import startup
 from leapjax import files
+from leapjax.checks import check_at_least, check_types
 from leapjax.errors import UserError, first_line
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
 CONNECT_SECONDS = 120
+LAST_PORT = 2**16 - 1
 # How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
 # starts one process has too.)
 LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
@@ -80,8 +82,8 @@ class Cluster:
 
     def __post_init__(self) -> None:
         given = [self.coordinator, self.num_processes, self.process_id]
-        if self.fsdp < 1:
-            raise ValueError(f"fsdp must be at least 1, got {self.fsdp}")
+        check_types(self)
+        check_at_least(self, 1, "fsdp")
         if given == [None, None, None]:
             return
         if self.coordinator is None or self.num_processes is None or self.process_id is None:
@@ -92,8 +94,11 @@ class Cluster:
                 f"to {self.num_processes - 1}"
             )
         host, _, port = self.coordinator.rpartition(":")
-        if not host or not port.isdecimal():
-            raise ValueError(f"coordinator is {self.coordinator!r}: expected host:port")
+        if not host or not port.isdecimal() or len(port) > 5 or int(port) > LAST_PORT:
+            raise ValueError(
+                f"coordinator is {self.coordinator!r}: expected host:port, a port of at most "
+                f"{LAST_PORT}"
+            )
 
 
 def start(cluster: Cluster = Cluster(), cache: bool = True) -> None:

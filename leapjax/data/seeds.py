@@ -56,11 +56,12 @@ def check_disjoint(demonstrations: list[int], episodes: range) -> None:
 
 
 def _within(seeds: range, low: int, high: int, kind: str) -> range:
-    if len(seeds) < 1:
-        raise UserError(f"at least one {kind} episode is needed, got {len(seeds)}")
-    if seeds[0] < low or seeds[-1] >= high:
+    first, last = seeds.start, seeds.stop - 1  # of any size: `len` would refuse the largest
+    if last < first:
+        raise UserError(f"at least one {kind} episode is needed, got {last + 1 - first}")
+    if first < low or last >= high:
         raise UserError(
-            f"{kind} seeds {seeds[0] - low} .. {seeds[-1] - low} leave their range "
+            f"{kind} seeds {first - low} .. {last - low} leave their range "
             f"0 .. {high - low - 1}; the seeds beyond it belong to other episodes"
         )
     return seeds

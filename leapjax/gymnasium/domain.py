@@ -11,7 +11,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from leapjax.checks import check_at_least, check_fits
+from leapjax.checks import check_at_least, check_fits, check_types
 from leapjax.domain import Domain, DomainType, Statistics
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
@@ -42,6 +42,7 @@ class Settings:
     arguments: str = "{}"  # that it is made with, as a JSON object
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.max_steps is not None:
             check_at_least(self, 1, "max_steps")
         try:
