@@ -1,10 +1,16 @@
 """Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import contextlib
+import functools
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 
 from leapjax.types import Array, PyTree
+
+A = TypeVar("A", bound="Adapter")
+_ENVIRONMENTS = (gym.Env, gym.vector.VectorEnv)
 
 
 class Transition(NamedTuple):
@@ -31,8 +37,9 @@ class Transition(NamedTuple):
 class Adapter(Protocol):
     """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
 
-    An observation is any pytree of NumPy arrays whose shapes never change. One that works on its
-    own may be `Eager`, too.
+    An observation is any pytree of NumPy arrays whose shapes never change. An adapter whose
+    environment works on its own may be `Eager`; one whose environment holds files, ports or
+    processes should be `Closable`.
     """
 
     num_actions: int  # A, the end action included
@@ -53,6 +60,57 @@ class Eager(Protocol):
     def begin(self, action: int) -> None:
         """Begins to take an action; the next `step`, with the same one, waits for what it gives."""
         ...
+
+
+@runtime_checkable
+class Closable(Protocol):
+    """An `Adapter` whose environment holds something that must be given back."""
+
+    def close(self) -> None:
+        """Gives it back; the adapter is not played again."""
+        ...
+
+
+def close(adapter: Adapter) -> None:
+    """Closes an adapter if it is `Closable`."""
+    if isinstance(adapter, Closable):
+        adapter.close()
+
+
+@contextlib.contextmanager
+def closing(adapter: A) -> Iterator[A]:
+    """Yields an adapter and closes it, also after an error, which a failing `close` never hides."""
+    try:
+        yield adapter
+    except BaseException:
+        with contextlib.suppress(Exception):
+            close(adapter)
+        raise
+    close(adapter)
+
+
+def environments_of(adapter: Adapter) -> list[object]:
+    """The Gymnasium environments that an adapter steps, without their wrappers.
+
+    Those that are attributes of the adapter, of its class, or of another adapter inside it.
+    """
+    found: list[object] = []
+    owners: list[object] = [adapter]
+    for owner in owners:
+        found += _environments_of_class(type(owner))
+        for part in getattr(owner, "__dict__", {}).values():
+            if isinstance(part, _ENVIRONMENTS):
+                found.append(part.unwrapped)
+            elif callable(getattr(part, "step", None)) and id(part) not in map(id, owners):
+                owners.append(part)
+    return found
+
+
+@functools.lru_cache
+def _environments_of_class(kind: type) -> list[object]:
+    """Those that all adapters of a class have in common."""
+    parts = [part for each in kind.__mro__ for part in vars(each).values()]
+    return [part.unwrapped for part in parts if isinstance(part, _ENVIRONMENTS)]
 
 
 class GymnasiumAdapter:
@@ -96,3 +154,7 @@ class GymnasiumAdapter:
             over = terminated or truncated or self._threshold > 0
             success = over and self._return >= self._threshold
         return Transition(observation, reward, terminated, truncated, bool(success))
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.env.close()
