@@ -222,7 +222,7 @@ def check_fit(name: str, tree: PyTree) -> None:
         narrow = jax.dtypes.canonicalize_dtype(array.dtype)
         if narrow == array.dtype:
             continue
-        limits = np.finfo(narrow) if narrow.kind == "f" else np.iinfo(narrow)
+        limits: Any = np.finfo(narrow) if narrow.kind == "f" else np.iinfo(narrow)
         least, most = (x.item() if narrow.kind == "f" else x for x in (limits.min, limits.max))
         if array.min() >= least and array.max() <= most:
             continue

@@ -76,7 +76,7 @@ def check_seed(value: Any, name: str = "seed") -> int:
     return check_integer(name, value, 0, LARGEST_SEED)
 
 
-def check_seeds(values: Sequence[Any], name: str = "seed") -> np.ndarray:
+def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.ndarray:
     """Returns seeds as an array `[n]` uint32; see `check_seed`.
 
     Raises:

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 
@@ -95,9 +95,9 @@ def environments_of(adapter: Adapter) -> list[object]:
     Those that are attributes of the adapter, of its class, or of another adapter inside it.
     """
     found: list[object] = []
-    owners: list[object] = [adapter]
+    owners: list[Any] = [adapter]
     for owner in owners:
-        found += _environments_of_class(type(owner))
+        found += _environments_of_class(owner.__class__)
         for part in getattr(owner, "__dict__", {}).values():
             if isinstance(part, _ENVIRONMENTS):
                 found.append(part.unwrapped)

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -71,6 +71,7 @@ class History:
         self._actions: list[int] = []
         self._rewards: list[float] = []
         self._encoded: Array | None = None
+        self._structure: Any
         leaves, self._structure = jax.tree.flatten(observation)
         self._shapes = list(map(np.shape, leaves))
         self.current = self._checked(observation)
@@ -122,19 +123,21 @@ class History:
 
     def _checked(self, observation: PyTree) -> PyTree:
         """A copy: environments may write the next observation into the arrays of the last."""
+        structure: Any
         leaves, structure = jax.tree.flatten(observation)
         copies = list(map(np.array, leaves))
         shapes = [copy.shape for copy in copies]
         if structure != self._structure or shapes != self._shapes:
             raise UserError(
                 f"an observation of other shapes than the first at {self.where}: "
-                f"{_shapes_of(structure, shapes)}, not {_shapes_of(self._structure, self._shapes)}"
+                f"{structure.unflatten(shapes)}, not {self._structure.unflatten(self._shapes)}"
             )
-        for copy in copies:
+        for place, copy in enumerate(copies):
             if copy.dtype.kind == "f" and not np.isfinite(copy).all():
+                path, _ = jax.tree.leaves_with_path(observation)[place]
                 raise UserError(
-                    f"the environment gave an observation at {self.where} with numbers that are "
-                    "not finite"
+                    f"the environment gave an observation{jax.tree_util.keystr(path)} with numbers "
+                    f"that are not finite at {self.where}"
                 )
         return structure.unflatten(copies)
 
@@ -157,27 +160,19 @@ class History:
         )
 
 
-def _shapes_of(structure: jax.tree_util.PyTreeDef, shapes: Sequence[tuple[int, ...]]) -> PyTree:
-    """The shapes of an observation, in its structure."""
-    return structure.unflatten(shapes)
-
-
-def check_limits(
-    executed: int | None, max_steps: int | None, most: int = sys.maxsize
-) -> tuple[int | None, int | None]:
+def check_limits(executed: int | None, max_steps: int | None) -> tuple[int | None, int | None]:
     """Returns both limits as integers of Python, or None.
 
     Args:
         executed: actions of a plan.
         max_steps: of an episode.
-        most: the largest limit allowed.
 
     Raises:
-        UserError: one of them is not an integer, or out of range 1 .. most.
+        UserError: one of them is not an integer, or less than 1.
     """
     limits = {"executed": executed, "max_steps": max_steps}
     checked = [
-        None if value is None else check_integer(name, value, 1, most)
+        None if value is None else check_integer(name, value, 1, sys.maxsize)
         for name, value in limits.items()
     ]
     return checked[0], checked[1]

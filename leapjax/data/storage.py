@@ -27,6 +27,7 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from leapjax import files
+from leapjax.checks import check_integer
 from leapjax.domain import Collection, Domain, Recording, Source
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
@@ -309,12 +310,23 @@ def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
         dataset = minari.load_dataset(name)
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
         for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
-            yield episode, int(details.get("seed", UNKNOWN_SEED))
+            yield episode, _seed(details.get("seed"))
     except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
         again = "delete it and it is made again, or " if _version(name) is not None else ""
         raise UserError(
             f"the Minari data set {name!r} cannot be read ({first_line(error)}): {again}restore it"
         ) from None
+
+
+def _seed(value: Any) -> int:
+    """The seed of a reset as a data set holds it: of 64 bits, which is all that it can hold.
+
+    Anything else is unknown, so that a demonstration can always be stored again.
+    """
+    try:
+        return check_integer("the seed of an episode", value, 0, 2**64 - 1)
+    except UserError:
+        return UNKNOWN_SEED
 
 
 def _demonstration(
