@@ -213,7 +213,8 @@ class _Episode:
         self.place, self.seed = place, seed
         self.adapter, self.history = adapter, history
         self.eager = adapter if isinstance(adapter, Eager) else None
-        self.owned = [adapter, *environments_of(adapter)]  # that no other episode may step
+        # What no other episode may step, by identity.
+        self.owned = {id(part): part for part in (adapter, *environments_of(adapter))}
         self.replans = 0
 
 
@@ -223,20 +224,6 @@ def _alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
         group = [each for each in episodes if each.history.has_encoded == has_encoded]
         if group:
             yield group
-
-
-def _check_alone(episode: _Episode, others: Sequence[_Episode]) -> None:
-    """Checks that an episode shares no environment with those under way.
-
-    Raises:
-        UserError: it does.
-    """
-    taken = {id(part) for other in others for part in other.owned}
-    if not taken.isdisjoint(map(id, episode.owned)):
-        raise UserError(
-            "make_adapter returned the same environment twice: make a new one for each episode, "
-            "since episodes under way take turns"
-        )
 
 
 def evaluate(
@@ -295,6 +282,7 @@ def evaluate(
     waiting = iter(range(count))
     opened: dict[int, Adapter] = {}  # by place
     active: list[_Episode] = []
+    owned: set[int] = set()  # by those under way
     over, planned, planning_seconds = 0, 0, 0.0
 
     def begin(place: int) -> _Episode:
@@ -303,7 +291,12 @@ def evaluate(
         check_actions("planner", plan.num_actions, adapter.num_actions)
         history = History(adapter.reset(level_seed), context, end + 1, level_seed)
         episode = _Episode(place, level_seed, adapter, history)
-        _check_alone(episode, active)  # now: an adapter may make its environment when it is reset
+        if not owned.isdisjoint(episode.owned):
+            raise UserError(
+                "make_adapter returned the same environment twice: make a new one for each "
+                "episode, since episodes under way take turns"
+            )
+        owned.update(episode.owned)
         return episode
 
     def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray, Array | None]]:
@@ -362,6 +355,7 @@ def evaluate(
             for episode, actions, encoded in decided:
                 if act(episode, actions, encoded):
                     close(opened.pop(episode.place))
+                    owned.difference_update(episode.owned)
                     over += 1
                 else:
                     active.append(episode)
