@@ -1,11 +1,13 @@
 """Rows say what they were made with."""
 
+import math
 import subprocess
 from types import SimpleNamespace
 
 import pytest
 
 from experiments.common import results
+from leapjax.errors import UserError
 
 
 @pytest.fixture
@@ -55,3 +57,13 @@ def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):
     gpus = [SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")] * 2
     monkeypatch.setattr(results.jax, "local_devices", lambda: gpus)
     assert results.versions()["machine"] == f"{alone}, 2 NVIDIA H100"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("mean_return", math.nan), ("planner", {"temperature": math.inf})]
+)
+def test_a_row_is_json_or_refused(tmp_path, field, value):
+    path = tmp_path / "rows.jsonl"
+    with pytest.raises(UserError, match=f"{field} of a new row is not finite"):
+        results.record(path, {"hash": "a", field: value})
+    assert not path.exists()

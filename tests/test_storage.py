@@ -436,6 +436,27 @@ def test_an_episode_without_actions(saved, minari_folder):
     assert "no actions" in refused()
 
 
+@pytest.mark.parametrize(
+    ("stored", "seed"),
+    [
+        (2**63 + 5, 2**63 + 5), (2**64 - 1, 2**64 - 1), (str(2**32), 2**32),
+        (-5, storage.UNKNOWN_SEED), (str(2**70), storage.UNKNOWN_SEED),
+        (None, storage.UNKNOWN_SEED),
+    ],
+)  # fmt: skip
+def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stored, seed):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        attributes = file["episode_0"].attrs
+        del attributes["seed"]
+        if stored is not None:
+            attributes["seed"] = np.uint64(stored) if stored == 2**64 - 1 else stored
+    loaded = storage.load(NAME, LEVEL)
+    assert loaded.demonstrations[0].seed == seed
+    assert loaded.demonstrations[1].seed == saved[1].seed
+    save(loaded.demonstrations)  # and again
+    assert_same(storage.load(NAME, LEVEL).demonstrations, loaded.demonstrations)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
 def test_rewards_that_are_not_finite(saved, minari_folder, bad):
     with h5py.File(file_of(minari_folder), "r+") as file:
