@@ -148,10 +148,14 @@ def play(
 ) -> tuple[list[Recorder], list[bool]]:
     """The episodes of one planner, and whether each succeeded."""
     planner = pretrained.load(run)
-    recorders = [Recorder(level) for _ in played]
-    waiting = iter(recorders)
+    recorders: list[Recorder] = []
+
+    def make_adapter() -> Recorder:
+        recorders.append(Recorder(level))
+        return recorders[-1]
+
     episodes = rollouts.evaluate(
-        lambda: next(waiting), played, planner.plan, planner.params,
+        make_adapter, played, planner.plan, planner.params,
         context=planner.specification.context, executed=executed,
     )  # fmt: skip
     return recorders, episodes.successes.tolist()

@@ -10,6 +10,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from leapjax.errors import UserError
@@ -81,17 +82,19 @@ def check_seed(value: Any, name: str = "seed") -> int:
     return check_integer(name, value, 0, LARGEST_SEED)
 
 
-def check_seeds(values: Sequence[Any], name: str = "seed") -> np.ndarray:
+def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.ndarray:
     """Returns seeds as an array `[n]` uint32; see `check_seed`.
 
     Raises:
         UserError: one of them is no seed.
     """
-    array = np.asarray(values)
-    if array.ndim == 1 and array.dtype == np.uint32:
-        return array
     if np.ndim(values) != 1:
         raise UserError(f"{name}s must be a sequence of integers, got {_shown(values)}")
+    if isinstance(values, np.ndarray | jax.Array) and len(values):
+        array = np.asarray(values)  # of one type, so that its extremes speak for all
+        for extreme in (array.min(), array.max()):
+            check_seed(extreme, name)
+        return array.astype(np.uint32)
     return np.array([check_seed(value, name) for value in values], np.uint32)
 
 

@@ -1,11 +1,16 @@
 """Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import contextlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 
 from leapjax.checks import check_number
 from leapjax.types import Array, PyTree, to_plain_dicts
+
+A = TypeVar("A", bound="Adapter")
+_ENVIRONMENTS = (gym.Env, gym.vector.VectorEnv)
 
 
 class Transition(NamedTuple):
@@ -32,8 +37,9 @@ class Transition(NamedTuple):
 class Adapter(Protocol):
     """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
 
-    An observation is any pytree of NumPy arrays whose shapes never change. One that works on its
-    own may be `Eager`, too.
+    An observation is any pytree of NumPy arrays whose shapes never change. An adapter whose
+    environment works on its own may be `Eager`; one whose environment holds files, ports or
+    processes should be `Closable`.
     """
 
     num_actions: int  # A, the end action included
@@ -112,6 +118,50 @@ def judge_episode(
     return bool(over and total >= criterion.least_return)
 
 
+@runtime_checkable
+class Closable(Protocol):
+    """An `Adapter` whose environment holds something that must be given back."""
+
+    def close(self) -> None:
+        """Gives it back; the adapter is not played again."""
+        ...
+
+
+def close(adapter: Adapter) -> None:
+    """Closes an adapter if it is `Closable`."""
+    if isinstance(adapter, Closable):
+        adapter.close()
+
+
+@contextlib.contextmanager
+def closing(adapter: A) -> Iterator[A]:
+    """Yields an adapter and closes it, also after an error, which a failing `close` never hides."""
+    try:
+        yield adapter
+    except BaseException:
+        with contextlib.suppress(Exception):
+            close(adapter)
+        raise
+    close(adapter)
+
+
+def environments_of(adapter: Adapter) -> list[object]:
+    """The Gymnasium environments that an adapter steps, without their wrappers.
+
+    Those that are attributes of the adapter, of its class, or of another adapter inside it.
+    """
+    found: list[object] = []
+    owners: list[Any] = [adapter]
+    for owner in owners:
+        places = (*type(owner).__mro__, owner)
+        for part in [part for place in places for part in getattr(place, "__dict__", {}).values()]:
+            if isinstance(part, _ENVIRONMENTS):
+                found.append(part.unwrapped)
+            elif callable(getattr(part, "step", None)) and id(part) not in map(id, owners):
+                owners.append(part)
+    return found
+
+
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
@@ -147,3 +197,7 @@ class GymnasiumAdapter:
         self._return += reward
         success = judge_episode(self.criterion, self._return, reward, terminated, truncated)
         return Transition(to_plain_dicts(observation), reward, terminated, truncated, success)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.env.close()

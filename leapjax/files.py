@@ -213,8 +213,8 @@ def check_memory(needed: int, what: str) -> None:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > memory:
         raise UserError(
-            f"{what} would need {needed / 2**30:.1f} GiB of memory at least, and this machine has "
-            f"{memory / 2**30:.1f}"
+            f"{what}: at least {needed >> 30} GiB of memory would be needed, and this machine has "
+            f"{memory >> 30}"
         )
 
 

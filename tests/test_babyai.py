@@ -265,7 +265,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--masking", "some"], "unknown masking 'some'"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
-        (["--seeds", "-1"], "a training seed must be in"),
+        (["--seeds", "-1"], "a training seed must be at least 0"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
         (["--checkpoint", "n" * 300], f"File name too long: {'n' * 300}"),

@@ -96,9 +96,24 @@ class Odd(Corridor):
         self.made_with = way, lamp
 
 
+class Held(Corridor):
+    """Counts how many are open; the third cannot be closed."""
+
+    made = closed = 0
+
+    def __init__(self, **arguments):
+        super().__init__(**arguments)
+        Held.made += 1
+
+    def close(self):
+        Held.closed += 1
+        if Held.closed == 3:
+            raise OSError("the port is gone")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def registered():
-    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows, "Deep": Deep}
+    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows, "Deep": Deep, "Held": Held}
     for name, kind in kinds.items():
         gym.register(f"{name}-v0", f"tests.test_gymnasium:{kind.__name__}", max_episode_steps=12)
     gym.register("Endless-v0", "tests.test_gymnasium:Corridor")
@@ -627,3 +642,16 @@ def test_choices_that_there_are_not_are_refused():
         check_choices(several, {**good, "more": np.array([[0, 0], [2, 3]])}, "episode 0")
     with pytest.raises(UserError, match="a choice of 16, expected 0 to 15"):
         make("FrozenLake-v1", Settings()).check(np.array([16]), "episode 0")
+
+
+def test_what_is_made_is_closed(monkeypatch):
+    for count in ("made", "closed"):
+        monkeypatch.setattr(Held, count, 0)
+    domain = make("Held-v0", Settings())
+    assert Held.made == Held.closed == 1
+    adapter = domain.make_adapter()
+    adapter.reset(0)
+    adapter.close()
+    assert Held.made == Held.closed == 2
+    with pytest.raises(UserError, match="close of Held-v0 raised OSError: the port is gone"):
+        domain.make_adapter().close()

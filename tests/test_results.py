@@ -1,6 +1,7 @@
 """Rows say what they were made with."""
 
 import json
+import math
 import subprocess
 from types import SimpleNamespace
 
@@ -131,3 +132,13 @@ def test_measurements_that_no_table_can_show(tmp_path, name, change, says):
     path.write_text(json.dumps(values))
     with pytest.raises(UserError, match=says):
         measured.read(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("mean_return", math.nan), ("planner", {"temperature": math.inf})]
+)
+def test_a_row_is_json_or_refused(tmp_path, field, value):
+    path = tmp_path / "rows.jsonl"
+    with pytest.raises(UserError, match=f"{field} of a new row is not finite"):
+        results.record(path, {"hash": "a", field: value})
+    assert not path.exists()

@@ -482,6 +482,27 @@ def test_an_episode_without_actions(saved, minari_folder):
     assert "no actions" in refused()
 
 
+@pytest.mark.parametrize(
+    ("stored", "seed"),
+    [
+        (2**63 + 5, 2**63 + 5), (2**64 - 1, 2**64 - 1), (str(2**32), 2**32),
+        (-5, storage.UNKNOWN_SEED), (str(2**70), storage.UNKNOWN_SEED),
+        (None, storage.UNKNOWN_SEED),
+    ],
+)  # fmt: skip
+def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stored, seed):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        attributes = file["episode_0"].attrs
+        del attributes["seed"]
+        if stored is not None:
+            attributes["seed"] = np.uint64(stored) if stored == 2**64 - 1 else stored
+    loaded = storage.load(NAME, LEVEL)
+    assert loaded.demonstrations[0].seed == seed
+    assert loaded.demonstrations[1].seed == saved[1].seed
+    save(loaded.demonstrations)  # and again
+    assert_same(storage.load(NAME, LEVEL).demonstrations, loaded.demonstrations)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
 def test_rewards_that_are_not_finite(saved, minari_folder, bad):
     with h5py.File(file_of(minari_folder), "r+") as file:
@@ -591,7 +612,7 @@ def test_what_does_not_fit_into_memory_is_not_unpacked(saved, minari_folder, mon
     monkeypatch.setattr(os, "sysconf", memory.__getitem__)
     assert_same(storage.load(NAME, LEVEL, most=3).demonstrations, saved[:3])  # it is not needed
     monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
-    assert "would need 0.0 GiB of memory at least" in refused()
+    assert "at least 0 GiB of memory would be needed" in refused()
 
 
 def test_an_array_is_not_widened_to_be_checked():

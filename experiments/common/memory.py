@@ -1,21 +1,13 @@
 """What a run needs of memory, judged before it begins: a machine without any left kills it."""
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
-from leapjax.errors import UserError
+from leapjax.files import check_memory
 from leapjax.types import PyTree, TrainState
-
-
-def installed() -> int | None:
-    """Bytes of memory that this machine has; None where it does not say, as on Windows."""
-    if not hasattr(os, "sysconf"):
-        return None
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def check(needs: Mapping[str, int]) -> None:
@@ -27,13 +19,8 @@ def check(needs: Mapping[str, int]) -> None:
     Raises:
         UserError: names the options.
     """
-    memory = installed()
     for options, needed in needs.items():
-        if memory is not None and needed > memory:
-            raise UserError(
-                f"{options}: at least {needed >> 30} GiB of memory would be needed, and this "
-                f"machine has {memory >> 30}"
-            )
+        check_memory(needed, options)
 
 
 def check_state(state: TrainState) -> None:

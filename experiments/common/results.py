@@ -130,7 +130,16 @@ def folder(recorded: bool, runs: Path) -> Path:
 
 
 def record(path: Path, row: Row) -> None:
-    """Adds a row, in the place of one of the same configuration, atomically."""
+    """Adds a row, in the place of one of the same configuration, atomically.
+
+    Raises:
+        UserError: it holds a number that is not finite, which JSON has no word for.
+    """
+    for name, value in row.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError:
+            raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
     with only_process_in(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])

@@ -32,6 +32,7 @@ import numpy as np
 
 from leapjax import files
 from leapjax.atari.games import GAMES, HEIGHT, WIDTH, Game
+from leapjax.checks import check_seed
 from leapjax.data.storage import UNKNOWN_SEED
 from leapjax.domain import Collection
 from leapjax.errors import UserError, first_line
@@ -394,7 +395,7 @@ def _choose(logs: Path, numbers: list[int], transitions: int, seed: int) -> _Cho
     Raises:
         UserError: there are none.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     left, waiting = list(numbers), dict[int, list[_Span]]()
     chosen, dropped, total = list[_Span](), Counter[str](), 0
     while left and total < transitions:

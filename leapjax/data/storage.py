@@ -30,7 +30,7 @@ from minari.storage.datasets_root_dir import get_dataset_path
 from PIL import Image
 
 from leapjax import files
-from leapjax.checks import MOST, check_fits
+from leapjax.checks import MOST, check_fits, check_integer
 from leapjax.domain import Collection, Described, Domain, Recording, Source
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
@@ -346,7 +346,18 @@ def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
         dataset = minari.load_dataset(name)
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
         for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
-            yield episode, int(details.get("seed", UNKNOWN_SEED))
+            yield episode, _seed(details.get("seed"))
+
+
+def _seed(value: Any) -> int:
+    """The seed of a reset as a data set holds it: of 64 bits, which is all that it can hold.
+
+    Anything else is unknown, so that a demonstration can always be stored again.
+    """
+    try:
+        return check_integer("the seed of an episode", value, 0, 2**64 - 1)
+    except UserError:
+        return UNKNOWN_SEED
 
 
 def _demonstration(

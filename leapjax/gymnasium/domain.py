@@ -1,5 +1,6 @@
 """Any Gymnasium environment with discrete actions as a `Domain`, with data from Minari."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -75,6 +76,10 @@ class CheckedAdapter(GymnasiumAdapter):
         found = self._guarded("step", lambda: super(CheckedAdapter, self).step(action))
         return found._replace(observation=self._checked(found.observation))
 
+    def close(self) -> None:
+        """Closes the environment."""
+        self._guarded("close", super().close)
+
     def _guarded(self, what: str, work: Callable[[], R]) -> R:
         try:
             return work()
@@ -113,6 +118,8 @@ def make_environment(name: str, options: Settings) -> gym.Env:
             f"the environment {name!r} cannot be made: {_explain(name, error)}"
         ) from None
     if _longest(env) is None:
+        with contextlib.suppress(Exception):
+            env.close()
         raise UserError(
             f"{name} has no limit of steps, so an episode may never end: give it one with "
             "--max-steps"
@@ -160,6 +167,15 @@ def make(name: str, options: Settings) -> Domain:
         UserError: it cannot be made, or its spaces cannot be used.
     """
     env = make_environment(name, options)
+    try:
+        return _described(env, name, options)
+    finally:
+        with contextlib.suppress(Exception):  # it was only looked at
+            env.close()
+
+
+def _described(env: gym.Env, name: str, options: Settings) -> Domain:
+    """The domain of an environment that is only looked at."""
     actions = env.action_space
     if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
         raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
