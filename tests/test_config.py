@@ -178,7 +178,8 @@ def test_every_program_is_known_by_name(capsys):
 
 
 KINDS = [
-    *{method.settings for method in METHODS.values()}, *(d.settings for d in DOMAINS.values()),
+    *dict.fromkeys(method.settings for method in METHODS.values()),
+    *(domain.settings for domain in DOMAINS.values()),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
 FIELDS = [
