@@ -271,7 +271,8 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
             as episodes.
     """
     key = planner_key(seed)
-    episodes, replans = check_seeds(episodes, "episode"), check_seeds(replans, "replan")
+    episodes = check_seeds(_whole(episodes), "episode")
+    replans = check_seeds(_whole(replans), "replan")
     batch = len(episodes)
     if len(replans) != batch:
         raise UserError(f"{batch} episodes, but {len(replans)} replans: expected one for each")
@@ -281,6 +282,15 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
     rows = np.minimum(np.arange(1 << (batch - 1).bit_length()), batch - 1)
     folded = np.stack([episodes, replans])[:, rows]
     return np.asarray(_fold_in(key, folded))[:batch]
+
+
+def _whole(values: np.ndarray) -> np.ndarray:
+    """Integers where all numbers are whole: `np.zeros(B)`, which holds floats, means B zeros."""
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            integers = values.astype(np.int64)
+        return integers if np.array_equal(integers, values) else values
+    return values
 
 
 def plan_key(key: jax.Array, episode: jax.Array, replan: jax.Array) -> jax.Array:

@@ -961,6 +961,9 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
     keys = [jax.random.key_data(plan_keys(seed, grid[:, 0], grid[:, 1])) for seed in (0, 1)]
     assert len(np.unique(np.concatenate(keys), axis=0)) == 2 * len(grid)
+    np.testing.assert_array_equal(
+        plan_keys(0, episodes, np.zeros(4)), plan_keys(0, episodes, [0] * 4)
+    )
 
 
 # Mistakes.
@@ -1170,7 +1173,7 @@ def test_numbers_of_64_bits_that_fit_are_taken():
 
 
 @pytest.mark.parametrize("edge", [0, 1, 2])
-@pytest.mark.parametrize("wrong", [-1, 2**32, 5.9])
+@pytest.mark.parametrize("wrong", [-1, 2**32, 5.9, np.nan, 1e300, -1.0])
 def test_keys_of_other_numbers_than_seeds_are_refused(edge, wrong):
     arguments = [0, np.array([0]), np.array([0])]
     arguments[edge] = np.array([wrong]) if edge else wrong
