@@ -268,7 +268,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--seeds", "-1"], "a training seed must be at least 0"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
-        (["--checkpoint", "n" * 300], f"File name too long: {'n' * 300}"),
+        (["--checkpoint", "n" * 300], "...: File name too long"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):

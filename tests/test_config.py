@@ -14,7 +14,7 @@ import experiments.__main__ as programs
 from experiments.common import config, memory
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, pretrained
+from leapjax import checkpoints, domains, files, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
@@ -242,7 +242,8 @@ def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path
 
 
 def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch):
-    monkeypatch.setattr(memory, "installed", lambda: 10 << 30)
+    pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
+    monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
 
     def state(count):
         params = {"w": jax.ShapeDtypeStruct((count, 1024, 1024), jnp.float32)}
@@ -266,7 +267,7 @@ def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkey
         memory.check_program(Compiled())
     Compiled.memory_analysis = lambda self: None  # a backend that does not say
     memory.check_program(Compiled())
-    monkeypatch.setattr(memory, "installed", lambda: None)
+    monkeypatch.delattr(files.os, "sysconf")  # Windows does not say
     memory.check_state(state(2**40))
 
 

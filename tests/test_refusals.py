@@ -280,8 +280,7 @@ def test_code_that_data_name(trap, monkeypatch):
 
 
 SIZES = [
-    ("model", {"layers": 100_000}), ("domain_settings", {"rounds": 10**6}),
-    ("model", {"width": 2**40}), ("model", {"width": 2**30}),
+    ("model", {"layers": 150}), ("domain_settings", {"rounds": 150}), ("model", {"width": 2**30}),
 ]  # fmt: skip
 
 
@@ -294,12 +293,11 @@ def test_a_specification_of_a_network_that_nothing_can_build(workplace, monkeypa
     (folder / "specification.json").write_text(json.dumps(values))
     with monkeypatch.context() as patch:
         patch.setattr(pretrained, "make_domain", lambda *given: pytest.fail("built"))
-        with pytest.raises(UserError, match="another configuration|must be at most"):
+        with pytest.raises(UserError, match="another configuration"):
             leap.load(folder)
-    if 2**40 not in size.values():  # which no specification may say
-        seal(folder)
-        with pytest.raises(UserError, match="but only 1 arrays of at most 900 numbers were saved"):
-            leap.load(folder)
+    seal(folder)
+    with pytest.raises(UserError, match="but only 1 arrays of at most 900 numbers were saved"):
+        leap.load(folder)
 
 
 # Paths and files.

@@ -788,7 +788,8 @@ class Common(GymnasiumAdapter):
     env = ONE
 
     def __init__(self) -> None:
-        self.num_actions, self._first_action, self._threshold, self._return = 4, 0, None, 0.0
+        super().__init__(ONE)
+        del self.env
 
 
 class Late(GymnasiumAdapter):
