@@ -6,6 +6,7 @@ over the plan; states encoded per second, and what that is of the matrix-multipl
 the same run, as for training.
 """
 
+import contextlib
 import dataclasses
 import sys
 import time
@@ -30,7 +31,7 @@ from experiments.tables.atari import encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
-from leapjax.environments import Eager
+from leapjax.environments import Eager, closing
 from leapjax.errors import UserError
 from leapjax.rollouts import kept
 
@@ -79,7 +80,7 @@ def run(options: Options) -> None:
     if options.training_json and not options.training:
         raise UserError("--training-json with --no-training: there are no rows to write; drop one")
     check_writable(options.json, options.training_json)
-    runtime.use_every_core()  # and no compilation cache: compile times are real
+    runtime.start(cache=False)  # compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [
         with_options(preset("atari", game, "leap", name), {"max_steps": 1000})
@@ -151,18 +152,19 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
 
 def playing_seconds(domain: Domain, batch: int) -> float:
     """What one decision in each of some games takes the emulator."""
-    adapters = [domain.make_adapter() for _ in range(batch)]
-    for seed, adapter in enumerate(adapters):
-        adapter.reset(seed)
-    actions = np.random.default_rng(0).integers(domain.num_actions - 1, size=(DECISIONS, batch))
-    begun = time.perf_counter()
-    for decision in actions:
-        for adapter, action in zip(adapters, decision, strict=True):
-            assert isinstance(adapter, Eager)
-            adapter.begin(int(action))
-        for adapter, action in zip(adapters, decision, strict=True):
-            adapter.step(int(action))
-    return (time.perf_counter() - begun) / DECISIONS
+    with contextlib.ExitStack() as stack:
+        adapters = [stack.enter_context(closing(domain.make_adapter())) for _ in range(batch)]
+        for seed, adapter in enumerate(adapters):
+            adapter.reset(seed)
+        actions = np.random.default_rng(0).integers(domain.num_actions - 1, size=(DECISIONS, batch))
+        begun = time.perf_counter()
+        for decision in actions:
+            for adapter, action in zip(adapters, decision, strict=True):
+                assert isinstance(adapter, Eager)
+                adapter.begin(int(action))
+            for adapter, action in zip(adapters, decision, strict=True):
+                adapter.step(int(action))
+        return (time.perf_counter() - begun) / DECISIONS
 
 
 def tables(rows: Sequence[Row]) -> tuple[Table, Table]:

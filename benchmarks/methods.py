@@ -59,7 +59,7 @@ def run(options: Options) -> None:
     check_counts(options, "batch", "rounds")
     level = levels.find_level(options.level)
     check_writable(options.json)
-    runtime.use_every_core()
+    runtime.start(cache=False)
     calls = {method: make_call(level.name, method, options.batch) for method in METHODS}
     best = dict.fromkeys(METHODS, float("inf"))
     for _ in range(options.rounds):

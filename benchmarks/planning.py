@@ -85,7 +85,7 @@ def run(options: Options) -> None:
         if not sizes or min(sizes) < 1:
             raise UserError(f"--{name} {' '.join(map(str, sizes))}: expected positive numbers")
     check_writable(options.json)
-    runtime.use_every_core()  # and no compilation cache: compile times are real
+    runtime.start(cache=False)  # compile times are real
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
     batches = (1, 256) if options.quick else options.batches
     console = Console()

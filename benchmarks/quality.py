@@ -24,6 +24,7 @@ from leapjax import pretrained, rollouts
 from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
+from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import FILLS, GibbsConfig
 from leapjax.scores import wilson_interval
@@ -127,12 +128,12 @@ def measure(options: Options, path: Path, name: str, config: GibbsConfig) -> Row
     planner = pretrained.load(path, config)
     specification = planner.specification
     domain, context = pretrained.make_domain(specification), specification.context
-    adapter = domain.make_adapter()
     firsts = seeds.validation_seeds(0, min(options.batch, options.episodes))
-    histories = [
-        rollouts.History(adapter.reset(int(seed)), context, adapter.num_actions)
-        for seed in np.resize(np.array(firsts), options.batch)
-    ]
+    with closing(domain.make_adapter()) as adapter:
+        histories = [
+            rollouts.History(adapter.reset(int(seed)), context, adapter.num_actions)
+            for seed in np.resize(np.array(firsts), options.batch)
+        ]
     contexts = rollouts.stack_contexts(histories)
     keys = plan_keys(0, np.arange(options.batch), np.zeros(options.batch, int))
     planner(keys, contexts)

@@ -63,7 +63,7 @@ def run(options: Options, arguments: list[str]) -> None:
     preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
     check_writable(options.json)
     if options.worker:
-        runtime.connect(options.cluster)
+        runtime.start(options.cluster, cache=False)
         row = measure(options)
         if processes.is_first():
             print(json.dumps(row), flush=True)

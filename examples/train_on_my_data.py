@@ -14,6 +14,7 @@ import leapjax as leap
 from leapjax.agents import leap as method
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import storage, windows
+from leapjax.domain import apply_statistics
 from leapjax.domains import find_domain
 from leapjax.gymnasium.domain import Settings
 from leapjax.models.trajectory import ModelConfig
@@ -38,7 +39,9 @@ if not storage.exists(NAME):
 
 # A network of plans of five actions, trained and played.
 domain = find_domain("gymnasium").make("CartPole-v1", Settings())
-data = windows.concatenate(storage.load(NAME, domain).demonstrations)
+demonstrations = storage.load(NAME, domain).demonstrations
+domain = apply_statistics(domain, domain.measure(demonstrations))  # the network scales numbers
+data = windows.concatenate(demonstrations)
 training = TrainingConfig(steps=steps, learning_rate=3e-3)
 model = ModelConfig(width=64, layers=2, dropout=0.0)
 agent = method.make_agent(Setup(domain, 0, 5, model, training, method.Settings("random")))

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, program, results
+from experiments.common import experiment, memory, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
@@ -26,6 +26,7 @@ from leapjax.errors import UserError
 
 RECORDED = Path("results/atari-data.json")
 EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
+SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
 NAMES = {"--game": "--level"}  # what its users call the options of every experiment
 
 
@@ -68,6 +69,8 @@ def run(options: Collect) -> None:
     for name in ("transitions", "replay_run", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
+    Settings(replay_run=options.replay_run, max_steps=options.longest)  # raises above their ranges
+    memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
     if options.record and (options.replay_run, options.longest) != (1, LONGEST):
         raise UserError(
             f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"

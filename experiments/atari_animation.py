@@ -9,6 +9,7 @@ from PIL import Image, ImageDraw
 from experiments.common.episodes import watched
 from experiments.common.pictures import Frame, save_animation
 from experiments.common.run import Run
+from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
 from leapjax.types import Plan
 
@@ -22,20 +23,21 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     """Draws the beginning of one game, every second decision of it."""
     from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
 
-    adapter = run.domain.make_adapter()
-    assert isinstance(adapter, AtariAdapter)
     actions, title = run.domain.actions, run.domain.level
     frames: list[Frame] = []
     step = 0
-    for event in watched(
-        adapter, planner, planner.specification.context, seeds[0], run.seed, run.config.executed,
-        MOST_DECISIONS,
-    ):  # fmt: skip
-        if not isinstance(event, Plan):
-            step += 1
-        elif step % SHOWN == 0:
-            plan = np.asarray(event.actions[0])
-            frames.append((picture(adapter.frame, plan, actions, adapter.score, title), STEP_MS))
+    with closing(run.domain.make_adapter()) as adapter:
+        assert isinstance(adapter, AtariAdapter)
+        context, executed = planner.specification.context, run.config.executed
+        for event in watched(
+            adapter, planner, context, seeds[0], run.seed, executed, MOST_DECISIONS
+        ):
+            if not isinstance(event, Plan):
+                step += 1
+            elif step % SHOWN == 0:
+                plan = np.asarray(event.actions[0])
+                drawn = picture(adapter.frame, plan, actions, adapter.score, title)
+                frames.append((drawn, STEP_MS))
     save_animation(frames, path)
 
 

@@ -19,8 +19,8 @@ from rich.console import Console
 from scipy import stats
 
 from experiments.accuracy import learned
-from experiments.common import plots, program, results, runtime
-from experiments.common.config import check_counts
+from experiments.common import memory, plots, program, results, runtime
+from experiments.common.config import check_counts, layer_bytes
 from leapjax import pretrained
 from leapjax.data import windows
 from leapjax.errors import UserError
@@ -62,6 +62,10 @@ def report(options: Options) -> None:
             raise UserError(
                 f"{path} is {specification.method} on {specification.level}, not LEAP on Atari"
             )
+        # Each window is scored with T passes, all of a trajectory at once.
+        horizon, model = specification.planner.horizon, specification.model
+        layer = layer_bytes(model, specification.context + horizon)
+        memory.check({"--windows": options.windows * horizon * layer})
     runtime.start()
     path = results.folder(options.record, options.runs) / RESULTS
     console = Console()

@@ -12,6 +12,7 @@ from experiments.common.run import Run
 from leapjax.babyai import levels
 from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
 from leapjax.babyai.levels import Level
+from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
 from leapjax.types import Plan
 
@@ -32,7 +33,13 @@ def episode_frames(
     planner: Pretrained, level: Level, level_seed: int, seed: int, executed: int | None = None
 ) -> list[Frame]:
     """The frames of one episode with their durations in milliseconds."""
-    adapter = BabyAIAdapter(level)
+    with closing(BabyAIAdapter(level)) as adapter:
+        return _frames(adapter, planner, level_seed, seed, executed)
+
+
+def _frames(
+    adapter: BabyAIAdapter, planner: Pretrained, level_seed: int, seed: int, executed: int | None
+) -> list[Frame]:
     frames: list[Frame] = []
     replan = step = 0
     context = planner.specification.context

@@ -21,13 +21,14 @@ from rich.table import Table
 
 from experiments.babyai_drawing import picture
 from experiments.common import program, runtime
-from experiments.common.config import check_executed
+from experiments.common.config import check_counts, check_executed
 from experiments.common.pictures import check_picture, save_sheet
 from leapjax import pretrained, rollouts
 from leapjax.babyai import levels, observations
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.levels import Level
 from leapjax.babyai.observations import Cell, Observation
+from leapjax.checks import check_integer
 from leapjax.data import seeds
 from leapjax.environments import Transition
 from leapjax.errors import UserError
@@ -99,6 +100,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def report(options: Options) -> None:
     """Plays validation levels, prints the tables, draws the gallery."""
+    check_counts(options, "episodes")
+    check_integer("--drawn", options.drawn)
     console = Console()
     played = seeds.validation_seeds(0, options.episodes)
     if options.gallery is not None:
@@ -145,10 +148,14 @@ def play(
 ) -> tuple[list[Recorder], list[bool]]:
     """The episodes of one planner, and whether each succeeded."""
     planner = pretrained.load(run)
-    recorders = [Recorder(level) for _ in played]
-    waiting = iter(recorders)
+    recorders: list[Recorder] = []
+
+    def make_adapter() -> Recorder:
+        recorders.append(Recorder(level))
+        return recorders[-1]
+
     episodes = rollouts.evaluate(
-        lambda: next(waiting), played, planner.plan, planner.params,
+        make_adapter, played, planner.plan, planner.params,
         context=planner.specification.context, executed=executed,
     )  # fmt: skip
     return recorders, episodes.successes.tolist()

@@ -32,9 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def publish(runs: Sequence[Path]) -> None:
     """Publishes runs, the later one where two are of one level."""
+    targets = [pretrained.PUBLISHED / pretrained.read_specification(run).level for run in runs]
     runtime.start()
-    for folder in runs:
-        target = pretrained.PUBLISHED / pretrained.read_specification(folder).level
+    for folder, target in zip(runs, targets, strict=True):
         pretrained.publish(folder, target)
         size = sum(path.stat().st_size for path in target.iterdir())
         print(f"{folder}: {target}, {size / 1e6:.1f} MB")

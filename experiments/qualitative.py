@@ -31,6 +31,7 @@ from leapjax.babyai.constraints import in_half
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.observations import Cell, agent_cell
 from leapjax.data import seeds
+from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import Pretrained
@@ -116,8 +117,8 @@ def refinement(level: str, first: int) -> list[Image.Image]:
 
     def plans_of(found: Drawn) -> tuple[BabyAIAdapter, list[list[Cell]]]:
         """The level as it was at first, and where plans lead after more and more iterations."""
-        start = BabyAIAdapter(find_level(level))
-        start.reset(found.level_seed)
+        with closing(BabyAIAdapter(find_level(level))) as start:
+            start.reset(found.level_seed)
         return start, [way_of(start, found.trace[n - 1]) for n in ITERATIONS]
 
     def refined(found: Drawn) -> bool:
@@ -181,7 +182,8 @@ def episode(
         UserError: there is none among many.
     """
     for level_seed in range(first, first + MOST_LEVELS):
-        found = played(BabyAIAdapter(find_level(level)), planner, limit, level_seed)
+        with closing(BabyAIAdapter(find_level(level))) as adapter:
+            found = played(adapter, planner, limit, level_seed)
         if found.steps >= STEPS and wanted(found):
             return found
     raise UserError(f"--test-seed {first}: none of {MOST_LEVELS} episodes is worth a drawing")

@@ -3,32 +3,33 @@
 What is in each is a function of rows in `experiments/tables/`.
 """
 
+import argparse
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.common import plots, program, results
 from experiments.common.results import Row
-from experiments.tables import analyses, atari, babyai, puzzles, speed
+from experiments.tables import analyses, atari, babyai, measured, puzzles, speed
 from experiments.tables.analyses import ANALYSES
-from leapjax.checkpoints import read_json
+from experiments.tables.measured import MEASURED
+from leapjax.errors import UserError
 from leapjax.files import read_text, write_text
 
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 PROPERTIES = ("adaptation", "generalization", "composition", "constraints")  # a table each
-MEASURED = (  # files of rows beside those of experiments
-    "planning", "training", "quality", "methods", "landscape",
-    "atari-data", "atari-energy", "atari-cost", "atari-training",
-)  # fmt: skip
 
 
-def main() -> int:
-    """Rewrites every table here."""
-    return program.guarded("experiments.report", (), rewrite)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Rewrites every table here; the exit code."""
+    given = program.arguments_of(arguments)
+    about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
+    argparse.ArgumentParser("experiments.report", description=about).parse_args(given)
+    return program.guarded("experiments.report", given, rewrite)
 
 
 def rewrite() -> None:
@@ -46,20 +47,57 @@ def rewrite() -> None:
 
 
 def rows_of(root: Path, *names: str) -> list[Row]:
-    """The rows of some experiments."""
-    return [row for name in names for row in results.read(root / "results" / f"{name}.jsonl")]
+    """The rows of some experiments.
+
+    Raises:
+        UserError: a row that tables could not be made from, or of another experiment.
+    """
+    found = []
+    for name in names:
+        path = root / "results" / f"{name}.jsonl"
+        schema = results.OF_ANALYSIS if name in ANALYSES else results.OF_EXPERIMENT
+        for row in results.read(path, schema):
+            if row["experiment"] != name:
+                raise UserError(
+                    f"{path}: a row of {row['experiment'][:40]}, hash {row['hash'][:20]}: move it "
+                    "to the file of its experiment"
+                )
+            found.append(row)
+    return found
 
 
 def _measured(root: Path, name: str) -> Any:
-    return read_json(root / "results" / f"{name}.json")
+    return measured.read(root / "results" / f"{name}.json")
+
+
+def rows_by_source(root: Path) -> dict[str, Any]:
+    """What tables are made from: rows by experiment, and what was measured, by file."""
+    rows: dict[str, Any] = {name: rows_of(root, name) for name in EXPERIMENTS}
+    rows |= {name: _measured(root, name) for name in MEASURED}
+    return rows | {"puzzles": [row for name in PUZZLES for row in rows[name]]}
 
 
 def documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
-    rows: dict[str, Any] = {name: rows_of(root, name) for name in EXPERIMENTS}
-    rows |= {name: _measured(root, name) for name in MEASURED}
-    rows["puzzles"] = [row for name in PUZZLES for row in rows[name]]
-    sections: dict[str, tuple[Callable[[Any], str], str]] = {
+    rows = rows_by_source(root)
+    sections = sections_of(rows)
+    written = {}
+    for path in (root / name for name in DOCUMENTS):
+        text = read_text(path)
+        for name, (make, source) in sections.items():
+            if f"<!-- {name}: begin -->" in text:
+                text = replace_section(text, name, make(rows[source]))
+        written[path] = text
+    return written
+
+
+def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str], str]]:
+    """By name of the section, what makes its table, and the source of the rows that it takes.
+
+    Args:
+        rows: by source: some tables take a second one.
+    """
+    return {
         "results": (babyai.success, "babyai"),
         "steps": (babyai.steps, "babyai"),
         "iterations": (babyai.iterations, "babyai"),
@@ -96,14 +134,6 @@ def documents(root: Path) -> dict[Path, str]:
             if name != "properties"
         },
     }
-    written = {}
-    for path in (root / name for name in DOCUMENTS):
-        text = read_text(path)
-        for name, (make, source) in sections.items():
-            if f"<!-- {name}: begin -->" in text:
-                text = replace_section(text, name, make(rows[source]))
-        written[path] = text
-    return written
 
 
 def replace_section(text: str, name: str, section: str) -> str:

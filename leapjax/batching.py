@@ -10,10 +10,13 @@ import numpy as np
 from jax.sharding import Mesh
 
 from leapjax import sharding
+from leapjax.checks import check_counts, check_seed, check_seeds
+from leapjax.errors import UserError
 from leapjax.planners import PlannerConfig, bind
 from leapjax.types import Array, Energy, Params, Plan, PyTree
 
 CHUNK_SIZES = (1, 16, 128)
+KEYS = "threefry2x32"  # the kind of all keys made here, whatever JAX is set to: see `plan_keys`
 
 
 class NotANumber(ValueError):
@@ -40,9 +43,9 @@ class CompiledPlanner:
         chunk_sizes: Sequence[int],
         devices: Sequence[jax.Device] | None,
     ) -> None:
-        self.chunk_sizes = tuple(sorted(set(chunk_sizes)))
-        if not self.chunk_sizes or self.chunk_sizes[0] < 1:
-            raise ValueError(f"chunk sizes must be positive, got {tuple(chunk_sizes)}")
+        self.chunk_sizes = tuple(sorted({*check_counts("chunk sizes", chunk_sizes, 1).tolist()}))
+        if not self.chunk_sizes:
+            raise ValueError("chunk sizes: expected at least one")
         planner = bind(energy, config)
         self.num_actions = energy.num_actions
 
@@ -63,14 +66,15 @@ class CompiledPlanner:
 
         Args:
             params: of the energy.
-            keys: `[B]`, or raw `[B, 2]` from `plan_keys`.
+            keys: `[B]`, or raw `[B, 2]` uint32 from `plan_keys`.
             contexts: leaves with a leading `[B]`.
 
         Returns:
             A `Plan` of NumPy arrays with a leading `[B]`.
 
         Raises:
-            ValueError: no contexts, or not as many as keys, or contexts that are not numbers.
+            ValueError: no contexts, or not as many as keys; contexts that are not numbers; numbers
+                of 64 bits, in contexts or parameters, that do not fit 32.
             NotANumber: the energy of some action was NaN or -inf; it holds the plans.
         """
         keys = keys if hasattr(keys, "dtype") else jnp.stack(list(keys))
@@ -94,10 +98,12 @@ class CompiledPlanner:
                     f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
                     "numbers: encode it first"
                 )
+        check_fit("context", contexts)
         # Cut with NumPy: each slice of a device array would be a program of its own.
-        kind = str(jax.config.jax_default_prng_impl)  # type: ignore[attr-defined]
         if typed:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
+        else:
+            kind = _kind_of(keys)
         inputs = jax.tree.map(np.asarray, (keys, contexts))
         chunks = split_batch(batch, self.chunk_sizes)
         placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
@@ -136,6 +142,7 @@ class CompiledPlanner:
             placed = {}
         missing = {mesh for mesh in meshes if mesh.size not in placed}
         if missing:
+            check_fit("params", params)
             placed = placed | {mesh.size: sharding.replicate(params, mesh) for mesh in missing}
             self._last = leaves, structure, placed  # at once: another thread sees all or nothing
         return placed
@@ -196,6 +203,61 @@ def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
     return chunks
 
 
+def check_fit(name: str, tree: PyTree) -> None:
+    """Refuses numbers that JAX, which computes with 32 bits, would change beyond rounding.
+
+    Args:
+        name: of the tree, for the message.
+        tree: arrays of any kind; those of JAX are as they are.
+
+    Raises:
+        UserError: names the first leaf that holds such a number.
+    """
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        if isinstance(leaf, jax.Array):
+            continue
+        array = np.asarray(leaf)
+        if array.dtype.kind not in "iuf" or not array.size:
+            continue
+        narrow = jax.dtypes.canonicalize_dtype(array.dtype)
+        if narrow == array.dtype:
+            continue
+        limits: Any = np.finfo(narrow) if narrow.kind == "f" else np.iinfo(narrow)
+        least, most = (x.item() if narrow.kind == "f" else x for x in (limits.min, limits.max))
+        if array.min() >= least and array.max() <= most:
+            continue
+        wrong = array[((array < least) | (array > most)) & np.isfinite(array)]
+        if wrong.size:
+            raise UserError(
+                f"{name}{jax.tree_util.keystr(path)} holds {wrong[0]}, which does not fit "
+                f"{narrow}, the numbers that JAX computes with"
+            )
+
+
+def _kind_of(keys: Array) -> str:
+    """The kind of raw keys `[B, width]`, which their width tells: 2 of `KEYS`, else the default.
+
+    Raises:
+        UserError: they are of no kind.
+    """
+    if keys.dtype == np.uint32 and keys.shape[1] == 2:
+        return KEYS
+    if keys.dtype == np.uint32 and keys.shape[1:] == jax.random.PRNGKey(0).shape:
+        return str(jax.config.jax_default_prng_impl)  # type: ignore[attr-defined]
+    raise UserError(
+        f"raw keys must be [B, 2] uint32, as plan_keys makes them, got {keys.shape} {keys.dtype}"
+    )
+
+
+def planner_key(seed: int) -> jax.Array:
+    """The key that all plans of a seed derive theirs from.
+
+    Raises:
+        UserError: not a seed; see `leapjax.checks.check_seed`.
+    """
+    return jax.random.key(check_seed(seed), impl=KEYS)
+
+
 def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarray:
     """Raw keys `[B, 2]` uint32: functions of (seed, episode, replan index), not of the row.
 
@@ -203,14 +265,32 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
         seed: of all plans.
         episodes: `[B]` whose plan it is, such as a level seed.
         replans: `[B]` how many plans the episode has had.
+
+    Raises:
+        UserError: one of these is not an integer in 0 .. 2^32 - 1, or there are not as many replans
+            as episodes.
     """
+    key = planner_key(seed)
+    episodes = check_seeds(_whole(episodes), "episode")
+    replans = check_seeds(_whole(replans), "replan")
     batch = len(episodes)
+    if len(replans) != batch:
+        raise UserError(f"{batch} episodes, but {len(replans)} replans: expected one for each")
     if batch == 0:
         return np.zeros((0, 2), np.uint32)
     # Padded to a power of two, so that a shrinking batch does not compile at every size.
     rows = np.minimum(np.arange(1 << (batch - 1).bit_length()), batch - 1)
-    folded = np.stack([episodes, replans]).astype(np.uint32)[:, rows]
-    return np.asarray(_fold_in(jax.random.key(seed), folded))[:batch]
+    folded = np.stack([episodes, replans])[:, rows]
+    return np.asarray(_fold_in(key, folded))[:batch]
+
+
+def _whole(values: np.ndarray) -> np.ndarray:
+    """Integers where all numbers are whole: `np.zeros(B)`, which holds floats, means B zeros."""
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            integers = values.astype(np.int64)
+        return integers if np.array_equal(integers, values) else values
+    return values
 
 
 def plan_key(key: jax.Array, episode: jax.Array, replan: jax.Array) -> jax.Array:

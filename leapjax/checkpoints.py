@@ -3,9 +3,16 @@
 import contextlib
 import dataclasses
 import errno
+import functools
+import glob
 import hashlib
 import json
+import logging
+import math
+import os
 import shutil
+import sys
+import traceback
 import types
 import typing
 import warnings
@@ -23,9 +30,12 @@ from leapjax import files, processes, sharding
 from leapjax.errors import UserError, first_line
 from leapjax.types import PyTree, TrainState
 
-UNUSABLE = ("[", "*", "?", ":/")  # in a path: Orbax takes them for patterns and for addresses
 ITEM = "default"  # Orbax's name for the only thing that a checkpoint of ours holds
+IDENTITY = "identity"  # the array that says whose checkpoint it is
 PASSING = {errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM}  # not damage
+ORBAX = Path(ocp.__file__).parent
+Shapes = dict[str, tuple[int, ...]]  # by the place of an array in its tree
+NO_ROOM = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]
 T = TypeVar("T")
 
 
@@ -43,9 +53,11 @@ class Checkpoints:
 
     def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
         check_path(folder)
+        hush_orbax()
         self._folder = _absolute(folder)
         self._identity = identity
         self._keep = keep
+        self._saved: int | None = None  # the step that was saved last
         if processes.is_first():
             self._manager = self._open()
 
@@ -77,11 +89,12 @@ class Checkpoints:
         values = jax.tree.map(np.array, sharding.to_host(state))
 
         def write() -> None:
-            # Where the disk fills up meanwhile Orbax says so on every thread, with tracebacks.
+            self._finish()
             files.check_room(self._folder, sum(x.nbytes for x in jax.tree.leaves(values)))
             with self._writing():
                 arguments = ocp.args.StandardSave(_sealed(values._asdict(), self._identity))
                 self._manager.save(int(values.step), args=arguments)
+            self._saved = int(values.step)
 
         processes.first_does(write)
 
@@ -113,8 +126,7 @@ class Checkpoints:
 
     def _read(self, like: TrainState, skipped: Callable[[str], Any]) -> list[TrainState]:
         """The newest state, as arrays of NumPy, or nothing."""
-        with self._writing():
-            self._manager.wait_until_finished()  # one that is still being written is the newest
+        self._finish()  # one that is still being written is the newest
         while (latest := self._manager.latest_step()) is not None:
             path = self._folder / str(latest)
             try:
@@ -147,21 +159,37 @@ class Checkpoints:
         went wrong, where they may be anywhere.
 
         Raises:
-            UserError: a state cannot be written.
+            UserError: a state cannot be written, or is not found where it was to be.
         """
         if processes.is_first():
-            with self._writing():
-                self._manager.wait_until_finished()
+            self._finish()
             self._manager.close()
+
+    def _finish(self) -> None:
+        """Waits until the last state is on disk, and looks for it where it will be read."""
+        with self._writing():
+            self._manager.wait_until_finished()
+        if self._saved is None:
+            return
+        path, self._saved = self._folder / str(self._saved), None
+        try:
+            _saved_shapes(path)
+        except Exception as error:  # noqa: BLE001  (TensorStore raises many kinds)
+            raise UserError(
+                f"a checkpoint was written, but is not found in {path} ({first_line(error)}): "
+                "choose another folder"
+            ) from None
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         try:
             yield
         except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
+            # TensorStore says it at the end of a long line.
+            said = next((text for text in NO_ROOM if text in str(error)), first_line(error))
             raise UserError(
-                f"cannot write a checkpoint to {self._folder} ({first_line(error)}); those "
-                "written before are intact: make room, and start the same command again"
+                f"cannot write a checkpoint to {self._folder} ({said}); those written before are "
+                "intact: make room, and start the same command again"
             ) from None
 
 
@@ -174,14 +202,50 @@ def check_path(folder: Path) -> None:
     """Refuses a folder in which checkpoints would not be found again.
 
     Raises:
-        UserError: says why.
+        UserError: says how the libraries that write them read its name.
     """
-    found = [text for text in UNUSABLE if text in str(_absolute(folder))]
-    if found:
-        raise UserError(
-            f"{_absolute(folder)} cannot hold checkpoints, because of {found[0]!r} in its name: "
-            "choose another folder"
-        )
+    path = str(_absolute(files.check_path(folder)))
+    try:  # of a backslash TensorStore makes a slash
+        spec = tensorstore.KvStore.Spec({"driver": "file", "path": f"{path}/"})
+        written = spec.to_json()["path"].removesuffix("/")
+    except Exception as error:  # noqa: BLE001  (TensorStore raises many kinds)
+        written = first_line(error)
+    if written != path:
+        taken = f"TensorStore takes it for {written}"
+    elif glob.escape(path) != path:
+        taken = "Orbax takes it for a pattern, with '*', '?' or '['"
+    elif ":/" in path:
+        taken = "Orbax takes it for an address, with ':/'"
+    else:
+        return
+    raise UserError(f"{path} cannot hold checkpoints ({taken}): choose another folder")
+
+
+@functools.cache
+def hush_orbax() -> None:
+    """Keeps Orbax from printing what this module says in one line.
+
+    Of a full disk or a damaged checkpoint many threads of Orbax fail at once, and log each
+    failure with its traceback. TensorStore then tells event loops that are closed already.
+    """
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).addFilter(lambda record: not _is_of_orbax(record))
+    before = sys.unraisablehook
+
+    def hook(failure: Any) -> None:
+        if failure.object is not None or str(failure.exc_value) != "Event loop is closed":
+            before(failure)
+
+    sys.unraisablehook = hook
+
+
+def _is_of_orbax(record: logging.LogRecord) -> bool:
+    """Whether a warning was logged by Orbax, or is about an exception in it."""
+    if record.levelno < logging.WARNING:
+        return False
+    failure = record.exc_info[2] if record.exc_info else None
+    places = [record.pathname, *(frame.filename for frame in traceback.extract_tb(failure))]
+    return any(Path(place).is_relative_to(ORBAX) for place in places)
 
 
 class Unfinished(UserError):
@@ -189,11 +253,44 @@ class Unfinished(UserError):
 
 
 def newest(folder: Path) -> list[int]:
-    """The steps of the checkpoints in a folder, the newest first."""
+    """The steps of the checkpoints in a folder, the newest first.
+
+    Raises:
+        UserError: the folder cannot hold checkpoints, or cannot be read.
+    """
     check_path(folder)
     if not folder.is_dir():
         return []
-    return sorted((int(p.name) for p in folder.iterdir() if p.name.isdecimal()), reverse=True)
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise UserError(f"cannot read {folder}: {first_line(error)}") from None
+    # Not `isdecimal` alone: it takes digits of every script, and a number may have many.
+    steps = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) < 20]
+    return sorted(steps, reverse=True)
+
+
+def check_identity(folder: Path, identity: str) -> list[int]:
+    """Checks with which identity the newest readable checkpoint was saved, and reads no more.
+
+    Returns:
+        How many numbers each array of its parameters has.
+
+    Raises:
+        UserError: there is no checkpoint, or it was saved with another identity.
+        Unfinished: none can be read.
+    """
+    reasons = []
+    for step in _steps(folder):
+        path = _absolute(folder) / str(step)
+        try:
+            shapes, saved = _saved_shapes(path), _saved_identity(path)
+        except Exception as error:  # noqa: BLE001  (TensorStore raises many kinds)
+            reasons.append(_cannot_be_read(path, error))
+            continue
+        _check_same(saved, identity, path)
+        return [math.prod(shapes[place]) for place in shapes if place.startswith("params/")]
+    raise Unfinished("; ".join(reasons))
 
 
 def restore_params(
@@ -208,9 +305,8 @@ def restore_params(
             saved with another identity.
         Unfinished: that of `step` is not there, or cannot be read.
     """
-    steps = newest(folder)
-    if not steps:
-        raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
+    hush_orbax()
+    steps = _steps(folder)
     if step is not None:
         if step not in steps:
             raise Unfinished(
@@ -242,12 +338,24 @@ def restore_params(
         except UserError:
             raise
         except Exception as error:  # noqa: BLE001  (TensorStore and Orbax raise many kinds)
-            reasons.append(f"the checkpoint {path} cannot be read ({first_line(error)})")
+            reasons.append(_cannot_be_read(path, error))
         else:
             for reason in reasons:
                 warnings.warn(f"{reason}: using step {step}", stacklevel=2)
             return jax.tree.map(jnp.asarray, params)
     raise (UserError if step is None else Unfinished)("; ".join(reasons))
+
+
+def _steps(folder: Path) -> list[int]:
+    """The steps of the checkpoints in a folder, the newest first; at least one."""
+    steps = newest(folder)
+    if not steps:
+        raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
+    return steps
+
+
+def _cannot_be_read(checkpoint: Path, error: Exception) -> str:
+    return f"the checkpoint {checkpoint} cannot be read ({first_line(error)})"
 
 
 def _blank(like: PyTree) -> PyTree:
@@ -260,12 +368,16 @@ def _sealed(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
 
     The format underneath notices damage to its own structure, not to the numbers.
     """
-    whose = np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
     return {
         **parts,
         "digests": {name: _digest(part) for name, part in parts.items()},
-        "identity": whose,
+        IDENTITY: identity_digest(identity),
     }
+
+
+def identity_digest(identity: str) -> np.ndarray:
+    """The SHA-256 of an identity: `[32]` uint8."""
+    return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
 
 
 def _opened(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, PyTree]:
@@ -275,17 +387,22 @@ def _opened(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, Py
         ValueError: they are damaged.
         UserError: they are whole, but of another configuration.
     """
-    parts = {name: part for name, part in saved.items() if name not in ("digests", "identity")}
+    parts = {name: part for name, part in saved.items() if name not in ("digests", IDENTITY)}
     for name, part in parts.items():
         if not np.array_equal(_digest(part), saved["digests"][name]):
             raise ValueError(f"the numbers of {name} are not those that were saved")
-    if not np.array_equal(saved["identity"], _sealed({}, identity)["identity"]):
-        raise UserError(
-            f"the checkpoint {path} is of another configuration than the one beside it: it was "
-            "copied here from another run, or the specification was changed; put back what was "
-            "there, or train again in another --runs folder"
-        )
+    _check_same(saved[IDENTITY], identity, path)
     return parts
+
+
+def _check_same(saved: np.ndarray, identity: str, checkpoint: Path) -> None:
+    """Refuses a checkpoint that was saved with another identity."""
+    if not np.array_equal(saved, identity_digest(identity)):
+        raise UserError(
+            f"the checkpoint {checkpoint} is of another configuration than the one beside it: it "
+            "was copied here from another run, or the specification was changed; put back what "
+            "was there, or train again in another --runs folder"
+        )
 
 
 def _digest(tree: PyTree) -> np.ndarray:
@@ -296,14 +413,22 @@ def _digest(tree: PyTree) -> np.ndarray:
     return np.frombuffer(digest.digest(), np.uint8)
 
 
-def _saved_shapes(checkpoint: Path) -> dict[str, tuple[int, ...]]:
+def _store(checkpoint: Path) -> tensorstore.KvStore:
+    """The keys and values of a checkpoint."""
+    base = {"driver": "file", "path": f"{checkpoint / ITEM}/"}
+    return tensorstore.KvStore.open({"driver": "ocdbt", "base": base}).result()
+
+
+def _saved_shapes(checkpoint: Path) -> Shapes:
     """The shapes of the arrays in a checkpoint, by their place in the tree.
 
     Nothing is read but what the arrays say of themselves. (Orbax's `metadata` does the same,
     and keeps a megabyte for ever each time.)
+
+    Raises:
+        ValueError: it has no arrays, or some that would be unpacked to more than they hold.
     """
-    base = {"driver": "file", "path": f"{checkpoint / ITEM}/"}
-    store = tensorstore.KvStore.open({"driver": "ocdbt", "base": base}).result()
+    store = _store(checkpoint)
     shapes = {}
     for key in store.list().result():
         name = key.decode()
@@ -311,12 +436,25 @@ def _saved_shapes(checkpoint: Path) -> dict[str, tuple[int, ...]]:
             description = json.loads(store.read(key).result().value)
             place = name.removesuffix("/.zarray").replace(".", "/")
             shapes[place] = tuple(description["shape"])
+            pieces = zip(description["chunks"], shapes[place], strict=True)
+            if any(piece > max(1, size) for piece, size in pieces):
+                raise ValueError(f"{place} is in pieces that are larger than it is")
     if not shapes:
         raise ValueError("it has no arrays")
     return shapes
 
 
-def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
+def _saved_identity(checkpoint: Path) -> np.ndarray:
+    """The digest of the identity that a checkpoint was saved with: `[32]` uint8."""
+    kvstore = _store(checkpoint).spec().to_json()
+    array = tensorstore.open(
+        {"driver": "zarr", "kvstore": {**kvstore, "path": f"{IDENTITY}/"}},
+        dtype=tensorstore.uint8, shape=identity_digest("").shape, open=True,
+    )  # fmt: skip
+    return array.result().read().result()
+
+
+def _shapes(tree: PyTree) -> Shapes:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     # Orbax keeps named tuples and lists as dictionaries: compare the names alone.
     return {
@@ -327,7 +465,7 @@ def _shapes(tree: PyTree) -> dict[str, tuple[int, ...]]:
     }
 
 
-def _check_shapes(found: dict[str, tuple[int, ...]], like: PyTree, checkpoint: Path) -> None:
+def _check_shapes(found: Shapes, like: PyTree, checkpoint: Path) -> None:
     expected = _shapes(like)
     for name in sorted(expected.keys() | found.keys()):
         if found.get(name) != expected.get(name):
@@ -389,13 +527,17 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
     raise UserError(f"{name} must be of type {getattr(hint, '__name__', hint)}, got {value!r}")
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
     """The contents of a JSON file.
 
+    Args:
+        path: of the file.
+        most: the largest size allowed, in bytes.
+
     Raises:
-        UserError: it is missing or is not JSON.
+        UserError: it is missing, is too large, or is not JSON.
     """
-    text = files.read_text(path)
+    text = files.read_text(path, most)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -3,16 +3,20 @@
 A number is taken for what it says, never rounded, wrapped or truncated to fit.
 """
 
+import dataclasses
 import math
 import operator
+import typing
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from leapjax.errors import UserError
 
 MOST = 2**31 - 1  # the largest int32, the integers that JAX computes with
+LARGEST = float(np.finfo(np.float32).max)  # the largest number that JAX computes with
 LARGEST_SEED = 2**32 - 1  # the largest seed that JAX's random keys tell from all others
 
 
@@ -41,12 +45,12 @@ def check_integer(name: str, value: Any, least: int = 0, most: int = MOST) -> in
     return number
 
 
-def check_number(name: str, value: Any, least: float = -math.inf, most: float = math.inf) -> float:
+def check_number(name: str, value: Any, least: float = -LARGEST, most: float = LARGEST) -> float:
     """Returns a finite float of Python.
 
     Args:
         name: of the argument, for the message.
-        value: any real number.
+        value: any real number; booleans, texts and arrays are refused.
         least: the smallest value allowed.
         most: the largest value allowed.
 
@@ -54,16 +58,19 @@ def check_number(name: str, value: Any, least: float = -math.inf, most: float = 
         UserError: not a number, NaN, infinite, or out of range.
     """
     try:
-        if isinstance(value, bool | np.bool_ | str | bytes):
+        if isinstance(value, bool | np.bool_ | str | bytes) or np.ndim(value):
             raise TypeError
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise UserError(f"{name} must be a number, got {_shown(value)}") from None
     if not math.isfinite(number):
         raise UserError(f"{name} must be finite, got {number}")
-    if not least <= number <= most:
+    if least <= number <= most:
+        return number
+    if least > -LARGEST and most < LARGEST:
         raise UserError(f"{name} must be in {least} .. {most}, got {number}")
-    return number
+    bound = f"at least {least}" if number < least else f"at most {most:g}"
+    raise UserError(f"{name} must be {bound}, got {number}")
 
 
 def check_seed(value: Any, name: str = "seed") -> int:
@@ -75,18 +82,34 @@ def check_seed(value: Any, name: str = "seed") -> int:
     return check_integer(name, value, 0, LARGEST_SEED)
 
 
-def check_seeds(values: Sequence[Any], name: str = "seed") -> np.ndarray:
+def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.ndarray:
     """Returns seeds as an array `[n]` uint32; see `check_seed`.
 
     Raises:
         UserError: one of them is no seed.
     """
-    array = np.asarray(values)
-    if array.ndim == 1 and array.dtype == np.uint32:
-        return array
     if np.ndim(values) != 1:
         raise UserError(f"{name}s must be a sequence of integers, got {_shown(values)}")
+    if isinstance(values, np.ndarray | jax.Array) and len(values):
+        array = np.asarray(values)  # of one type, so that its extremes speak for all
+        for extreme in (array.min(), array.max()):
+            check_seed(extreme, name)
+        return array.astype(np.uint32)
     return np.array([check_seed(value, name) for value in values], np.uint32)
+
+
+def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray:
+    """Returns counts as an array `[n]` int64.
+
+    Args:
+        name: of the argument, for the message.
+        values: any sequence of integers.
+        least: the smallest value allowed.
+
+    Raises:
+        UserError: no sequence, or one of them is not an integer, or out of range.
+    """
+    return np.array([check_integer(name, value, least) for value in _items(name, values)], np.int64)
 
 
 def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ...]:
@@ -100,7 +123,7 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
     Raises:
         UserError: other types, an index out of range or named twice, a mask of another length.
     """
-    items = list(values)
+    items = _items(name, values)
     if items and all(isinstance(item, bool | np.bool_) for item in items):
         if len(items) != count:
             raise UserError(f"{name}: a mask of {len(items)} booleans, expected {count}")
@@ -109,6 +132,82 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
     if len(set(indices)) < len(indices):
         raise UserError(f"{name} names one index twice: {indices}")
     return tuple(indices)
+
+
+def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
+    """Returns the same numbers in another type; a type of floats rounds them.
+
+    Args:
+        name: of the numbers, for the message.
+        values: an array of booleans, integers or floats, or what NumPy makes one of.
+        dtype: the type.
+
+    Raises:
+        UserError: no numbers, numbers that the type does not have, or NaN or infinite.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise UserError(f"{name}: numbers expected, got {array.dtype}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        narrow = array.astype(dtype, copy=False)
+    wrong = ~np.isfinite(narrow) if narrow.dtype.kind == "f" else narrow != array
+    if wrong.any():
+        raise UserError(
+            f"{name}: numbers that do not fit {dtype}, or are not finite, such as {array[wrong][0]}"
+        )
+    return narrow
+
+
+def check_types(config: Any, *unlimited: str) -> None:
+    """Checks that every field of a configuration holds what its type says.
+
+    Numbers must be finite. A number of NumPy or JAX becomes Python's, so that a configuration can
+    be hashed and written as JSON. Fields of other types than numbers, booleans, texts, tuples of
+    them and None are not looked at.
+
+    Args:
+        config: an instance of a frozen dataclass.
+        unlimited: fields that may be infinite.
+
+    Raises:
+        UserError: names the field, and what it holds.
+    """
+    types_of = typing.get_type_hints(type(config))
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name in unlimited and isinstance(value, float) and value == math.inf:
+            continue
+        checked = _check_type(field.name, value, types_of[field.name])
+        if checked is not value:
+            object.__setattr__(config, field.name, checked)
+
+
+def _check_type(name: str, value: Any, kind: Any) -> Any:
+    """The value, in the plain type that a field is declared with."""
+    kinds = typing.get_args(kind)
+    if type(None) in kinds:
+        if value is None:
+            return None
+        return _check_type(name, value, next(each for each in kinds if each is not type(None)))
+    if typing.get_origin(kind) is tuple:
+        items = _items(name, value)
+        every = kinds[:1] * len(items) if kinds[1:] == (...,) else kinds
+        if len(items) != len(every):
+            raise UserError(f"{name} must be {len(every)} values, got {_shown(value)}")
+        return tuple(_check_type(name, *each) for each in zip(items, every, strict=True))
+    checked = value
+    if kind is int:
+        checked = check_integer(name, value, -MOST - 1)
+    elif kind is float:
+        checked = check_number(name, value)
+    elif kind is bool and not isinstance(value, bool | np.bool_):
+        raise UserError(f"{name} must be True or False, got {_shown(value)}")
+    elif kind is str and not isinstance(value, str):
+        raise UserError(f"{name} must be a text, got {_shown(value)}")
+    elif kind in (bool, str):
+        checked = kind(value)
+    # An integer that stands for a number stays one: names of runs are made from what is written.
+    return value if type(value) in (int, float, bool, str) else checked
 
 
 def check_at_least(config: object, least: int, *names: str, most: int = MOST) -> None:
@@ -141,6 +240,17 @@ def check_within(config: object, least: float, most: float, *names: str) -> None
     """
     for name in names:
         check_number(name, getattr(config, name), least, most)
+
+
+def _items(name: str, values: Any) -> list[Any]:
+    """What a sequence holds."""
+    try:
+        if isinstance(values, str | bytes):
+            raise TypeError
+        # Of an array of JAX as NumPy's, whose booleans and integers can be told apart.
+        return list(np.asarray(values) if hasattr(values, "dtype") else values)
+    except TypeError:
+        raise UserError(f"{name} must be a sequence, got {_shown(values)}") from None
 
 
 def _shown(value: Any) -> str:

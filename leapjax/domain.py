@@ -10,15 +10,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
+import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.environments import Adapter
+from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
 from leapjax.models.trajectory import ModelConfig
-from leapjax.types import Context, Demonstration, Energy, PyTree, Window
+from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
 
+Statistics = tuple[tuple[tuple[float, ...], ...], ...]
+# what a network must know of its training data, kept with its checkpoint: by array of an
+# observation, by column of it
 Augmentation = Callable[[jax.Array, Window], Window]
 # (key, window) -> window: one training example as it could have been
 
@@ -37,6 +41,19 @@ class Recording(NamedTuple):
     actions: np.ndarray  # [n] int64
     rewards: np.ndarray  # [n] float32
     seed: int  # with which the environment was reset; negative where nobody knows
+
+
+class Described(NamedTuple):
+    """What a data set says of itself; what is wrong with that is said when it is loaded."""
+
+    level: str | None = None  # the id of the environment that it was recorded in
+    episodes: int | None = None
+    arguments: Mapping[str, Any] | None = None  # of that environment
+    wrappers: Sequence[Mapping[str, Any]] | None = None  # around it, the innermost first, each with
+    # `name`, `entry_point` and `kwargs`; None: it does not say
+    max_steps: int | None = None  # of an episode, by that environment
+    spaces: Mapping[str, gym.Space] = {}  # of each "observation" and "action", where it says more
+    # than shapes and types
 
 
 class Source(NamedTuple):
@@ -77,6 +94,15 @@ def _nothing_to_check(observations: PyTree, where: str) -> None:
     del observations, where
 
 
+def _no_statistics(demonstrations: Sequence[Demonstration]) -> Statistics:
+    del demonstrations
+    return ()
+
+
+def _nothing_to_compare(recorded: Described, where: str) -> None:
+    del recorded, where
+
+
 def _no_extras(demonstration: Demonstration) -> PyTree:
     del demonstration
     return ()
@@ -97,6 +123,10 @@ class Domain(NamedTuple):
     # by architecture, (model, K) -> module; see leapjax.models.trajectory. One of `paper` may have
     # `of_all` as well, (B contexts) -> tokens [B, K + 1, D], where training is faster with it
     augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
+    measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
+    # what encoders must know of the training data
+    with_statistics: Callable[[Statistics], "Domain"] | None = None
+    # the same level, with encoders that know so much; None: theirs need to know nothing
     extras: Callable[[Demonstration], PyTree] = _no_extras
     # what augmentations must know of each step, [n, ...]; no model sees it
     check: Callable[[PyTree, str], None] = _nothing_to_check
@@ -107,6 +137,10 @@ class Domain(NamedTuple):
     source: Source | None = None  # of demonstrations; None: `collect`, kept by leapjax.data.storage
     arguments: Mapping[str, Any] | None = None  # JSON values that its environment is made with, and
     # that of data must agree with; None: theirs do not matter
+    check_recorded: Callable[[Described, str], None] = _nothing_to_compare
+    # (what a data set says of itself, its name) -> UserError if it contradicts the environment in
+    # more than `arguments`
+    criterion: Criterion | None = None  # when an episode succeeds; None: the environment says so
     rules: Energy | None = None  # what is known without learning; it has no parameters, ()
     shortest_limit: int | None = None  # steps that every episode may last, if that is known
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
@@ -132,11 +166,21 @@ class DomainType(NamedTuple):
     # (level, method, preset) -> options that a level changes of the method's own
 
 
+def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
+    """Returns a level whose encoders know statistics of their training data, if they need any.
+
+    Raises:
+        UserError: the statistics are not of this level's observations.
+    """
+    return domain.with_statistics(statistics) if domain.with_statistics and statistics else domain
+
+
 def blank_context(domain: Domain, length: int) -> Context:
     """A context with K = `length` of the right shapes, all zeros."""
-    past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), domain.blank)
+    blank = to_plain_dicts(domain.blank)
+    past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), blank)
     return Context(
-        domain.blank,
+        blank,
         past,
         np.zeros(length, np.int32),
         np.zeros(length, np.float32),

@@ -1,5 +1,7 @@
 """The table of domains: what `leapjax.load` and the experiments find by name."""
 
+import sys
+
 from leapjax.atari.domain import ATARI
 from leapjax.babyai.domain import BABYAI
 from leapjax.domain import DomainType
@@ -23,3 +25,24 @@ def find_domain(name: str) -> DomainType:
     if name not in DOMAINS:
         raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
     return DOMAINS[name]
+
+
+def check_imported(level: str, named_by: str) -> None:
+    """Refuses to import a module because a file names it.
+
+    A level `module:id` is an environment that a module registers: to make it is to run the
+    module's code. Whoever wants that imports the module, or names the level.
+
+    Args:
+        level: by name or id.
+        named_by: the file or folder that names it, for the message.
+
+    Raises:
+        UserError: the module has not been imported.
+    """
+    module, colon, _ = level.partition(":")
+    if colon and module not in sys.modules:
+        raise UserError(
+            f"{named_by} names the level {level}, which would run the module {module}: if you "
+            f"trust it, import {module} first, or name the level (level, --level, --env)"
+        )

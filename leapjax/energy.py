@@ -1,9 +1,9 @@
 """Energies over plans and their algebra: every function here returns an `Energy`.
 
 An energy is written for one trajectory. Parameters are always an argument and varying
-data lives in the context, so an energy is built once and compiled once. Outside of `jit`,
-where values can be seen, actions or positions out of range and energies that are NaN raise
-`ValueError`; inside, shapes are checked, and a plan says whether it is `valid`.
+data lives in the context, so an energy is built once and compiled once. Actions and positions
+that are not integers raise `ValueError`. So do, outside of `jit`, where values can be seen, those
+that are out of range, and energies that are NaN; inside, a plan says whether it is `valid`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Energy, Params, PyTree, mask_token, no_violation, nothing_encoded
+from leapjax.checks import check_indices, check_number
+from leapjax.types import (
+    Energy,
+    Params,
+    PyTree,
+    check_num_actions,
+    mask_token,
+    no_violation,
+    nothing_encoded,
+)
 
 EncodeFn = Callable[[Params, PyTree], PyTree]
 LogitsFn = Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
@@ -48,7 +57,7 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     total = _sum_of_conditionals(conditional, num_actions)
-    return Energy(encode, conditional, total, _checked(num_actions))
+    return Energy(encode, conditional, total, check_num_actions(num_actions))
 
 
 def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Energy:
@@ -75,13 +84,13 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-        actions = jnp.asarray(actions)
+        actions = _check_plan(actions, num_actions)
         energies = conditional(params, memory, actions, jnp.arange(actions.shape[0]))
         chosen = jnp.minimum(actions, num_actions - 1)[:, None]
         energy = jnp.take_along_axis(energies, chosen, axis=1).sum()
         return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
-    return Energy(encode, conditional, total, _checked(num_actions))
+    return Energy(encode, conditional, total, check_num_actions(num_actions))
 
 
 def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
@@ -97,6 +106,7 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """
 
     def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = _check_plan(actions, num_actions)
         energy = jnp.asarray(total(params, memory, actions), jnp.float32)
         if energy.shape:
             raise ValueError(f"a total must be one number, got shape {energy.shape}")
@@ -111,7 +121,9 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
         )
         return _check_energies(energies, positions)
 
-    return Energy(encode, conditional, guarded_total, _checked(num_actions), accepts_mask=False)
+    return Energy(
+        encode, conditional, guarded_total, check_num_actions(num_actions), accepts_mask=False
+    )
 
 
 def single_action(
@@ -141,11 +153,12 @@ def single_action(
         return _check_energies(energies(params, memory)[None], positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = _check_plan(actions, num_actions)
         _check_single(actions)
         energy = energies(params, memory)[jnp.minimum(actions[0], num_actions - 1)]
         return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
-    return Energy(encode, conditional, total, _checked(num_actions))
+    return Energy(encode, conditional, total, check_num_actions(num_actions))
 
 
 def _check_single(actions: jax.Array) -> None:
@@ -174,27 +187,29 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     """The weighted sum of energies (paper, section 4, task compositionality).
 
     A weight is an inverse temperature: two is twice as sharp. Parameters and memories
-    become tuples with one entry per energy.
+    become tuples with one entry per energy. The constraints of every energy hold, whatever its
+    weight: with weight 0 they do not guide the search, and `satisfied` still counts them.
 
     Raises:
         ValueError: no energies, different action sets, or weights that are negative, not
             finite or not as many as the energies.
     """
     energies = tuple(energies)
-    weights = (1.0,) * len(energies) if weights is None else tuple(map(float, weights))
+    weights = [1.0] * len(energies) if weights is None else list(weights)
     if not energies:
         raise ValueError("compose needs at least one energy")
     if len(weights) != len(energies):
         raise ValueError(f"{len(energies)} energies need as many weights, got {len(weights)}")
-    if any(not 0 <= weight < float("inf") for weight in weights):
-        raise ValueError(f"weights must be finite and at least 0, got {weights}")
+    weights = [check_number("a weight", weight, 0) for weight in weights]
     action_sets = {energy.num_actions for energy in energies}
     if len(action_sets) > 1:
         raise ValueError(
             f"composed energies must agree on one action set, got sizes {sorted(action_sets)}"
         )
-    # Weight 0 leaves an energy out altogether: 0 * inf would be NaN.
-    active = [index for index, weight in enumerate(weights) if weight > 0]
+    num_actions = energies[0].num_actions
+    # Weight 0 leaves the values of an energy out: 0 * inf would be NaN. JAX takes what is smaller
+    # than `tiny` for 0.
+    active = [index for index, weight in enumerate(weights) if weight >= np.finfo(np.float32).tiny]
 
     def encode(params: Params, context: PyTree) -> PyTree:
         return tuple(energy.encode(p, context) for energy, p in zip(energies, params, strict=True))
@@ -202,28 +217,30 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
-        actions, positions = jnp.asarray(actions), jnp.asarray(positions)
-        result = jnp.zeros((positions.shape[0], energies[0].num_actions), jnp.float32)
+        actions, positions = _check_query(actions, positions, num_actions)
+        result = jnp.zeros((positions.shape[0], num_actions), jnp.float32)
         for i in active:
             result += weights[i] * energies[i].conditional(params[i], memory[i], actions, positions)
         return result
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = _check_plan(actions, num_actions)
         result = jnp.zeros((), jnp.float32)
         for i in active:
             result += weights[i] * energies[i].total(params[i], memory[i], actions)
         return result
 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        actions = _check_plan(actions, num_actions)
         result = jnp.zeros((), jnp.float32)
-        for i in active:
-            result += energies[i].violation(params[i], memory[i], actions)
+        for energy, p, known in zip(energies, params, memory, strict=True):
+            result += energy.violation(p, known, actions)
         return result
 
     accepts_mask = all(energies[i].accepts_mask for i in active)
-    free = all(energies[i].violation is no_violation for i in active)
+    free = all(energy.violation is no_violation for energy in energies)
     return Energy(
-        encode, conditional, total, energies[0].num_actions, accepts_mask,
+        encode, conditional, total, num_actions, accepts_mask,
         no_violation if free else violation,
     )  # fmt: skip
 
@@ -278,10 +295,12 @@ def constrain(
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
+        actions = _check_plan(actions, energy.num_actions)
         return _check_total(energy.total(params, inner, actions) + penalty(context, actions))
 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
+        actions = _check_plan(actions, energy.num_actions)
         # What one penalty allows, even rewards, makes no other violation good.
         mine = jnp.maximum(penalty(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
@@ -294,6 +313,9 @@ def constrain(
 
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
     """Puts `function(context)` in front of an energy: what this energy may see.
+
+    A constraint of this energy sees the same, `function(context)`, and still counts. To judge
+    plans by the whole context, constrain what `view` returns.
 
     All of a context is seen anew for each plan: what was made of a state may change with what the
     function shows of it.
@@ -314,27 +336,27 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
 
     Args:
         energy: one that accepts MASK.
-        actions: that it should say nothing of; at least one is left.
+        actions: that it should say nothing of, by number or as a mask `[A]` of booleans; at least
+            one is left.
 
     Raises:
         ValueError: the energy accepts no MASK, the actions are none, all, or none of its own, or
             it is constrained: what is MASK would not be judged.
     """
-    chosen = sorted(set(actions))
+    chosen = check_indices("neutral actions", actions, energy.num_actions)
     if energy.violation is not no_violation:
         raise ValueError("neutral comes before constrain: constrain what it returns")
     if not energy.accepts_mask:
         raise ValueError("neutral needs an energy that accepts MASK (accepts_mask is False)")
     if not chosen or len(chosen) >= energy.num_actions:
         raise ValueError(f"neutral actions {chosen}: expected some of {energy.num_actions} actions")
-    if chosen[0] < 0 or chosen[-1] >= energy.num_actions:
-        raise ValueError(f"neutral actions {chosen} are not all in 0 .. {energy.num_actions - 1}")
     unknown = np.isin(np.arange(energy.num_actions), chosen)
     mask = mask_token(energy.num_actions)
 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
+        actions, positions = _check_query(actions, positions, energy.num_actions)
         seen = jnp.where(jnp.isin(actions, jnp.array(chosen)), mask, actions)
         energies = energy.conditional(params, memory, seen, positions)
         best = jnp.min(jnp.where(unknown, jnp.inf, energies), axis=-1, keepdims=True)
@@ -348,7 +370,7 @@ def _sum_of_conditionals(conditional: ConditionalFn, num_actions: int) -> TotalF
     """The total of a plan: at every position the energy of its action, given all others."""
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-        actions = jnp.asarray(actions)
+        actions = _check_plan(actions, num_actions)
 
         def term(position: jax.Array) -> jax.Array:
             energies = conditional(params, memory, actions, position[None])[0]
@@ -379,22 +401,38 @@ def _try_every_action(
 def _check_query(
     actions: jax.Array, positions: jax.Array, num_actions: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Both as JAX's arrays."""
-    actions, positions = jnp.asarray(actions), jnp.asarray(positions)
-    chex.assert_rank([actions, positions], 1)
-    for name, values, end in (
-        ("positions", positions, actions.shape[0]),
-        ("actions", actions, num_actions + 1),
-    ):
-        if isinstance(values, jax.core.Tracer) or values.size == 0:
-            continue
+    """Both as JAX's arrays of int32."""
+    actions = _check_plan(actions, num_actions)
+    end = actions.shape[0]
+    expected = f"0 .. {end - 1}, the horizon is {end}"
+    return actions, _check_integers("positions", positions, end, expected)
+
+
+def _check_plan(actions: jax.Array, num_actions: int) -> jax.Array:
+    """Actions `[T]`, which may be MASK, as JAX's array of int32."""
+    expected = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
+    return _check_integers("actions", actions, num_actions + 1, expected)
+
+
+def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> jax.Array:
+    """Integers `[n]` below `end` as JAX's array of int32.
+
+    Raises:
+        ValueError: not integers; or, outside of `jit`, out of range.
+    """
+    if not isinstance(values, jax.Array):
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+        # NumPy keeps 64 bits, which JAX would cut off.
+        values = jnp.asarray(values) if traced else np.asarray(values)
+        values = values if values.size else values.astype(np.int32)  # an empty list has no type
+    chex.assert_rank(values, 1)
+    if not jnp.issubdtype(values.dtype, jnp.integer):
+        raise ValueError(f"{name} must be integers, got {values.dtype}")
+    if not isinstance(values, jax.core.Tracer) and values.size:
         seen = np.asarray(values)  # a constant of a program is an array there too
-        least, most = int(seen.min()), int(seen.max())
-        if least < 0 or most >= end:
-            what = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
-            expected = what if name == "actions" else f"0 .. {end - 1}, the horizon is {end}"
-            raise ValueError(f"{name} {np.asarray(values)} are not all in {expected}")
-    return actions, positions
+        if int(seen.min()) < 0 or int(seen.max()) >= end:
+            raise ValueError(f"{name} {seen} are not all in {expected}")
+    return jnp.asarray(values, jnp.int32)
 
 
 def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:
@@ -417,9 +455,3 @@ def _infinite_if_incomplete(energy: jax.Array, actions: jax.Array, num_actions: 
     """A plan that still holds MASK has no total energy: it is never the best plan."""
     complete = jnp.all((actions >= 0) & (actions < num_actions))
     return jnp.where(complete, energy, jnp.inf)
-
-
-def _checked(num_actions: int) -> int:
-    if num_actions < 1:
-        raise ValueError(f"an energy needs at least one action, got {num_actions}")
-    return num_actions

@@ -1,10 +1,16 @@
 """Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
 
-from typing import NamedTuple, Protocol, runtime_checkable
+import contextlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 
-from leapjax.types import Array, PyTree
+from leapjax.checks import check_number
+from leapjax.types import Array, PyTree, to_plain_dicts
+
+A = TypeVar("A", bound="Adapter")
+_ENVIRONMENTS = (gym.Env, gym.vector.VectorEnv)
 
 
 class Transition(NamedTuple):
@@ -31,8 +37,9 @@ class Transition(NamedTuple):
 class Adapter(Protocol):
     """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
 
-    An observation is any pytree of NumPy arrays whose shapes never change. One that works on its
-    own may be `Eager`, too.
+    An observation is any pytree of NumPy arrays whose shapes never change. An adapter whose
+    environment works on its own may be `Eager`; one whose environment holds files, ports or
+    processes should be `Closable`.
     """
 
     num_actions: int  # A, the end action included
@@ -55,6 +62,106 @@ class Eager(Protocol):
         ...
 
 
+class Criterion(NamedTuple):
+    """When an episode succeeds, in an environment that has no measure of success of its own.
+
+    Attributes:
+        least_return: that the episode has to reach; None: it has to terminate with a positive
+            reward.
+        given: by the user; otherwise by the environment's `reward_threshold`, or by nobody.
+    """
+
+    least_return: float | None
+    given: bool = False
+
+    def __str__(self) -> str:
+        """In words, with where it comes from."""
+        if self.least_return is None:
+            return "a positive reward at the end (nobody has named a return)"
+        origin = "given"
+        if not self.given:
+            origin = "reward_threshold of the environment, meant for the mean over episodes"
+        return f"a return of at least {self.least_return:g} ({origin})"
+
+
+def find_criterion(env: gym.Env, success_return: float | None = None) -> Criterion:
+    """Chooses when an episode of an environment succeeds.
+
+    Args:
+        env: whose authors may ask for a return (`reward_threshold`).
+        success_return: that the user asks for; None: what the authors ask for.
+
+    Raises:
+        UserError: `success_return` is not a finite number.
+    """
+    if success_return is not None:
+        return Criterion(check_number("success_return", success_return), given=True)
+    return Criterion(env.spec.reward_threshold if env.spec is not None else None)
+
+
+def judge_episode(
+    criterion: Criterion, total: float, reward: float, terminated: bool, truncated: bool
+) -> bool:
+    """Says whether an episode has succeeded so far.
+
+    Args:
+        criterion: to judge by.
+        total: the episode's return so far.
+        reward: of its last step.
+        terminated: with its last step.
+        truncated: with its last step.
+    """
+    if criterion.least_return is None:
+        return bool(terminated and reward > 0)
+    # So far, for who ends it early; but what is lost on the way is known at the end alone.
+    over = terminated or truncated or criterion.least_return > 0
+    return bool(over and total >= criterion.least_return)
+
+
+@runtime_checkable
+class Closable(Protocol):
+    """An `Adapter` whose environment holds something that must be given back."""
+
+    def close(self) -> None:
+        """Gives it back; the adapter is not played again."""
+        ...
+
+
+def close(adapter: Adapter) -> None:
+    """Closes an adapter if it is `Closable`."""
+    if isinstance(adapter, Closable):
+        adapter.close()
+
+
+@contextlib.contextmanager
+def closing(adapter: A) -> Iterator[A]:
+    """Yields an adapter and closes it, also after an error, which a failing `close` never hides."""
+    try:
+        yield adapter
+    except BaseException:
+        with contextlib.suppress(Exception):
+            close(adapter)
+        raise
+    close(adapter)
+
+
+def environments_of(adapter: Adapter) -> list[object]:
+    """The Gymnasium environments that an adapter steps, without their wrappers.
+
+    Those that are attributes of the adapter, of its class, or of another adapter inside it.
+    """
+    found: list[object] = []
+    owners: list[Any] = [adapter]
+    for owner in owners:
+        places = (*type(owner).__mro__, owner)
+        for part in [part for place in places for part in getattr(place, "__dict__", {}).values()]:
+            if isinstance(part, _ENVIRONMENTS):
+                found.append(part.unwrapped)
+            elif callable(getattr(part, "step", None)) and id(part) not in map(id, owners):
+                owners.append(part)
+    return found
+
+
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
@@ -69,8 +176,7 @@ class GymnasiumAdapter:
         self.env = env
         self.num_actions = int(env.action_space.n) + 1
         self._first_action = int(env.action_space.start)
-        asked = env.spec.reward_threshold if env.spec is not None else None
-        self._threshold = asked if success_return is None else success_return
+        self.criterion = find_criterion(env, success_return)
         self._return = 0.0
 
     def reset(self, seed: int) -> PyTree:
@@ -82,17 +188,16 @@ class GymnasiumAdapter:
                 f"reset of {self.env} returned {type(found).__name__}, not (observation, info): "
                 "it is of Gym's old interface; wrap it for Gymnasium"
             )
-        return found[0]
+        return to_plain_dicts(found[0])
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
         observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
         reward = float(reward)
         self._return += reward
-        if self._threshold is None:
-            success = terminated and reward > 0
-        else:
-            # So far, for who ends it early; but what is lost on the way is known at the end alone.
-            over = terminated or truncated or self._threshold > 0
-            success = over and self._return >= self._threshold
-        return Transition(observation, reward, terminated, truncated, bool(success))
+        success = judge_episode(self.criterion, self._return, reward, terminated, truncated)
+        return Transition(to_plain_dicts(observation), reward, terminated, truncated, success)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.env.close()

@@ -12,7 +12,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_number, check_types
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number
@@ -21,13 +21,12 @@ ORDERS = ("random", "sequential", "uncertain")
 
 
 def check_temperature(temperature: float) -> None:
-    """Refuses what is no temperature.
+    """Checks a temperature.
 
     Raises:
-        ValueError: it is out of range.
+        ValueError: not a number, negative, NaN or too large.
     """
-    if not 0 <= temperature <= HOTTEST:  # false for NaN too
-        raise ValueError(f"a temperature must be in 0 .. {HOTTEST}, got {temperature}")
+    check_number("a temperature", temperature, 0, HOTTEST)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +53,7 @@ class GibbsConfig:
     score_trace: bool = False  # also return the energy after every iteration (N * T passes)
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 1, "horizon", "iterations", "resampled", "restarts")
         if self.resampled > self.horizon:
             raise ValueError(
@@ -85,6 +85,7 @@ class ShootingConfig:
     score: bool = False  # also return the energy of the plan (known anyway)
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 1, "horizon", "candidates")
 
 
@@ -100,6 +101,7 @@ class CrossEntropyConfig:
     score: bool = False
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 1, "horizon", "iterations", "candidates", "elites")
         if self.elites > self.candidates:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
@@ -115,6 +117,7 @@ class BeamConfig:
     score: bool = False  # also return the energy of the plan
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 1, "horizon", "beams")
         check_temperature(self.temperature)
 

@@ -14,17 +14,18 @@ from jax.sharding import Mesh
 from leapjax import checkpoints, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
-from leapjax.checks import check_at_least
-from leapjax.domain import Domain
-from leapjax.domains import find_domain
-from leapjax.errors import UserError
-from leapjax.files import write_text
+from leapjax.checks import check_at_least, check_types
+from leapjax.domain import Domain, Statistics, apply_statistics
+from leapjax.domains import check_imported, find_domain
+from leapjax.errors import UserError, first_line
+from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
 SPECIFICATION = "specification.json"
+LARGEST_SPECIFICATION = 2**20  # bytes
 CHECKPOINTS = "checkpoints"
 WEIGHTS = "weights.npz"  # in place of checkpoints, in the folder of a published planner
 PUBLISHED = Path(__file__).parent / "published"
@@ -39,6 +40,9 @@ class Origin:
     seed: int
     demos: int
     demonstrations: str | None = None
+
+    def __post_init__(self) -> None:
+        check_types(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +60,10 @@ class Specification:
     domain_settings: Any
     signature: dict  # of the domain, when it was trained
     origin: Origin
+    statistics: Statistics = ()  # of what it learned from, as far as its network needs them
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_at_least(self, 0, "context")
 
 
@@ -75,10 +81,19 @@ class Pretrained:
         return self.plan(self.params, keys, contexts)
 
 
-def make_domain(specification: Specification) -> Domain:
-    """The level that a planner was trained for."""
+def make_domain(specification: Specification, level: str | None = None) -> Domain:
+    """The level that a planner was trained for, or another one for the same network.
+
+    Raises:
+        UserError: it cannot be made, or only the specification names it and its module has not
+            been imported.
+    """
+    if level is None:
+        level = specification.level
+        check_imported(level, f"the specification of a {specification.method} planner")
     kind = find_domain(specification.domain)
-    return kind.make(specification.level, specification.domain_settings)
+    domain = kind.make(level, specification.domain_settings)
+    return apply_statistics(domain, specification.statistics)
 
 
 def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None = None) -> Agent:
@@ -101,6 +116,8 @@ def identity(specification: Specification) -> str:
     values = dataclasses.asdict(specification)
     changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
     changed["training"] = without_unnamed(changed["training"])
+    if not specification.statistics:  # as before there were any
+        del values["statistics"]
     return json.dumps(values | changed, sort_keys=True)
 
 
@@ -115,7 +132,28 @@ def save_specification(folder: Path, specification: Specification) -> None:
 
 
 def read_specification(folder: Path) -> Specification:
-    """The specification that a run left in its folder.
+    """The specification that a run left in its folder, if its parameters were saved with it.
+
+    Raises:
+        UserError: missing, damaged, of an unknown method or domain, or changed since.
+    """
+    return _read_sealed(folder)[0]
+
+
+def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
+    """The specification in a folder, and how many numbers each array saved with it has.
+
+    Nothing is built, imported or unpacked before this: a specification is what a file says.
+    """
+    specification = parse_specification(check_path(folder))
+    whose = identity(specification)
+    if (folder / WEIGHTS).exists():
+        return specification, weights.check_identity(folder / WEIGHTS, whose)
+    return specification, checkpoints.check_identity(folder / CHECKPOINTS, whose)
+
+
+def parse_specification(folder: Path) -> Specification:
+    """What the specification in a folder says, whether parameters were saved with it or not.
 
     Raises:
         UserError: missing, damaged, or of an unknown method or domain.
@@ -125,7 +163,7 @@ def read_specification(folder: Path) -> Specification:
         raise UserError(
             f"{folder} is not a checkpoint: expected the folder of a run, with {SPECIFICATION}"
         )
-    values = checkpoints.read_json(path)
+    values = checkpoints.read_json(path, LARGEST_SPECIFICATION)
     try:
         if not isinstance(values, dict):
             raise UserError(f"a Specification must be a JSON object, got {type(values).__name__}")
@@ -163,8 +201,12 @@ def publish(folder: Path, target: Path) -> None:
 
 
 def find(path: str | os.PathLike[str]) -> Path:
-    """The folder of a run; or, where there is none, of the published planner of a level."""
-    folder = Path(path)
+    """The folder of a run; or, where there is none, of the published planner of a level.
+
+    Raises:
+        UserError: the system cannot look for such a path.
+    """
+    folder = check_path(path)
     published = not folder.exists() and (PUBLISHED / folder).is_dir()
     return PUBLISHED / folder if published else folder
 
@@ -188,6 +230,35 @@ def asking_for(specification: Specification, target_return: float) -> Specificat
     return dataclasses.replace(specification, method_settings=settings)
 
 
+def _trace_parameters(
+    agent: Agent, specification: Specification, saved: Sequence[int], folder: Path
+) -> Params:
+    """The shapes and types of an agent's parameters.
+
+    Args:
+        agent: of the specification.
+        specification: that says how large its network is.
+        saved: how many numbers each array has that is there.
+        folder: of both, for the message.
+
+    Raises:
+        UserError: the network is larger than what was saved, or than any can be.
+    """
+    largest = max(saved, default=0)
+    model = specification.model
+    # Each layer, and each round of an encoder, has arrays of its own; one is as wide as all.
+    parts = max(model.layers, getattr(specification.domain_settings, "rounds", 0))
+    if saved and (parts > len(saved) or model.width > largest):
+        raise UserError(
+            f"{folder}: a network of {parts} layers or rounds, of width {model.width}, but only "
+            f"{len(saved)} arrays of at most {largest} numbers were saved"
+        )
+    try:
+        return jax.eval_shape(agent.init, jax.random.key(0)).params
+    except (ArithmeticError, TypeError, ValueError) as error:
+        raise UserError(f"{folder}: its network cannot be built: {first_line(error)}") from error
+
+
 def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
@@ -204,6 +275,7 @@ def load(
         planner: search settings, of the same horizon; None for those it was trained with.
         chunk_sizes: see `leapjax.compile_planner`.
         level: to plan for, where it is another than it was trained on, and its network serves both.
+            A run on a level `module:id` needs it too, unless that module is imported already.
         target_return: to ask for, where that is another than it was trained for.
         finished: whether nothing will do but what the run has learned at its end. If not, what it
             had learned at its newest readable checkpoint will, with a warning.
@@ -213,20 +285,20 @@ def load(
             horizon, a level that needs another network, or a return that it cannot be asked for.
     """
     folder = find(path)
-    specification = read_specification(folder)
+    specification, saved = _read_sealed(folder)
     whose = identity(specification)
     if target_return is not None:
         specification = asking_for(specification, target_return)
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:
         raise UserError(f"{folder} plans {horizon} actions, not {planner.horizon}: its horizon")
+    # First: the module of a level that the caller names is imported by it.
+    other = None if level is None else make_domain(specification, level)
     domain = make_domain(specification)
     for name, value in domain.signature.items():
         if specification.signature.get(name) != value:
             raise UserError(f"{folder}: trained with another {name}; train it again")
-    if level is not None:
-        kind = find_domain(specification.domain)
-        other = kind.make(level, specification.domain_settings)
+    if other is not None:
         for name, value in other.signature.items():
             if domain.signature.get(name) != value:
                 raise UserError(
@@ -236,7 +308,7 @@ def load(
         # A network that counts steps counts no further than it has learned to.
         domain = other._replace(max_steps=domain.max_steps)
     agent = make_agent(specification, domain)
-    like = jax.eval_shape(agent.init, jax.random.key(0)).params
+    like = _trace_parameters(agent, specification, saved, folder)
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:

@@ -1,15 +1,24 @@
 """Plan, act, replan: many episodes in lockstep, so that hundreds are planned per call."""
 
+import contextlib
+import itertools
+import math
+import sys
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
-from leapjax.environments import Adapter, Eager
-from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token
+from leapjax.checks import check_integer, check_seed, check_seeds
+from leapjax.environments import Adapter, Eager, close, environments_of
+from leapjax.errors import UserError
+from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token, to_plain_dicts
+
+MOST_OPEN = 128  # environments at once: as many as plans in a chunk; each may hold files, or a port
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Episodes(NamedTuple):
@@ -44,19 +53,39 @@ class History:
         observation: of the first state.
         length: K.
         num_actions: A.
+        seed: of the episode, for messages.
+
+    Raises:
+        UserError: see `advance`.
     """
 
-    def __init__(self, observation: PyTree, length: int, num_actions: int) -> None:
-        self.current = _copy(observation)
+    def __init__(
+        self, observation: PyTree, length: int, num_actions: int, seed: int | None = None
+    ) -> None:
         self.step = 0
         self.return_so_far = 0.0
-        self._length = length
+        self._seed = seed
+        self._length = check_integer("length", length)
+        self._num_actions = num_actions
         self._past: list[PyTree] = []
         self._actions: list[int] = []
         self._rewards: list[float] = []
         self._encoded: Array | None = None
+        self._structure: Any
+        leaves, self._structure = jax.tree.flatten(to_plain_dicts(observation))
+        self._shapes = list(map(np.shape, leaves))
+        self.current = self._checked(observation)
         self._blank = jax.tree.map(np.zeros_like, self.current)
-        self._pad = pad_token(num_actions)
+
+    @property
+    def where(self) -> str:
+        """The episode and the step that it is at, for messages."""
+        return f"step {self.step}" + ("" if self._seed is None else f" of level seed {self._seed}")
+
+    @property
+    def has_encoded(self) -> bool:
+        """Whether contexts hold encoded states."""
+        return self._encoded is not None
 
     def advance(
         self, action: int, observation: PyTree, reward: float, encoded: Array | None = None
@@ -68,24 +97,54 @@ class History:
             observation: what it led to.
             reward: what it gave.
             encoded: `[K, D]` what is known of the states before it, if they are (see `kept`).
+
+        Raises:
+            UserError: an observation of other parts or shapes than the first; a number in it, a
+                reward or a return that is not finite, or does not fit float32; an action that is
+                not an integer in 0 .. A - 1.
         """
+        self.step += 1
+        action = check_integer(
+            f"the action taken at {self.where}", action, 0, self._num_actions - 1
+        )
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
             self._rewards = [*self._rewards, reward][-self._length :]
         self._encoded = encoded
-        before, self.current = self.current, _copy(observation)
-        if jax.tree.map(np.shape, before) != jax.tree.map(np.shape, self.current):
-            raise ValueError(
-                f"an observation of other shapes than the one before: "
-                f"{jax.tree.map(np.shape, self.current)}, not {jax.tree.map(np.shape, before)}"
-            )
-        self.step += 1
+        self.current = self._checked(observation)
         self.return_so_far += reward
+        for name, value in (("reward", reward), ("return", self.return_so_far)):
+            if not -LARGEST <= value <= LARGEST:
+                raise UserError(
+                    f"the environment gave a {name} of {value} at {self.where}: expected a finite "
+                    "number that fits float32"
+                )
+
+    def _checked(self, observation: PyTree) -> PyTree:
+        """A copy: environments may write the next observation into the arrays of the last."""
+        structure: Any
+        observation = to_plain_dicts(observation)
+        leaves, structure = jax.tree.flatten(observation)
+        copies = list(map(np.array, leaves))
+        shapes = [copy.shape for copy in copies]
+        if structure != self._structure or shapes != self._shapes:
+            raise UserError(
+                f"an observation of other shapes than the first at {self.where}: "
+                f"{structure.unflatten(shapes)}, not {self._structure.unflatten(self._shapes)}"
+            )
+        for place, copy in enumerate(copies):
+            if copy.dtype.kind == "f" and not np.isfinite(copy).all():
+                path, _ = jax.tree.leaves_with_path(observation)[place]
+                raise UserError(
+                    f"the environment gave an observation{jax.tree_util.keystr(path)} with numbers "
+                    f"that are not finite at {self.where}"
+                )
+        return structure.unflatten(copies)
 
     def context(self) -> Context:
         """As NumPy arrays, padded at the front where the episode is younger than K."""
-        missing = self._length - len(self._past)
+        missing, pad = self._length - len(self._past), pad_token(self._num_actions)
         past = [self._blank] * missing + self._past
         if past:
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *past)
@@ -94,7 +153,7 @@ class History:
         return Context(
             observation=self.current,
             past=stacked,
-            actions=np.array([self._pad] * missing + self._actions, np.int32),
+            actions=np.array([pad] * missing + self._actions, np.int32),
             rewards=np.array([0.0] * missing + self._rewards, np.float32),
             step=np.array(self.step, np.int32),
             return_so_far=np.array(self.return_so_far, np.float32),
@@ -102,25 +161,22 @@ class History:
         )
 
 
-def _check_adapters(adapters: Sequence[Adapter], plan: CompiledPlanner) -> None:
-    """Refuses, once, what would give wrong episodes without a word."""
-    if not adapters:
-        raise ValueError("no seeds: there is no episode to play")
-    if len({id(adapter) for adapter in adapters}) < len(adapters):
-        raise ValueError("make_adapter returned the same environment twice: make a new one")
-    for adapter in adapters:
-        check_actions("planner", plan.num_actions, adapter.num_actions)
+def check_limits(executed: int | None, max_steps: int | None) -> tuple[int | None, int | None]:
+    """Returns both limits as integers of Python, or None.
 
-
-def check_limits(executed: int | None, max_steps: int | None) -> None:
-    """Refuses to execute nothing of a plan, or of an episode.
+    Args:
+        executed: actions of a plan.
+        max_steps: of an episode.
 
     Raises:
-        ValueError: says which.
+        UserError: one of them is not an integer, or less than 1.
     """
-    for name, value in {"executed": executed, "max_steps": max_steps}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+    limits = {"executed": executed, "max_steps": max_steps}
+    checked = [
+        None if value is None else check_integer(name, value, 1, sys.maxsize)
+        for name, value in limits.items()
+    ]
+    return checked[0], checked[1]
 
 
 def check_actions(of: str, planned: int, possible: int) -> None:
@@ -134,11 +190,6 @@ def check_actions(of: str, planned: int, possible: int) -> None:
             f"the {of} has {planned} actions and the environment {possible}, the end action "
             "included in both"
         )
-
-
-def _copy(observation: PyTree) -> PyTree:
-    """Environments may write the next observation into the arrays of the last."""
-    return jax.tree.map(np.array, observation)
 
 
 def kept(plans: Plan, executed: int | None) -> Array | None:
@@ -156,6 +207,26 @@ def stack_contexts(histories: Sequence[History]) -> Context:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *contexts)
 
 
+class _Episode:
+    """An episode under way: its place among all, its environment, and what a planner sees."""
+
+    def __init__(self, place: int, seed: int, adapter: Adapter, history: History) -> None:
+        self.place, self.seed = place, seed
+        self.adapter, self.history = adapter, history
+        self.eager = adapter if isinstance(adapter, Eager) else None
+        # What no other episode may step, by identity.
+        self.owned = {id(part): part for part in (adapter, *environments_of(adapter))}
+        self.replans = 0
+
+
+def _alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
+    """Episodes whose contexts can be stacked: those with encoded states, and those without."""
+    for has_encoded in (True, False):
+        group = [each for each in episodes if each.history.has_encoded == has_encoded]
+        if group:
+            yield group
+
+
 def evaluate(
     make_adapter: Callable[[], Adapter],
     seeds: Sequence[int],
@@ -169,84 +240,135 @@ def evaluate(
     max_steps: int | None = None,
     progress: Callable[[int, int], None] = lambda over, succeeded: None,
 ) -> Episodes:
-    """Plays one episode per level seed, all in lockstep, replanning when a plan is used up.
+    """Plays one episode per level seed, in lockstep, replanning when a plan is used up.
 
-    Finished episodes leave the batch; one whose plan ends before its first action has given
-    up. A plan's randomness derives from (seed, level seed, replan index), so an episode plays
-    the same way whatever else is in the batch.
+    At most `MOST_OPEN` episodes are under way at once. When one is over its environment is closed
+    (see `leapjax.environments.Closable`), and the next one begins. An episode whose plan ends
+    before its first action has given up. A plan's randomness derives from (seed, level seed,
+    replan index), so an episode plays the same way whatever else is in the batch.
+
+    Episodes under way take turns, so their environments must not share anything that a step or a
+    reset changes. The same adapter twice is refused, and so is one Gymnasium environment in two
+    adapters (see `leapjax.environments.environments_of`); other state that they share is not found.
 
     Args:
-        make_adapter: makes one environment; called once per episode.
-        seeds: level seeds.
+        make_adapter: makes one environment; called once per episode, in the order of the seeds.
+        seeds: level seeds, integers in 0 .. 2^32 - 1.
         plan: from `compile_planner`.
         params: of the energy.
         context: K.
-        seed: of the planner's randomness.
+        seed: of the planner's randomness, in the same range.
         executed: actions to execute before replanning; None for all T.
         iteration: execute the plan as it stood after this many iterations; None: the last.
         max_steps: cut an episode off after so many; None: only the environment ends it.
         progress: called with (episodes over, successes) after every round.
 
     Raises:
-        ValueError: nothing to play or to execute, an iteration that there is not, environments
-            that are one and the same, or that have other actions than the planner, or
-            observations that are not all of one shape.
+        UserError: no seeds, or a seed or a count that is not an integer of its range; environments
+            that are one and the same, that have other actions than the planner, or that give
+            values which `History` refuses, or a score that is not finite.
         NotANumber: see `CompiledPlanner`.
     """
-    check_limits(executed, max_steps)
+    level_seeds = check_seeds(seeds, "level seed")
+    seed, context = check_seed(seed), check_integer("context", context)
+    executed, max_steps = check_limits(executed, max_steps)
+    if iteration is not None:
+        iteration = check_integer("iteration", iteration, 1)
+    if not len(level_seeds):
+        raise UserError("no seeds: there is no episode to play")
     begun = time.perf_counter()
-    adapters = [make_adapter() for _ in seeds]
-    _check_adapters(adapters, plan)
-    eager = {i: adapter for i, adapter in enumerate(adapters) if isinstance(adapter, Eager)}
     end = plan.num_actions - 1
-    histories = [
-        History(adapter.reset(int(s)), context, end + 1)
-        for adapter, s in zip(adapters, seeds, strict=True)
-    ]
-    successes, scores = np.zeros(len(seeds), bool), np.zeros(len(seeds))
-    active = list(range(len(seeds)))
-    planned, planning_seconds, replan = 0, 0.0, 0
-    while active:
+    count = len(level_seeds)
+    successes, lengths, scores = np.zeros(count, bool), np.zeros(count, int), np.zeros(count)
+    waiting = iter(range(count))
+    opened: dict[int, Adapter] = {}  # by place
+    active: list[_Episode] = []
+    owned: set[int] = set()  # by those under way
+    over, planned, planning_seconds = 0, 0, 0.0
+
+    def begin(place: int) -> _Episode:
+        level_seed = int(level_seeds[place])
+        adapter = opened[place] = make_adapter()
+        check_actions("planner", plan.num_actions, adapter.num_actions)
+        history = History(adapter.reset(level_seed), context, end + 1, level_seed)
+        episode = _Episode(place, level_seed, adapter, history)
+        if not owned.isdisjoint(episode.owned):
+            raise UserError(
+                "make_adapter returned the same environment twice: make a new one for each "
+                "episode, since episodes under way take turns"
+            )
+        owned.update(episode.owned)
+        return episode
+
+    def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray, Array | None]]:
+        """Plans for some episodes: the actions `[executed]` of each, and what stays known."""
+        nonlocal planned, planning_seconds
         before = time.perf_counter()
-        episodes = np.array([seeds[i] for i in active], np.uint32)
-        keys = plan_keys(seed, episodes, np.full(len(active), replan, np.uint32))
-        plans = plan(params, keys, stack_contexts([histories[i] for i in active]))
-        if iteration is not None and not 1 <= iteration <= plans.trace.shape[1]:
-            raise ValueError(f"iteration {iteration} is not in 1 .. {plans.trace.shape[1]}")
+        keys = plan_keys(
+            seed,
+            np.array([episode.seed for episode in group], np.uint32),
+            np.array([episode.replans for episode in group], np.uint32),
+        )
+        plans = plan(params, keys, stack_contexts([episode.history for episode in group]))
+        if iteration is not None and iteration > plans.trace.shape[1]:
+            raise UserError(f"iteration {iteration} is not in 1 .. {plans.trace.shape[1]}")
         chosen = plans.actions if iteration is None else plans.trace[:, iteration - 1]
-        actions = np.asarray(chosen)[:, :executed]  # [B, executed]
-        planning_seconds += time.perf_counter() - before
-        planned += len(active)
         encoded = kept(plans, executed)
-        for row, episode in enumerate(active):
-            if episode in eager and actions[row, 0] < end:
-                eager[episode].begin(int(actions[row, 0]))
-        survivors = []
-        for row, episode in enumerate(active):
-            over = actions[row, 0] >= end
-            for action in actions[row]:
-                if action >= end:  # or MASK, of a plan that is executed before it is complete
-                    break
-                transition = adapters[episode].step(int(action))
-                scores[episode] += transition.counted
-                histories[episode].advance(
-                    transition.executed(int(action)), transition.observation, transition.reward,
-                    None if encoded is None else encoded[row],
-                )  # fmt: skip
-                too_long = max_steps is not None and histories[episode].step >= max_steps
-                over = transition.terminated or transition.truncated or too_long
-                if over:
-                    successes[episode] = transition.success
-                    break
-            if not over:
-                survivors.append(episode)
-        active = survivors
-        replan += 1
-        progress(len(seeds) - len(active), int(successes.sum()))
+        planning_seconds += time.perf_counter() - before
+        planned += len(group)
+        rows = itertools.repeat(None) if encoded is None else encoded
+        return zip(group, np.asarray(chosen)[:, :executed], rows, strict=False)
+
+    def act(episode: _Episode, actions: np.ndarray, encoded: Array | None) -> bool:
+        """Executes a plan; whether the episode is over."""
+        place, history = episode.place, episode.history
+        episode.replans += 1
+        for action in actions:
+            if action >= end:  # or MASK, of a plan that is executed before it is complete
+                return bool(actions[0] >= end)
+            found = episode.adapter.step(int(action))
+            history.advance(
+                found.executed(int(action)), found.observation, found.reward, encoded
+            )  # fmt: skip
+            if not math.isfinite(found.counted):
+                raise UserError(
+                    f"the environment gave a score of {found.counted} at {history.where}"
+                )
+            scores[place] += found.counted
+            lengths[place] = history.step
+            too_long = max_steps is not None and history.step >= max_steps
+            if found.terminated or found.truncated or too_long:
+                successes[place] = found.success
+                return True
+        return False
+
+    try:
+        while True:
+            for place in itertools.islice(waiting, MOST_OPEN - len(active)):
+                active.append(begin(place))
+            if not active:
+                break
+            decided = [each for group in _alike(active) for each in decide(group)]
+            for episode, actions, _ in decided:
+                if episode.eager is not None and actions[0] < end:
+                    episode.eager.begin(int(actions[0]))
+            active = []
+            for episode, actions, encoded in decided:
+                if act(episode, actions, encoded):
+                    close(opened.pop(episode.place))
+                    owned.difference_update(episode.owned)
+                    over += 1
+                else:
+                    active.append(episode)
+            progress(over, int(successes.sum()))
+    finally:
+        for adapter in opened.values():  # after an error, which must not be hidden by another
+            with contextlib.suppress(Exception):
+                close(adapter)
     return Episodes(
         np.asarray(seeds),
         successes,
-        np.array([history.step for history in histories]),
+        lengths,
         scores,
         planned,
         planning_seconds,

@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import check_integer
+
 MASKINGS = ("one", "each", "all", "random", "stratified")
 SINGLE = ("one", "each")  # those that mask one action in every copy
 
@@ -19,6 +21,7 @@ def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
     - `stratified`: the same with n = 1, 2, .. T, T copies: every window is also learned from as
       planning starts. For encoders that cost much more than a pass over T actions.
     """
+    horizon = check_integer("horizon", horizon, 1)
     if masking == "each":
         return jnp.eye(horizon, dtype=bool)
     if masking == "all":

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from leapjax.checks import check_counts, check_integer, check_number
+
 BOOTSTRAPS = 20_000
 # The correlation of success between training seeds that play the same levels: 0.2 to 0.67 in the
 # rows of BabyAI. The largest is the careful choice.
@@ -22,10 +24,12 @@ def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple
         z: standard errors to each side; 1.96 for 95%.
 
     Raises:
-        ValueError: no episodes, or more successes than episodes.
+        ValueError: counts that are not integers, no episodes, more successes than episodes, or a
+            `z` that is negative or not finite.
     """
-    if episodes < 1 or not 0 <= successes <= episodes:
-        raise ValueError(f"{successes} successes of {episodes} episodes")
+    episodes = check_integer("episodes", episodes, 1)
+    successes = check_integer("successes", successes, 0, episodes)
+    z = check_number("z", z, 0)
     rate = successes / episodes
     scale = 1 + z**2 / episodes
     centre = (rate + z**2 / (2 * episodes)) / scale
@@ -48,13 +52,15 @@ def interval_over_seeds(
     Args:
         successes: `[S]` of each training seed.
         episodes: `[S]` of each training seed, one on each level.
-        level: of confidence.
+        level: of confidence, between 0 and 1.
 
     Raises:
-        ValueError: no seeds, no episodes, or more successes than episodes.
+        ValueError: counts that are not integers, or not of the same seeds; no seeds, no episodes,
+            or more successes than episodes; or a level out of range.
     """
-    means = _drawn_means(successes, episodes, np.random.default_rng(0))
-    rate = float((np.asarray(successes) / np.asarray(episodes)).mean())
+    good, count = _check_outcomes(successes, episodes)
+    means = _drawn_means(good, count, np.random.default_rng(0))
+    rate = float((good / count).mean())
     return _bounds(means, rate, level)
 
 
@@ -86,27 +92,37 @@ def aggregate(
 
     Args:
         levels: of each, successes `[S]` and episodes `[S]` of its training seeds.
-        level: of confidence.
+        level: of confidence, between 0 and 1.
 
     Raises:
-        ValueError: no levels, no seeds, no episodes, or more successes than episodes.
+        ValueError: no levels; and as of `interval_over_seeds`.
     """
     if not levels:
         raise ValueError("no levels to aggregate over")
     rng = np.random.default_rng(0)
-    drawn = np.stack([_drawn_means(good, count, rng) for good, count in levels], axis=-1)
-    rates = np.array([(np.asarray(g) / np.asarray(c)).mean() for g, c in levels])
+    outcomes = [_check_outcomes(*each) for each in levels]
+    drawn = np.stack([_drawn_means(good, count, rng) for good, count in outcomes], axis=-1)
+    rates = np.array([(good / count).mean() for good, count in outcomes])
     middle = float(interquartile_mean(rates))
     return middle, _bounds(interquartile_mean(drawn), middle, level)
 
 
-def _drawn_means(
-    successes: Sequence[int], episodes: Sequence[int], rng: np.random.Generator
-) -> np.ndarray:
+def _check_outcomes(
+    successes: Sequence[int], episodes: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Successes and episodes `[S]`, of the same seeds.
+
+    Raises:
+        ValueError: says what is wrong with them.
+    """
+    good, count = check_counts("successes", successes), check_counts("episodes", episodes, 1)
+    if not len(good) or len(good) != len(count) or (good > count).any():
+        raise ValueError(f"{good.tolist()} successes of {count.tolist()} episodes")
+    return good, count
+
+
+def _drawn_means(good: np.ndarray, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Mean success rates `[BOOTSTRAPS]` of seeds, and levels, that could as well have been."""
-    good, count = np.asarray(successes), np.asarray(episodes)
-    if not len(good) or (count < 1).any() or (good < 0).any() or (good > count).any():
-        raise ValueError(f"{list(successes)} successes of {list(episodes)} episodes")
     rates, seeds = good / count, len(good)
     chosen = rng.integers(0, seeds, (BOOTSTRAPS, seeds))
     # The mean of a draw of S of S values varies (S - 1) / S as much as that of S others.
@@ -119,5 +135,7 @@ def _drawn_means(
 
 def _bounds(drawn: np.ndarray, found: float, level: float) -> tuple[float, float]:
     """The interval of a bootstrap, which holds what was found."""
+    if not 0 < check_number("level", level) < 1:
+        raise ValueError(f"level must be between 0 and 1, got {level}")
     low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2])
     return min(found, float(low)), max(found, float(high))

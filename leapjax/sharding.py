@@ -19,6 +19,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from leapjax.checks import check_integer
 from leapjax.types import PyTree
 
 DATA, FSDP = AXES = "data", "fsdp"  # of every mesh
@@ -39,6 +40,7 @@ def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int
     Raises:
         ValueError: no number of these devices splits the batch, or makes whole groups of `fsdp`.
     """
+    batch, fsdp = check_integer("batch", batch, 1), check_integer("fsdp", fsdp, 1)
     devices = jax.local_devices() if devices is None else devices
     if not devices:
         raise ValueError("a mesh needs at least one device, got none")

@@ -5,15 +5,26 @@ horizon), K past steps in a context, N planning iterations, P positions resample
 together, A actions (the end action included).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import MOST, check_integer
+
 PyTree = Any
 Params = Any
 Array = Any  # a jax.Array inside a program, a NumPy array at its edges
+
+
+def to_plain_dicts(observation: PyTree) -> PyTree:
+    """Replaces mappings of any kind by dicts: to `jax.tree` each kind is another structure."""
+    if isinstance(observation, Mapping):
+        return {key: to_plain_dicts(part) for key, part in observation.items()}
+    if isinstance(observation, tuple | list):  # which may hold mappings
+        return jax.tree.map(to_plain_dicts, observation, is_leaf=lambda x: isinstance(x, Mapping))
+    return observation
 
 
 class Context(NamedTuple):
@@ -106,12 +117,21 @@ class Energy(NamedTuple):
 
 def mask_token(num_actions: int) -> int:
     """The token of an action that is not chosen yet."""
-    return num_actions
+    return check_num_actions(num_actions)
 
 
 def pad_token(num_actions: int) -> int:
     """The token of a past action that never was: the episode had not begun."""
-    return num_actions + 1
+    return check_num_actions(num_actions) + 1
+
+
+def check_num_actions(num_actions: int) -> int:
+    """Returns A, the end action included.
+
+    Raises:
+        UserError: not an integer, or out of range.
+    """
+    return check_integer("num_actions", num_actions, 1, MOST - 1)  # PAD is one more
 
 
 class TrainState(NamedTuple):

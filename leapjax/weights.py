@@ -1,6 +1,7 @@
 """Parameters in one small file, in half precision: what a planner is published as."""
 
-import hashlib
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -8,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax import files
+from leapjax.checkpoints import IDENTITY, identity_digest
 from leapjax.errors import UserError, first_line
 from leapjax.types import Params
 
-IDENTITY = "identity"  # the entry that says whose parameters they are
+ITEMSIZE = 2  # bytes of a number in half precision
+HEADER = 1024  # bytes that an array takes beside its numbers, at most
 
 
 def write(path: Path, params: Params, identity: str) -> None:
@@ -31,7 +34,32 @@ def write(path: Path, params: Params, identity: str) -> None:
         if not np.isfinite(array).all():
             raise ValueError(f"{name} does not fit half precision")
     with files.whole(path) as scratch, scratch.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays, **{IDENTITY: _digest(identity)})
+        np.savez_compressed(
+            file, allow_pickle=False, **arrays, **{IDENTITY: identity_digest(identity)}
+        )
+
+
+def check_identity(path: Path, identity: str) -> list[int]:
+    """Checks with which identity parameters were written, and unpacks none of them.
+
+    Args:
+        path: of a file that `write` has made.
+        identity: that they should be of.
+
+    Returns:
+        How many numbers each array has, at most.
+
+    Raises:
+        UserError: the file cannot be read, or is of another configuration.
+    """
+    with _reading(path):
+        sizes = files.read_sizes(path)
+        if sizes.pop(IDENTITY, 2**20) > HEADER:
+            raise _another(path)
+        with np.load(path, allow_pickle=False) as archive:
+            if not np.array_equal(archive[IDENTITY], identity_digest(identity)):
+                raise _another(path)
+    return [size // ITEMSIZE for size in sizes.values()]
 
 
 def read(path: Path, like: Params, identity: str) -> Params:
@@ -45,28 +73,38 @@ def read(path: Path, like: Params, identity: str) -> Params:
     Raises:
         UserError: the file cannot be read, or is of another configuration.
     """
+    check_identity(path, identity)
     wanted = dict(_by_name(like))
-    try:
+    with _reading(path):
+        sizes = files.read_sizes(path)
+        if sizes.keys() != wanted.keys() | {IDENTITY} or any(
+            not 0 <= sizes[name] - ITEMSIZE * leaf.size <= HEADER for name, leaf in wanted.items()
+        ):
+            raise _another(path)
         with np.load(path, allow_pickle=False) as archive:
-            found = {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in wanted}
+    for name, leaf in wanted.items():
+        if (arrays[name].shape, arrays[name].dtype) != (leaf.shape, np.float16):
+            raise _another(path)
+    leaves = [jnp.asarray(array, jnp.float32) for array in arrays.values()]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except UserError:
+        raise
     except Exception as error:  # noqa: BLE001  (zipfile, zlib and NumPy raise many kinds)
         raise UserError(f"cannot read {path}: {first_line(error)}") from None
-    whose = found.pop(IDENTITY, None)
-    fits = found.keys() == wanted.keys() and all(
-        found[name].shape == leaf.shape and found[name].dtype == np.float16
-        for name, leaf in wanted.items()
-    )
-    if not fits or not np.array_equal(whose, _digest(identity)):
-        raise UserError(f"{path} is of another configuration than the one beside it")
-    leaves = [jnp.asarray(found[name], jnp.float32) for name in wanted]
-    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _another(path: Path) -> UserError:
+    return UserError(f"{path} is of another configuration than the one beside it")
 
 
 def _by_name(params: Params) -> list[tuple[str, jax.Array]]:
     """The leaves in the order of the tree, by their path in it."""
     leaves = jax.tree.leaves_with_path(params)
     return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves]
-
-
-def _digest(identity: str) -> np.ndarray:
-    return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)

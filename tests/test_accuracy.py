@@ -16,7 +16,7 @@ from leapjax.data.windows import Window
 from leapjax.energy import pseudo_likelihood
 from leapjax.pretrained import Origin
 from leapjax.types import mask_token
-from tests.programs import untrained_run
+from tests.programs import seal, untrained_run
 
 ACTIONS, HORIZON, END = 4, 5, 3
 DOMAIN = BABYAI.make("GoToLocalS7N5", Settings())
@@ -138,6 +138,7 @@ def test_what_nobody_demonstrates_has_nothing_to_compare_with(tmp_path, capsys):
     specification = json.loads((run / "specification.json").read_text())
     changed = {"domain": "gymnasium", "level": "CartPole-v1", "domain_settings": {}}
     (run / "specification.json").write_text(json.dumps(specification | changed))
+    seal(run)
     assert accuracy.main([str(run)]) == 2
     assert "CartPole-v1, which nobody here demonstrates" in capsys.readouterr().err
 

@@ -265,10 +265,10 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--masking", "some"], "unknown masking 'some'"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
-        (["--seeds", "-1"], "a training seed must be in"),
+        (["--seeds", "-1"], "a training seed must be at least 0"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
-        (["--checkpoint", "n" * 300], f"File name too long: {'n' * 300}"),
+        (["--checkpoint", "n" * 300], "...: File name too long"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):
@@ -284,7 +284,7 @@ def test_a_damaged_checkpoint_is_refused(workplace, tmp_path, capsys):
     specification = json.loads((copy / "specification.json").read_text())
     specification["model"]["width"] = 32
     (copy / "specification.json").write_text(json.dumps(specification))
-    with pytest.raises(UserError, match="does not fit its configuration"):
+    with pytest.raises(UserError, match="of another configuration"):
         load(copy)
     specification["model"]["width"], specification["training"]["steps"] = 16, 5
     (copy / "specification.json").write_text(json.dumps(specification))

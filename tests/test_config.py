@@ -2,20 +2,28 @@
 
 import dataclasses
 import itertools
+import math
+import typing
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import experiments.__main__ as programs
-from experiments.common import config
+from experiments.common import config, memory
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, pretrained
+from leapjax import checkpoints, domains, files, pretrained
+from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
+from leapjax.domains import DOMAINS
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
-from leapjax.planners import CrossEntropyConfig, ShootingConfig
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
+from leapjax.types import TrainState
 
 LEVEL = "GoToLocalS7N5"
 
@@ -30,6 +38,16 @@ class Later(Settings):
 def parse(*arguments):
     (found,) = config.parse("babyai", arguments)
     return found
+
+
+def test_options_of_training_are_not_for_methods_that_learn_nothing():
+    found = config.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
+    steps = {each.method: each.training.steps for each in found}
+    assert steps.pop("random") == 0 and set(steps.values()) == {5}
+    with pytest.raises(UserError, match="got 0: --steps 5 needs demonstrations"):
+        parse("--method", "random", "--steps", "5")
+    with pytest.raises(UserError, match="got -1: --steps 5 needs demonstrations"):
+        parse("--demos", "-1", "--steps", "5")
 
 
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
@@ -157,6 +175,100 @@ def test_every_program_is_known_by_name(capsys):
     assert programs.main(["babyia"]) == 2
     assert "did you mean babyai" in capsys.readouterr().err
     assert programs.main(["properties", "--only", "nothing"]) == 2  # what follows is handed on
+
+
+KINDS = [
+    *dict.fromkeys(method.settings for method in METHODS.values()),
+    *(domain.settings for domain in DOMAINS.values()),
+    ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
+]  # fmt: skip
+FIELDS = [
+    pytest.param(kind, field.name, kind_of, id=f"{kind.__module__}.{kind.__name__}.{field.name}")
+    for kind in KINDS
+    for field in dataclasses.fields(kind)
+    for kind_of in [typing.get_type_hints(kind)[field.name]]
+]
+NEVER = {
+    int: [1.0, True, "1", math.nan, -1, 2**31, 2**63],
+    float: [True, "1", math.nan, -math.inf, 10**400],
+    bool: [1, 0.0, "yes", None],
+    str: [1, None, True],
+}
+UNLIMITED = {"clip"}  # infinite: the gradient is never clipped
+
+
+@pytest.mark.parametrize(("kind", "name", "type_of"), FIELDS)
+def test_every_field_of_every_configuration_is_checked(kind, name, type_of):
+    kinds = typing.get_args(type_of) or (type_of,)
+    maybe = type(None) in kinds
+    never = [v for v in NEVER[kinds[0]] if not (maybe and v is None)]
+    if kinds[0] is float and name not in UNLIMITED:
+        never.append(math.inf)
+    pair = typing.get_origin(type_of) is tuple
+    for value in never:
+        with pytest.raises(UserError, match=name):
+            kind(**{name: (value,) * len(kinds) if pair else value})
+    assert getattr(kind(), name) == next(
+        field.default for field in dataclasses.fields(kind) if field.name == name
+    )
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--context 100000", "--context 2147483648", "--word-heads 100000", "--radius 100000",
+     "--microbatch 9223372036854775808", "--restarts 100000", "--seeds 2147483648",
+     "--episodes 9223372036854775808", "--episodes 90000000", "--layers 100000", "--width 100000",
+     "--batch 2147483647", "--horizon 100000", "--iterations 2147483647", "--demos 9999999",
+     "--test-seed 9223372036854775808", "--checkpoint-seconds nan", "--rules inf",
+     "--fsdp 9223372036854775808", "--temperature nan", "--clip nan"],
+)  # fmt: skip
+def test_a_number_that_no_machine_can_serve_is_refused(option):
+    name, value = option.split()
+    with pytest.raises(UserError, match=name.strip("-s").replace("-", "[ _-]")):
+        parse("--level", LEVEL, name, value)
+
+
+def test_infinite_means_never_where_something_is_limited():
+    chosen = parse("--checkpoint-seconds", "inf", "--clip", "inf")
+    assert (chosen.checkpoint_seconds, chosen.training.clip) == (math.inf, math.inf)
+
+
+def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path):
+    """It was refused later on only."""
+    chosen = dataclasses.replace(parse("--level", LEVEL), context=1000)
+    with pytest.raises(UserError, match="--context 1000 is longer than any episode"):
+        config.check(chosen)
+    config.check(dataclasses.replace(chosen, checkpoint=tmp_path))
+
+
+def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch):
+    pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
+    monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
+
+    def state(count):
+        params = {"w": jax.ShapeDtypeStruct((count, 1024, 1024), jnp.float32)}
+        return TrainState(params, (params, params), jax.ShapeDtypeStruct((), jnp.int32))
+
+    memory.check_state(state(600))  # parameters, two moments and gradients: 4 * 4 bytes each
+    with pytest.raises(UserError, match="at least 10 GiB of memory would be needed"):
+        memory.check_state(state(700))
+    with pytest.raises(UserError, match="--width"):
+        memory.check_state(state(2**62))  # of any size
+
+    class Compiled:
+        temp_size_in_bytes, argument_size_in_bytes = 1 << 30, 1 << 20
+
+        def memory_analysis(self):
+            return self
+
+    memory.check_program(Compiled())  # on each of 8 devices
+    Compiled.temp_size_in_bytes = 2 << 30
+    with pytest.raises(UserError, match="--batch.* at least 16 GiB"):
+        memory.check_program(Compiled())
+    Compiled.memory_analysis = lambda self: None  # a backend that does not say
+    memory.check_program(Compiled())
+    monkeypatch.delattr(files.os, "sysconf")  # Windows does not say
+    memory.check_state(state(2**40))
 
 
 @pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])

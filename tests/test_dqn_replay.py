@@ -1,7 +1,6 @@
 import gzip
 import io
 import os
-import tempfile
 import tracemalloc
 from pathlib import Path
 
@@ -275,18 +274,26 @@ def test_a_damaged_conversion_is_named(tmp_path):
 
 def test_beside_read_only_data_nothing_is_written(tmp_path, monkeypatch):
     some = episodes([5, 6])
-    data, temporary = tmp_path / "data", tmp_path / "temporary"
-    temporary.mkdir()
+    data, cache = tmp_path / "data", tmp_path / "new" / "cache"
     put(data, stale(rows_of(some)))
     before = sorted(data.rglob("*"))
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr(os, "access", lambda path, mode: data not in Path(path).parents)
     assert_are(read(data).demonstrations, some)
     assert sorted(data.rglob("*")) == before
-    (path,) = temporary.rglob("frames.npy")
+    (path,) = cache.rglob("frames.npy")
+    assert all(folder.stat().st_mode & 0o077 == 0 for folder in (cache.parent, cache / "leapjax"))
     changed = path.stat().st_mtime_ns
     assert_are(read(data).demonstrations, some)
     assert path.stat().st_mtime_ns == changed
+    # What others may have put there is not learned from.
+    shared = cache / "leapjax" / "dqn-replay"
+    shared.chmod(0o777)
+    assert f"others can write to {shared}" in refused(data)
+    shared.chmod(0o700)
+    if os.getuid() == 0:
+        os.chown(path.parents[1], 1234, -1)
+        assert f"{path.parents[1]} belongs to another user" in refused(data)
 
 
 def test_frames_are_never_all_in_memory(tmp_path):
@@ -428,7 +435,27 @@ def test_a_header_that_claims_what_is_not_there(tmp_path):
             np.lib.format.write_array_header_1_0(file, header)
             file.write(bytes(10))
     message = refused(tmp_path)
-    assert str(path) in message and "before its last row" in message
+    assert f"{ACTION}_ckpt.0.gz claims to hold 4000000000000000 bytes" in message
+
+
+def test_a_small_file_of_very_many_rows_is_not_unpacked(tmp_path):
+    """All parts claim as many rows, and one of them has so many: 60 MB of zeros in 60 kB."""
+    rows = 60_000_000
+    logs = put(tmp_path, stale(rows_of(episodes([5]))))
+    for name, dtype in STORED.items():
+        with gzip.open(logs / f"$store$_{name}_ckpt.0.gz", "wb") as file:
+            shape = (rows, 84, 84) if name == "observation" else (rows,)
+            replay._write_header(file, np.dtype(dtype), shape)
+            for _ in range(60 if name == "terminal" else 1):
+                file.write(bytes(10**6))
+    (logs / f"{ACTION}_ckpt.0.gz").write_bytes((logs / f"{ACTION}_ckpt.0.gz").read_bytes() * 300)
+    (logs / f"{REWARD}_ckpt.0.gz").write_bytes((logs / f"{REWARD}_ckpt.0.gz").read_bytes() * 300)
+    tracemalloc.start()
+    message = refused(tmp_path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert f"{OBSERVATION}_ckpt.0.gz claims to hold" in message and "copy it again" in message
+    assert peak < 10**7
 
 
 @pytest.mark.parametrize("action", [-1, 6])

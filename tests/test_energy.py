@@ -8,6 +8,7 @@ import pytest
 from leapjax.batching import compile_planner
 from leapjax.energy import (
     autoregressive,
+    classifier,
     compose,
     constrain,
     from_total,
@@ -17,7 +18,7 @@ from leapjax.energy import (
     view,
 )
 from leapjax.planners import BeamConfig, GibbsConfig, bind, gibbs
-from leapjax.types import Energy, mask_token, pad_token
+from leapjax.types import Energy, mask_token, no_violation, pad_token
 from tests.enumerable import (
     all_plans,
     conditional_by_counting,
@@ -27,6 +28,7 @@ from tests.enumerable import (
     no_tilt,
     random_table,
 )
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
@@ -216,13 +218,6 @@ def test_forbidden_action_is_infinite_and_not_nan():
     np.testing.assert_allclose(np.exp(-table).sum(-1), 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("num_actions", [0, -1])
-def test_energy_without_actions_is_refused(num_actions):
-    for make in (pseudo_likelihood, from_total):
-        with pytest.raises(ValueError, match="at least one action"):
-            make(lambda p, c: c, lambda *_: jnp.zeros(()), num_actions)
-
-
 # An energy from its total alone.
 
 
@@ -323,9 +318,19 @@ def test_composing_with_nothing_changes_nothing(other, weights):
     np.testing.assert_array_equal(
         totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
     )
-    assert (violations(composed, params, NO_TILT) == 0).all()
+    # A constraint counts, whatever the weight of the energy that has it.
+    assert (violations(composed, params, NO_TILT) == (other is INFINITE)).all()
     assert composed.accepts_mask
     assert composed.num_actions == ACTIONS
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-45, 1e-39])
+def test_a_weight_that_jax_takes_for_nothing_leaves_an_energy_out(weight):
+    composed = compose([ENUMERABLE, INFINITE], [1.0, weight])
+    params = (TABLE, OTHER_TABLE)
+    np.testing.assert_array_equal(
+        totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
+    )
 
 
 def test_composition_accepts_mask_only_if_all_its_parts_do():
@@ -341,14 +346,54 @@ def test_composition_keeps_constraints():
     np.testing.assert_array_equal(violated, PLANS[:, 0] == 1)
 
 
+FORBIDDING = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
+KEEPING = {
+    "weight 0": (compose([ENUMERABLE, FORBIDDING], [1, 0]), (TABLE, TABLE)),
+    "all weights 0": (compose([FORBIDDING, ENUMERABLE], [0, 0]), (TABLE, TABLE)),
+    "nested": (
+        compose([ENUMERABLE, compose([FORBIDDING, ENUMERABLE], [0, 1])], [1, 0]),
+        (TABLE, (TABLE, TABLE)),
+    ),
+    "seen through a view": (view(FORBIDDING, lambda context: context), TABLE),
+    "constrained again": (constrain(FORBIDDING, lambda context, actions: jnp.float32(0)), TABLE),
+    "of a constrained neutral": (
+        compose([constrain(neutral(ENUMERABLE, [2]), lambda c, a: 1.0 * (a[0] == 1))], [0]),
+        (TABLE,),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", KEEPING)
+def test_no_operation_drops_a_constraint(case):
+    energy, params = KEEPING[case]
+    memory = energy.encode(params, NO_TILT)
+    for plan in ([1, 0, 2], [0, 1, 2]):
+        assert energy.violation(params, memory, np.array(plan)) == (plan[0] == 1)
+    with pytest.raises(ValueError, match="neutral comes before constrain"):
+        neutral(energy, [2])
+
+
+@only_long
+def test_a_plan_that_breaks_a_constraint_of_weight_0_is_not_satisfied():
+    # The likeliest plan begins with action 0, which is forbidden.
+    tilt = NO_TILT.copy()
+    tilt[0, 0] = 9.0
+    forbidding = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 0))
+    energy = compose([ENUMERABLE, forbidding], [1, 0])
+    plan = gibbs(energy, (TABLE, TABLE), jax.random.key(0), tilt, GibbsConfig(HORIZON, 1))
+    assert plan.actions[0] == 0 and not plan.satisfied
+
+
 def test_compose_refuses_different_action_sets():
     with pytest.raises(ValueError, match=r"one action set, got sizes \[3, 4\]"):
         compose([ENUMERABLE, enumerable_energy(HORIZON, 4)])
 
 
-@pytest.mark.parametrize("weight", [-1.0, float("inf"), float("nan")])
+@pytest.mark.parametrize(
+    "weight", [-1.0, float("inf"), float("nan"), 1e39, True, "1", None, np.ones(1), 1j]
+)
 def test_compose_refuses_impossible_weights(weight):
-    with pytest.raises(ValueError, match="finite and at least 0"):
+    with pytest.raises(ValueError, match="a weight must be"):
         compose([ENUMERABLE, ENUMERABLE], [1.0, weight])
 
 
@@ -475,11 +520,29 @@ def test_neutral_refuses_what_it_cannot_do():
     for actions in ([], [0, 1, 2]):
         with pytest.raises(ValueError, match="expected some of 3 actions"):
             neutral(ENUMERABLE, actions)
-    with pytest.raises(ValueError, match="not all in 0 .. 2"):
+    with pytest.raises(ValueError, match="neutral actions must be at most 2"):
         neutral(ENUMERABLE, [3])
+    for actions in ([1.5], [-1], [1, 1], [True, False], [0, True], ["0"], [None], 1, "1", None,
+                    np.array([0.0]), jnp.array([0.0]), jnp.array([[0]])):  # fmt: skip
+        with pytest.raises(ValueError, match="neutral actions"):
+            neutral(ENUMERABLE, actions)
     with pytest.raises(ValueError, match="neutral comes before constrain"):
         neutral(compose([CONSTRAINED, CONSTRAINED]), [2])
     assert neutral(compose([ENUMERABLE, ENUMERABLE]), [2]).accepts_mask
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [[False, False, True], np.array([False, False, True]), jnp.array([False, False, True]), {2},
+     np.array([2], np.uint8), jnp.array([2]), range(2, 3)],
+)  # fmt: skip
+def test_a_mask_and_a_number_mean_the_same_neutral_action(actions):
+    tokens, positions = jnp.array([0, 2, 1]), jnp.arange(HORIZON)
+    memory = ENUMERABLE.encode(TABLE, NO_TILT)
+    np.testing.assert_array_equal(
+        neutral(ENUMERABLE, actions).conditional(TABLE, memory, tokens, positions),
+        neutral(ENUMERABLE, [2]).conditional(TABLE, memory, tokens, positions),
+    )
 
 
 def test_a_constrained_or_composed_energy_takes_what_others_take():
@@ -684,6 +747,86 @@ def test_an_action_that_there_is_not_is_refused(energy, action):
     actions = jnp.zeros(HORIZON, jnp.int32).at[1].set(action)
     with pytest.raises(ValueError, match=r"actions .* are not all in 0 \.\. 2, or 3 for MASK"):
         energy.conditional(TABLE, jnp.asarray(TABLE), actions, jnp.array([0]))
+
+
+def energies_of_everyone():
+    """By name: an energy, its parameters and memory."""
+    free = scoring(np.zeros((HORIZON, ACTIONS)))
+    forbidding = constrain(free, lambda context, actions: jnp.float32(0))
+
+    def scores(params, memory, tokens, positions):
+        return jnp.zeros((len(positions), ACTIONS))
+
+    return {
+        "pseudo_likelihood": (free, (), ()),
+        "autoregressive": (autoregressive(lambda p, c: (), scores, ACTIONS), (), ()),
+        "from_total": (from_total(lambda p, c: (), lambda p, m, a: 0.0, ACTIONS), (), ()),
+        "compose": (compose([free, free], [0, 0]), ((), ()), ((), ())),
+        "constrain": (forbidding, (), ((), ())),
+        "neutral": (neutral(free, [2]), (), ()),
+        "view": (view(free, lambda context: context), (), ()),
+    }
+
+
+NO_TOKENS = {
+    "floats": np.zeros(HORIZON), "booleans": np.zeros(HORIZON, bool), "texts": ["0", "1", "2"],
+    "wide": np.array([0, 2**32, 1]), "negative": np.array([0, -(2**32), 1]), "JAX": jnp.zeros(3),
+    "too many": np.array([2**63, 0, 1], np.uint64), "lists": [0.0, 1.0, 2.0],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", energies_of_everyone())
+@pytest.mark.parametrize("wrong", NO_TOKENS)
+def test_actions_and_positions_are_integers(name, wrong):
+    energy, params, memory = energies_of_everyone()[name]
+    given, fine = NO_TOKENS[wrong], np.arange(HORIZON)
+    with pytest.raises(ValueError, match="actions"):
+        energy.conditional(params, memory, given, fine)
+    with pytest.raises(ValueError, match="positions"):
+        energy.conditional(params, memory, fine, given)
+    with pytest.raises(ValueError, match="actions"):
+        energy.total(params, memory, given)
+    if energy.violation is not no_violation:
+        with pytest.raises(ValueError, match="actions"):
+            energy.violation(params, memory, given)
+
+
+@pytest.mark.parametrize("name", energies_of_everyone())
+@pytest.mark.parametrize("kind", [jnp.float32, jnp.bfloat16, bool])
+def test_a_program_refuses_other_types_while_it_is_traced(name, kind):
+    energy, params, memory = energies_of_everyone()[name]
+    given, fine = jax.ShapeDtypeStruct((3,), kind), jax.ShapeDtypeStruct((3,), jnp.int32)
+    for arguments in ((given, fine), (fine, given)):
+        with pytest.raises(ValueError, match="must be integers"):
+            jax.eval_shape(lambda *each: energy.conditional(params, memory, *each), *arguments)
+    with pytest.raises(ValueError, match="must be integers"):
+        jax.eval_shape(lambda plan: energy.total(params, memory, plan), given)
+
+
+def test_small_integers_hold_every_token():
+    """255 is the last action of 256, and MASK is 256, which eight bits do not hold."""
+    seen = []
+
+    def logits(params, memory, tokens, positions):
+        seen.append(tokens)
+        return jnp.zeros((len(positions), 256))
+
+    energy = pseudo_likelihood(lambda p, c: (), logits, 256)
+    energy.conditional((), (), np.array([255, 0], np.uint8), np.array([0], np.int8))
+    assert seen[0].tolist() == [256, 0]
+
+
+@pytest.mark.parametrize("count", [0, -1, 3.0, True, "3", None, 2**31 - 1, 2**64, [3]])
+def test_a_number_of_actions_is_a_positive_integer(count):
+    def nothing(*given):
+        return jnp.zeros(())
+
+    for make in (pseudo_likelihood, autoregressive, from_total, single_action, classifier):
+        with pytest.raises(ValueError, match="num_actions must be"):
+            make(nothing, nothing, count)
+    for token in (mask_token, pad_token):
+        with pytest.raises(ValueError, match="num_actions must be"):
+            token(count)
 
 
 @pytest.mark.parametrize("row", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf] * 3])

@@ -6,6 +6,7 @@ thousands of cases; the suite tries some.
 
 import contextlib
 import copy
+import functools
 import io
 import json
 import resource
@@ -22,20 +23,24 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experiments.common import config, results, run
-from leapjax import checkpoints, pretrained
+from experiments import report
+from experiments.common import analysis, config, results, run, runtime
+from experiments.tables import measured
+from leapjax import checkpoints, pretrained, weights
+from leapjax.atari import collect
 from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import storage
 from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import LONG
+from tests import numbers
+from tests.programs import LONG, ROOT, only_long
 from tests.test_storage import LEVEL, NAME, SIDE, assert_same
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
 MEBIBYTES = 512
-CASES = 600 if LONG else 25  # for each of seven kinds of input
+CASES = 600 if LONG else 25  # for each of eight kinds of input
 
 
 # The same cases every time.
@@ -248,7 +253,7 @@ def replace_actions(replace):
             lambda g: g.create_dataset("actions", (9,), "i8", external=[("/etc/passwd", 0, 72)]),
             "not an array of this file",
         ),
-        (lambda g: g.__setitem__("actions", g), "recursion"),
+        (lambda g: g.__setitem__("actions", g), "actions is an object that has another name too"),
     ],
 )  # fmt: skip
 def test_arrays_that_are_not_there(data_set, replace, says):
@@ -271,18 +276,96 @@ def test_the_data_set_as_it_was(data_set, local_demonstrations):
 
 # Rows, the training curve, what a checkpoint says of itself.
 
+SOURCES = [*report.EXPERIMENTS, *report.MEASURED]
+VALUES_OF_FIELDS = [
+    None, True, "", "x", "paper", -1, 0, 2, 1.5, -0.5, 1e300, 10**40, float("nan"), float("inf"),
+    [], {}, [1], {"x": 1},
+]  # fmt: skip
+GONE = object()  # instead of a value: the field is removed
+
+
+@pytest.fixture(scope="module")
+def few_results(tmp_path_factory):
+    """A folder with some of the committed rows of each experiment, and all measurements."""
+    root = tmp_path_factory.mktemp("results")
+    (root / "results").mkdir()
+    for name in report.EXPERIMENTS:
+        lines = (ROOT / "results" / f"{name}.jsonl").read_text().splitlines()
+        kept = [line for line in lines[:: len(lines) // 8] if report.is_used(json.loads(line))]
+        assert len(kept) > 2
+        (root / "results" / f"{name}.jsonl").write_text("\n".join(kept[:3]))
+    for name in report.MEASURED:
+        shutil.copy(ROOT / "results" / f"{name}.json", root / "results")
+    return root
+
+
+def tables_of(root, name, rows):
+    """Every table that is made from one of the sources, for documents and for a terminal."""
+    if name in report.MEASURED:
+        rows = {**rows, name: measured.read(root / "results" / f"{name}.json")}
+    else:
+        rows = {**rows, name: report.rows_of(root, name)}
+        shown = analysis.table if name in report.ANALYSES else results.success_table
+        assert shown(rows[name]).row_count == results.time_table(rows[name]).row_count
+        assert all(isinstance(report.is_used(row), bool) for row in rows[name])
+    rows["puzzles"] = [row for puzzle in report.PUZZLES for row in rows[puzzle]]
+    sections = report.sections_of(rows)
+    return {section: make(rows[source]) for section, (make, source) in sections.items()
+            if source == name or (source == "puzzles" and name in report.PUZZLES)
+            or (section, name) in (("price", "methods"), ("atari", "atari-data"))}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_tables_of_damaged_rows(few_results, tmp_path, name):
+    """Each field of a real row becomes each of many values: there is a table, or one line."""
+    whole = report.rows_by_source(few_results)
+    assert tables_of(few_results, name, whole)
+    suffix = "json" if name in report.MEASURED else "jsonl"
+    text = (few_results / "results" / f"{name}.{suffix}").read_text()
+    original = json.loads(text) if suffix == "json" else json.loads(text.splitlines()[0])
+    rest = [] if suffix == "json" else text.splitlines()[1:]
+    changes = [(path, value) for path in places(original) if path
+               for value in (*VALUES_OF_FIELDS, GONE)]  # fmt: skip
+    rng = np.random.default_rng(SOURCES.index(name))
+    fields = [change for change in changes if len(change[0]) < 3]  # of rows; most are deep in one
+    chosen = [fields[i] for i in rng.choice(len(fields), CASES // 2)]
+    chosen += [changes[i] for i in rng.choice(len(changes), CASES // 2)]
+    root = tmp_path / "damaged"
+    (root / "results").mkdir(parents=True)
+    refused = 0
+    for path, value in chosen:
+        changed = copy.deepcopy(original)
+        parent = functools.reduce(lambda part, key: part[key], path[:-1], changed)
+        if value is GONE:
+            del parent[path[-1]]
+        else:
+            parent[path[-1]] = value
+        line = json.dumps(changed)
+        (root / "results" / f"{name}.{suffix}").write_text("\n".join([line, *rest]))
+        try:
+            refused += outcome(functools.partial(tables_of, root, name, whole)) is None
+        except Exception as error:
+            raise AssertionError(f"{name}: {path} = {value!r}") from error
+    assert refused  # they do reach what tables read
+
+
 ROW = {
     **{name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()},
     "paper_success": 95.0,
-    "configuration": {"level": "GoToLocalS7N5", "betas": [0.9, 0.95], "demonstrations": None},
+    "configuration": {
+        "level": "GoToLocalS7N5",
+        "betas": [0.9, 0.95],
+        "planner": {"fill": "margin"},
+    },
 }
 
 
 @cases
 @given(data=st.data())
-def test_damaged_rows(tmp_path_factory, data):
+def test_damaged_lines(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("rows") / "rows.jsonl"
-    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(ROW)) + b"\n")
+    other = {**ROW, "hash": "y"}
+    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(other)) + b"\n")
     rows = outcome(lambda: results.read(path))
     if rows is not None:
         for table in (results.success_table, results.time_table):
@@ -311,10 +394,10 @@ SPECIFICATION = config.specify(
 def test_a_damaged_specification(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("run")
     pretrained.save_specification(folder, SPECIFICATION)
-    assert pretrained.read_specification(folder) == SPECIFICATION
+    assert pretrained.parse_specification(folder) == SPECIFICATION
     path = folder / pretrained.SPECIFICATION
     path.write_bytes(data.draw(changed_json(json.loads(path.read_text()))))
-    found = outcome(lambda: pretrained.read_specification(folder))
+    found = outcome(lambda: pretrained.parse_specification(folder))
     assert found is None or isinstance(found, pretrained.Specification)
 
 
@@ -360,6 +443,60 @@ def test_any_command_line(arguments):
         assert parsed.demos > 0 or parsed.training.steps == 0
 
 
+@only_long
+@pytest.mark.parametrize("domain", numbers.LEVELS)
+def test_any_number_that_an_option_takes(domain):
+    """An accepted one has passed every check before work, the arithmetic of memory included."""
+    accepted = 0
+    for arguments in numbers.command_lines(domain):
+        try:
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                contextlib.redirect_stderr(io.StringIO()),
+            ):
+                parsed = outcome(lambda given=arguments: config.parse(domain, given)) or []
+        except SystemExit as stopped:  # what tyro has to say
+            assert stopped.code == 2
+            parsed = []
+        for each in parsed:
+            accepted += 1
+            assert len(config.configuration_hash(each, each.seeds[0])) == 12
+            assert each.context <= config.make_domain(each).max_steps
+            numbers_in = json.dumps(config.resolved(each, each.seeds[0]))
+            assert "NaN" not in numbers_in
+    assert accepted > 50
+
+
+class Begun(Exception):
+    """A program has made all checks, and would begin to work."""
+
+
+@only_long
+@pytest.mark.parametrize("name", numbers.PROGRAMS)
+def test_any_number_that_a_program_takes(toy_run, tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+
+    def begin(*given):
+        raise Begun
+
+    for module, name_of in ((runtime, "start"), (collect, "collect")):
+        monkeypatch.setattr(module, name_of, begin)
+    main, kind, before = numbers.PROGRAMS[name]
+    given = [str(toy_run) if each == "RUN" else each for each in before]
+    for field, option in numbers.numeric(kind):
+        with bounded():
+            try:
+                assert main([*given, *option]) == 2, (field, option)
+            except Begun:
+                assert float(option[-1]) >= 0, (field, option)
+            except SystemExit as stopped:
+                assert stopped.code == 2
+                capsys.readouterr()
+                continue
+        error = capsys.readouterr().err
+        assert not error or (error.startswith("error: ") and error.count("\n") == 1)
+
+
 # Checkpoints.
 
 STATE = TrainState(
@@ -396,7 +533,29 @@ def test_a_damaged_checkpoint(two_checkpoints, seed, whole_state):
             params = restored and restored.params
             assert restored is None or int(restored.step) in (1, 2)
         else:
+            sizes = outcome(lambda: checkpoints.check_identity(folder, ""))
+            assert sizes in (None, [30, 600])
             params = outcome(lambda: checkpoints.restore_params(folder, STATE.params))
         if params:  # not one bit of them is wrong
             for name, value in STATE.params.items():
                 np.testing.assert_array_equal(params[name], value)
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """The bytes of a file of weights."""
+    path = tmp_path_factory.mktemp("published") / "weights.npz"
+    weights.write(path, STATE.params, "mine")
+    return path.read_bytes()
+
+
+@cases
+@given(seed=SEEDS)
+def test_damaged_weights(published, tmp_path_factory, seed):
+    path = tmp_path_factory.mktemp("damaged") / "weights.npz"
+    path.write_bytes(damaged(published, np.random.default_rng(seed)))
+    sizes = outcome(lambda: weights.check_identity(path, "mine"))
+    assert sizes is None or len(sizes) <= 2
+    params = outcome(lambda: weights.read(path, STATE.params, "mine"))
+    for name, value in STATE.params.items() if params else ():
+        np.testing.assert_allclose(params[name], value, rtol=1e-3)

@@ -1,5 +1,8 @@
 """Environments of one's own: what they may look like, what goes wrong, the program at toy size."""
 
+import dataclasses
+import json
+import types
 import warnings
 from collections import OrderedDict
 
@@ -7,16 +10,29 @@ import gymnasium as gym
 import jax
 import numpy as np
 import pytest
+from flax.core import FrozenDict
 from gymnasium import spaces
+from gymnasium.wrappers import (
+    ClipReward,
+    FrameStackObservation,
+    RecordEpisodeStatistics,
+    RescaleObservation,
+    StickyAction,
+    TransformReward,
+)
 from minari import DataCollector
 
 from experiments import gymnasium as program
-from experiments.common import config, results
+from experiments.common import config, results, run
 from leapjax import domains
-from leapjax.domain import blank_context
+from leapjax.data import storage, windows
+from leapjax.domain import Collection, Domain, blank_context
+from leapjax.environments import Criterion, GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.gymnasium.observations import Part, StateTokens, blank_of, check_choices, parts_of
+from leapjax.rollouts import evaluate
+from leapjax.types import Demonstration, Plan
 from tests.parameters import random_like
 from tests.programs import SMALL
 
@@ -80,9 +96,24 @@ class Odd(Corridor):
         self.made_with = way, lamp
 
 
+class Held(Corridor):
+    """Counts how many are open; the third cannot be closed."""
+
+    made = closed = 0
+
+    def __init__(self, **arguments):
+        super().__init__(**arguments)
+        Held.made += 1
+
+    def close(self):
+        Held.closed += 1
+        if Held.closed == 3:
+            raise OSError("the port is gone")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def registered():
-    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows, "Deep": Deep}
+    kinds = {"Corridor": Corridor, "Raises": Raises, "Grows": Grows, "Deep": Deep, "Held": Held}
     for name, kind in kinds.items():
         gym.register(f"{name}-v0", f"tests.test_gymnasium:{kind.__name__}", max_episode_steps=12)
     gym.register("Endless-v0", "tests.test_gymnasium:Corridor")
@@ -93,9 +124,9 @@ def registered():
         del gym.registry[f"{name}-v0"]
 
 
-def recorded(name, level, policy, episodes, **arguments):
+def recorded(name, level, policy, episodes, wrap=lambda env: env, **arguments):
     """A data set of a policy, as Minari's collector writes it."""
-    made = gym.make(level, disable_env_checker=True, **arguments)
+    made = wrap(gym.make(level, disable_env_checker=True, **arguments))
     env = DataCollector(made, jpeg_encoding=False)
     for seed in range(episodes):
         seen, _ = env.reset(seed=seed)
@@ -114,10 +145,10 @@ def test_spaces_become_blank_observations_and_parts():
     space = Corridor.observation_space
     blank = blank_of(space, "it")
     assert [leaf.shape for leaf in jax.tree.leaves(blank)] == [(2,), (), (WAY, 3, 3)]
-    assert parts_of(space) == (Part("numbers"), Part("choices", 3), Part("image"))
+    assert parts_of(space) == (Part("vector"), Part("choices", 3), Part("picture"))
     several = spaces.MultiDiscrete([4, 9], start=[1, 1])
     assert parts_of(several) == (Part("choices", 10),) and blank_of(several, "it").shape == (2,)
-    assert parts_of(spaces.MultiBinary(3)) == (Part("numbers"),)
+    assert parts_of(spaces.MultiBinary(3)) == (Part("vector"),)
     with pytest.raises(UserError, match=r"it\['said'\] is a Text: expected Box"):
         blank_of(spaces.Dict(said=spaces.Text(5)), "it")
 
@@ -164,11 +195,101 @@ def test_success_is_what_the_environment_says_or_the_user():
     assert [adapter.step(0).truncated for _ in range(2)] == [False, True]
 
 
+def episode(rewards, terminated=True, truncated=False):
+    steps = len(rewards)
+    return Demonstration(
+        np.zeros(steps + 1), np.zeros(steps, np.int32), np.array(rewards, np.float32),
+        terminated, truncated, 0,
+    )  # fmt: skip
+
+
+def test_demonstrations_are_judged_as_episodes_that_are_played():
+    class Scripted(Corridor):
+        spec = None
+
+        def __init__(self, demonstration):
+            self.script = demonstration
+
+        def reset(self, *, seed=None, options=None):
+            self.place = self.count = 0
+            return self.seen(), {}
+
+        def step(self, action):
+            self.count += 1
+            d, last = self.script, self.count == len(self.script.rewards)
+            marks = last and d.terminated, last and d.truncated
+            return self.seen(), d.rewards[self.count - 1], *marks, {}
+
+    data = [
+        episode([1, 0, 0]), episode([0, 0, 1]), episode([5, -5, 1], False, True),
+        episode([-1, -1], False, True), episode([9, -9]),
+    ]  # fmt: skip
+    domain = make("Corridor-v0", Settings())
+    shares = {None: 1 / 5, 1.0: 3 / 5, 0.0: 4 / 5, -2.0: 1.0}
+    for least, share in shares.items():
+        criterion = Criterion(least, least is not None)
+        found = run.judge_data(data, domain._replace(criterion=criterion))
+        assert found == {"success": share, "return": pytest.approx(0.2)}
+        played = []
+        for each in data:
+            adapter = GymnasiumAdapter(Scripted(each), least)
+            adapter.reset(0)
+            played.append([adapter.step(0).success for _ in each.rewards][-1])
+        assert np.mean(played) == share
+    assert run.judge_data(data, domain._replace(criterion=None)) is None
+    assert run.judge_data([], domain) is None
+
+
+def test_a_criterion_says_where_it_comes_from():
+    criteria = {
+        name: make(name, Settings(success_return=least)).criterion
+        for name, least in (("CartPole-v1", None), ("CartPole-v0", 3.0), ("Corridor-v0", None))
+    }
+    assert criteria["CartPole-v1"] == Criterion(475.0)
+    assert "475 (reward_threshold of the environment, meant" in str(criteria["CartPole-v1"])
+    assert str(criteria["CartPole-v0"]) == "a return of at least 3 (given)"
+    assert criteria["Corridor-v0"] == Criterion(None)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(UserError, match="success_return must be finite"):
+            make("CartPole-v1", Settings(success_return=wrong))
+
+
+def row_of(**more):
+    kinds = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
+    return {**kinds, "mean_return": 7.93, "paper_success": None, **more}
+
+
+def headers(*rows):
+    return [str(column.header) for column in results.success_table(rows).columns]
+
+
+def test_tables_show_the_return_first_where_nobody_has_said_what_success_is():
+    judged = {"criterion": "a return of at least 8 (x)", "data_success": 0.56, "data_return": 8.0}
+    found = row_of(**judged, criterion_given=False)
+    asked = row_of(**judged, criterion_given=True)
+    assert headers(row_of()) == headers(asked)
+    assert headers(row_of())[4:6] == ["success [95%]", "return"]
+    assert headers(asked, found)[4:6] == ["return", "success [95%]"]
+    table = results.success_table([found])
+    assert [next(iter(table.columns[n].cells)) for n in (4, 5)] == [
+        "7.93 (data: 8.00)",
+        f"{results.percent(found)} (data: 56.0%)",
+    ]
+    assert table.caption == "success: a return of at least 8 (x)"
+    assert results.success_table([row_of()]).caption is None
+    assert results.summarize(found).startswith("mean return 7.93 (data: 8.00), success 100.0%")
+    assert results.summarize(asked).startswith("success 100.0%")
+    assert results.summarize(row_of()) == f"success {results.percent(found)}, mean length 1.0"
+    unknown = row_of(**{**judged, "data_return": None, "data_success": "x"}, criterion_given=False)
+    assert "data" not in results.summarize(unknown)
+
+
 @pytest.mark.parametrize(
     ("level", "says"),
     [
-        ("CartPol-v1", "cannot be made: .*; did you mean CartPole-v1"),
-        ("no_such_module:Own-v0", "cannot be made: .*no_such_module"),
+        ("CartPol-v1", "no 'CartPol-v1' is registered; .* MODULE:CartPol-v1; did you .*CartPole"),
+        ("tests.toy:Corridr-v0", "no 'Corridr-v0' is registered; did you mean Corridor-v0"),
+        ("no_such_module:Own-v0", "cannot be made: no module 'no_such_module': install it"),
         ("Pendulum-v1", "has actions Box.*: expected Discrete"),
         ("Endless-v0", "no limit of steps, so an episode may never end: .*--max-steps"),
     ],
@@ -178,6 +299,32 @@ def test_environments_that_cannot_be_used_are_one_line(level, says, capsys):
         make(level, Settings())
     assert program.main(["--env", level]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("level", "says"),
+    [
+        ("CartPole-v9", "provides versioned environments"),
+        ("ALF/Pong-v5", "no ALF/ is registered: install the package that has it"),
+        ("NoSuchFamily/Pong-v5", "no NoSuchFamily/ is registered: install the package that has it"),
+        ("Broken-v0", "Box3D is not installed, run `pip install box3d`"),
+        ("Absent-v0", "no module 'no_such_physics': install it"),
+        ("a:b:c", "expected its id, or MODULE:ID"),
+        ("not an id", "Malformed environment ID"),
+    ],
+)
+def test_no_other_name_is_proposed_where_the_cause_is_another(level, says):
+    def broken():
+        raise gym.error.DependencyNotInstalled("Box3D is not installed, run `pip install box3d`")
+
+    gym.register("Broken-v0", broken, max_episode_steps=5)
+    gym.register("Absent-v0", "no_such_physics.envs:Absent", max_episode_steps=5)
+    try:
+        with pytest.raises(UserError, match=says) as raised:
+            make(level, Settings())
+        assert "did you mean" not in str(raised.value)
+    finally:
+        del gym.registry["Broken-v0"], gym.registry["Absent-v0"]
 
 
 @pytest.mark.parametrize(
@@ -204,7 +351,7 @@ def test_without_data_it_says_what_is_missing(tmp_path, monkeypatch, capsys):
     assert "Corridor-v0 has no demonstrator: name a Minari data set" in capsys.readouterr().err
 
 
-def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
+def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 4)
     (chosen,) = config.parse("gymnasium", ["--demonstrations", name])
@@ -213,6 +360,10 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch):
     assert program.main(["--dataset", name, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
+    assert (row["data_success"], row["data_return"], row["criterion_given"]) == (1.0, 1.0, False)
+    said = capsys.readouterr().out
+    assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(said.split())
+    assert "success: a positive reward at the end (nobody has named a return)" in said
     assert domains.find_domain("gymnasium") is GYMNASIUM
 
 
@@ -254,6 +405,140 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(
             Settings(arguments=wrong)
 
 
+class Dimmed(gym.ObservationWrapper):
+    """A wrapper of the user's own, which says nothing of its arguments."""
+
+    def observation(self, observation):
+        return {**observation, "here": observation["here"] / 2}
+
+
+class Renamed(Dimmed):
+    """Another."""
+
+
+def loaded(name, level, **options):
+    return storage.load(name, make(level, Settings(**options))).demonstrations
+
+
+@pytest.mark.parametrize(
+    ("wrap", "says"),
+    [
+        (lambda env: RescaleObservation(env, -1.0, 1.0), "RescaleObservation .*min_obs.*-1.0"),
+        (lambda env: StickyAction(env, 0.25), "StickyAction"),  # its spaces are the same
+        (lambda env: ClipReward(env, 0.0, 0.5), "ClipReward"),
+        (lambda env: RecordEpisodeStatistics(FrameStackObservation(env, 2)), "FrameStackObserv"),
+        (lambda env: TransformReward(env, abs), None),  # a function: Minari keeps nothing then
+    ],
+)
+def test_data_recorded_through_wrappers_are_refused_by_name(wrap, says):
+    name = recorded("my/wrapped-v0", "MountainCar-v0", lambda seen: 1, 1, wrap)
+    if says is None:
+        assert len(loaded(name, "MountainCar-v0")) == 1
+        return
+    with pytest.raises(
+        UserError, match=f"'{name}' was recorded with the wrappers {says}"
+    ) as raised:
+        loaded(name, "MountainCar-v0")
+    assert "MountainCar-v0 is played with no wrappers" in str(raised.value)
+    assert "MODULE:MountainCar-v0" in str(raised.value)
+
+
+def test_wrappers_that_only_watch_are_nothing_to_refuse():
+    name = recorded("my/watched-v0", "Corridor-v0", lambda seen: 1, 2, RecordEpisodeStatistics)
+    assert len(loaded(name, "Corridor-v0")) == 2
+
+
+def test_an_environment_that_is_registered_with_its_wrappers():
+    wrappers = [RescaleObservation.wrapper_spec(min_obs=np.float32(-1), max_obs=np.float32(1))]
+    name = recorded(
+        "my/scaled-v0", "MountainCar-v0", lambda seen: 1, 1,
+        lambda env: RescaleObservation(env, -1.0, 1.0),
+    )  # fmt: skip
+    plain = recorded("my/plain-v0", "MountainCar-v0", lambda seen: 1, 1)
+    before = gym.registry["MountainCar-v0"]
+    try:
+        gym.registry["MountainCar-v0"] = dataclasses.replace(
+            before, additional_wrappers=tuple(wrappers)
+        )
+        (found,) = loaded(name, "MountainCar-v0")
+        adapter = make("MountainCar-v0", Settings()).make_adapter()
+        np.testing.assert_allclose(adapter.reset(0), found.observations[0], atol=1e-6)
+        with pytest.raises(UserError, match="was recorded with no wrappers, and .*RescaleObs"):
+            loaded(plain, "MountainCar-v0")
+    finally:
+        gym.registry["MountainCar-v0"] = before
+
+
+def test_wrappers_of_the_users_own_are_compared_by_name():
+    for kind, name in ((Dimmed, "my/dimmed-v0"), (Renamed, "my/renamed-v0")):
+        recorded(name, "Corridor-v0", lambda seen: 1, 1, kind)
+    gym.register("Dim-v0", lambda: Dimmed(Corridor()), max_episode_steps=12)
+    try:
+        assert len(loaded("my/dimmed-v0", "Dim-v0")) == 1
+        for level, name in (("Dim-v0", "my/renamed-v0"), ("Corridor-v0", "my/dimmed-v0")):
+            with pytest.raises(UserError, match="was recorded with the wrappers"):
+                loaded(name, level)
+    finally:
+        del gym.registry["Dim-v0"]
+
+
+def test_a_limit_of_steps_that_differs_is_the_users_choice():
+    name = recorded("my/short-v0", "Corridor-v0", lambda seen: 1, 1, max_episode_steps=7)
+    with pytest.raises(UserError, match=r"at most 7 steps, and Corridor-v0 ends them after 12: .*"):
+        loaded(name, "Corridor-v0")
+    for chosen in (7, 12, 9):
+        assert len(loaded(name, "Corridor-v0", max_steps=chosen)) == 1
+
+
+def saved_spaces(name, change):
+    """Changes what a data set says of its spaces, as if it came from somewhere else."""
+    path = storage.datasets_folder() / name / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    spaces = {each: json.loads(metadata[each]) for each in storage.SPACES}
+    change(spaces["observation_space"], spaces["action_space"])
+    metadata |= {each: json.dumps(space) for each, space in spaces.items()}
+    path.write_text(json.dumps(metadata))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda seen, acts: seen["low"].__setitem__(0, -0.5), "each observation is in Box"),
+        (lambda seen, acts: acts.update(n=4), r"each action is in Discrete\(4\), and in Mount"),
+        (lambda seen, acts: acts.update(start=1), r"each action is in Discrete\(3, start=1\)"),
+        (lambda seen, acts: seen["low"].__setitem__(0, -1.2000001), None),  # another rounding
+        (lambda seen, acts: seen.update(dtype="float64"), None),
+    ],
+)
+def test_spaces_that_are_not_those_of_the_environment(change, says):
+    name = recorded("my/car-v0", "MountainCar-v0", lambda seen: 1, 1)
+    saved_spaces(name, change)
+    if says is None:
+        assert len(loaded(name, "MountainCar-v0")) == 1
+        return
+    with pytest.raises(UserError, match=says):
+        loaded(name, "MountainCar-v0")
+
+
+def test_a_part_of_a_space_is_named_and_bounds_without_end_are_equal():
+    name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 1)
+    largest = float(np.finfo(np.float32).max)  # as environments of earlier versions have it
+    saved_spaces(name, lambda seen, acts: seen["subspaces"]["here"].update(high=[largest] * 2))
+    assert len(loaded(name, "Corridor-v0")) == 1
+    saved_spaces(name, lambda seen, acts: seen["subspaces"]["lamp"].update(n=4))
+    with pytest.raises(UserError, match=r"each observation\['lamp'\] is in Discrete\(4\)"):
+        loaded(name, "Corridor-v0")
+
+
+@pytest.mark.parametrize("level", ["Corridor-v0", "Deep-v0", "MountainCar-v0"])
+def test_what_leapjax_writes_of_an_environment_is_loaded_again(level):
+    name, domain = recorded("my/first-v0", level, lambda seen: 1, 2), make(level, Settings())
+    first = storage.load(name, domain)
+    storage.save("my/again-v0", first, domain, "again")
+    for one, other in zip(first.demonstrations, loaded("my/again-v0", level), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
 def test_choices_below_zero_are_told_apart():
     """A one-hot code that is counted from 0 would be nothing for all of them."""
     parts = parts_of(Deep.observation_space)
@@ -269,6 +554,76 @@ def test_choices_below_zero_are_told_apart():
     for index, token in enumerate(tokens):
         for other in tokens[:index]:
             assert np.abs(token - other).max() > 1e-3
+
+
+class Moody(gym.Env):
+    """Each observation is another kind of mapping."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Dict(b=spaces.Discrete(9), a=spaces.Discrete(9))
+    kinds = (OrderedDict, dict, types.MappingProxyType, FrozenDict)
+
+    def reset(self, *, seed=None, options=None):
+        self.count = seed  # episodes begin with different kinds
+        return self.seen(), {}
+
+    def seen(self):
+        self.count += 1
+        values = {"b": np.int64(self.count % 9), "a": np.int64(0)}
+        return self.kinds[self.count % len(self.kinds)](values)
+
+    def step(self, action):
+        return self.seen(), 1.0, False, self.count > 12, {}
+
+
+class Bare:
+    """An adapter that is not ours: observations are as they come."""
+
+    num_actions = 3
+
+    def __init__(self, env):
+        self.env = env
+
+    def reset(self, seed):
+        return self.env.reset(seed=seed)[0]
+
+    def step(self, action):
+        return Transition(*self.env.step(action)[:4], success=False)
+
+
+@pytest.mark.parametrize("adapter", [GymnasiumAdapter, Bare])
+def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
+    contexts = []
+
+    def plan(params, keys, context):
+        contexts.append(context)
+        return Plan(np.zeros((len(keys), 1), np.int32), *[None] * 3)
+
+    plan.num_actions = 3
+    episodes = evaluate(lambda: adapter(Moody()), [1, 2, 3], plan, (), context=2)
+    assert list(episodes.lengths) == [11, 10, 9]
+    assert all(set(each.past) == {"a", "b"} and type(each.past) is dict for each in contexts)
+    np.testing.assert_array_equal(contexts[2].past["b"], [[2, 3], [3, 4], [4, 5]])
+
+
+def test_dicts_of_any_kind_are_one_structure_in_data(minari_folder):
+    def nothing(*arguments):
+        raise NotImplementedError
+
+    blank = {"b": np.zeros((), np.int64), "a": np.zeros(2, np.float32)}
+    seen = {"b": np.arange(3), "a": np.ones((3, 2), np.float32)}
+    rest = np.zeros(2, np.int32), np.zeros(2, np.float32), True, False, 0
+    kinds = (dict, OrderedDict, FrozenDict)
+    domains = [Domain("Own", nothing, None, ("go", "end"), 9, kind(blank), {}) for kind in kinds]
+    collection = Collection([Demonstration(kind(seen), *rest) for kind in kinds], {})
+    storage.save("my/kinds-v0", collection, domains[0], "kinds")
+    for domain in domains:
+        found = storage.load("my/kinds-v0", domain).demonstrations
+        context = blank_context(domain, 1)
+        for demonstrations in (found, [*collection.demonstrations, *found]):
+            joined = windows.concatenate(demonstrations).observations
+            assert jax.tree.structure(joined) == jax.tree.structure(context.observation)
+            np.testing.assert_array_equal(joined["b"], [0, 1, 2] * len(demonstrations))
 
 
 def test_dicts_of_any_kind_are_observations():
@@ -287,3 +642,16 @@ def test_choices_that_there_are_not_are_refused():
         check_choices(several, {**good, "more": np.array([[0, 0], [2, 3]])}, "episode 0")
     with pytest.raises(UserError, match="a choice of 16, expected 0 to 15"):
         make("FrozenLake-v1", Settings()).check(np.array([16]), "episode 0")
+
+
+def test_what_is_made_is_closed(monkeypatch):
+    for count in ("made", "closed"):
+        monkeypatch.setattr(Held, count, 0)
+    domain = make("Held-v0", Settings())
+    assert Held.made == Held.closed == 1
+    adapter = domain.make_adapter()
+    adapter.reset(0)
+    adapter.close()
+    assert Held.made == Held.closed == 2
+    with pytest.raises(UserError, match="close of Held-v0 raised OSError: the port is gone"):
+        domain.make_adapter().close()

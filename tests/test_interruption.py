@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from experiments import babyai
-from experiments.common import results, run, runtime
+from experiments.common import results, run, runtime, startup
 from experiments.common.interruption import SIGNALS, Interrupted, interruptible
 from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints, restore_params
@@ -100,6 +101,47 @@ def test_a_signal_at_any_moment(tmp_path, trial):
     over = run.poll() is not None
     run.send_signal(number)
     assert run.wait(60) == (0 if over else code), run.stderr.read()[-2000:]
+
+
+def catches_signals(process):
+    """Whether a process has a handler of SIGTERM, which Python itself has not."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    (caught,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
+@only_long
+@pytest.mark.parametrize("trial", range(14))
+def test_a_signal_while_a_program_is_imported(tmp_path, trial):
+    rng = np.random.default_rng(trial)
+    number, code = ((signal.SIGINT, 130), (signal.SIGTERM, 0))[trial % 2]
+    program = (
+        [*"-m experiments.stars".split(), *RANDOM],
+        ["-m", "benchmarks.methods"],
+        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; import experiments.__main__ as leapjax; "
+         "leapjax.main(['stars', *sys.argv[1:]])", *RANDOM],
+    )[trial % 3]  # fmt: skip
+    run = subprocess.Popen(
+        [sys.executable, *program], cwd=tmp_path, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    while not catches_signals(run):
+        assert run.poll() is None, run.stderr.read()
+        time.sleep(0.001)
+    time.sleep(rng.uniform(0, 3))
+    assert run.poll() is None
+    run.send_signal(number)
+    assert run.wait(60) == code
+    (line,) = run.stderr.read().splitlines()
+    assert line.startswith(f"stopped by {signal.Signals(number).name}")
+
+
+def test_a_library_has_no_handlers():
+    """`experiments` changes nothing unless it is the program."""
+    assert not startup.is_program()
+    check = "import signal, experiments; assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL"
+    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=False).returncode == 0
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():

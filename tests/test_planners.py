@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leapjax.batching import NotANumber, compile_planner, plan_keys, split_batch
+from leapjax.batching import NotANumber, check_fit, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
+from leapjax.errors import UserError
 from leapjax.planners import (
     FILLS,
     ORDERS,
@@ -960,6 +961,9 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
     keys = [jax.random.key_data(plan_keys(seed, grid[:, 0], grid[:, 1])) for seed in (0, 1)]
     assert len(np.unique(np.concatenate(keys), axis=0)) == 2 * len(grid)
+    np.testing.assert_array_equal(
+        plan_keys(0, episodes, np.zeros(4)), plan_keys(0, episodes, [0] * 4)
+    )
 
 
 # Mistakes.
@@ -1144,9 +1148,63 @@ def test_contexts_that_do_not_match_the_keys_are_refused(shape):
         batched(CONFIGS["gibbs"])(TABLE, keys, {"tilt": np.zeros(shape, np.float32)})
 
 
-@pytest.mark.parametrize("chunk_sizes", [(), (0,), (8, -1), (0, 8)])
+WIDE = [
+    np.array([0, 2**32 + 2]), np.array([0, 2**31]), np.array([-(2**31) - 1, 0]),
+    np.array([0, 2**32], np.uint64), np.array([0, 1e300]), np.array([np.inf, -1e39]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wide", WIDE)
+def test_numbers_that_jax_would_change_are_refused(wide):
+    keys, contexts = batch_of(2)
+    plan = batched(CONFIGS["gibbs"])
+    with pytest.raises(UserError, match=r"context\['more'\]\[0\] holds .*does not fit"):
+        plan(TABLE, keys, {**contexts, "more": [wide]})
+    with pytest.raises(UserError, match=r"params\['more'\] holds .*does not fit"):
+        plan({"table": TABLE, "more": wide}, keys, contexts)
+
+
+def test_numbers_of_64_bits_that_fit_are_taken():
+    for fits in (
+        [2**31 - 1, -(2**31)], np.array([2**32 - 1], np.uint64), [np.nan, np.inf, -np.inf, 3e38],
+        [1 / 3], [], np.array([2**32 - 1], np.uint32), jnp.array([1]), ["words are not numbers"],
+    ):  # fmt: skip
+        check_fit("context", {"x": fits if isinstance(fits, jax.Array) else np.array(fits)})
+
+
+@pytest.mark.parametrize("edge", [0, 1, 2])
+@pytest.mark.parametrize("wrong", [-1, 2**32, 5.9, np.nan, 1e300, -1.0])
+def test_keys_of_other_numbers_than_seeds_are_refused(edge, wrong):
+    arguments = [0, np.array([0]), np.array([0])]
+    arguments[edge] = np.array([wrong]) if edge else wrong
+    with pytest.raises(UserError, match=("seed", "episode", "replan")[edge] + " must be"):
+        plan_keys(*arguments)
+    with pytest.raises(UserError, match="2 episodes, but 1 replans"):
+        plan_keys(0, np.arange(2), np.arange(1))
+
+
+def test_raw_keys_of_another_type_are_refused():
+    keys, contexts = batch_of(2)
+    for wrong in (keys.astype(np.int64), keys[:, :1], np.tile(keys, 2)):
+        with pytest.raises(UserError, match=r"raw keys must be \[B, 2\] uint32"):
+            batched(CONFIGS["gibbs"])(TABLE, wrong, contexts)
+
+
+def test_plans_do_not_depend_on_the_kind_of_keys_that_jax_makes():
+    keys, contexts = batch_of(2)
+    plan = batched(CONFIGS["gibbs"])
+    expected = plan(TABLE, keys, contexts)
+    with jax.default_prng_impl("rbg"):
+        again, _ = batch_of(2)
+        np.testing.assert_array_equal(again, keys)
+        np.testing.assert_array_equal(plan(TABLE, again, contexts).actions, expected.actions)
+
+
+@pytest.mark.parametrize(
+    "chunk_sizes", [(), (0,), (8, -1), (4.0,), (True,), ("8",), 8, "8", (2**31,), (None,)]
+)
 def test_impossible_chunk_sizes_are_refused(chunk_sizes):
-    with pytest.raises(ValueError, match="chunk sizes must be positive"):
+    with pytest.raises(ValueError, match="chunk sizes"):
         compile_planner(TILTED, CONFIGS["gibbs"], chunk_sizes)
 
 
@@ -1178,9 +1236,9 @@ def test_impossible_configurations_are_refused(make, options, message):
         make(**options)
 
 
-@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan")])
+@pytest.mark.parametrize("temperature", [-0.1, 1e31, float("inf"), float("nan"), "1", None, True])
 def test_impossible_temperatures_are_refused(temperature):
-    with pytest.raises(ValueError, match=r"temperature must be in 0 \.\. 1e\+30, got"):
+    with pytest.raises(ValueError, match="temperature must be"):
         GibbsConfig(temperature=temperature)
 
 

@@ -35,7 +35,7 @@ def test_a_planner_can_be_asked_for_another_return(tmp_path):
     np.testing.assert_array_equal(as_trained, same)
     finite = np.isfinite(other)  # the end action is not chosen
     assert np.abs(as_trained[finite] - other[finite]).max() > 1e-3
-    with pytest.raises(UserError, match="target_return must be a number"):
+    with pytest.raises(UserError, match="target_return must be finite"):
         pretrained.load(folder, target_return=float("nan"))
 
 

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import shutil
+import tracemalloc
+import zipfile
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +45,38 @@ def test_parameters_of_something_else_are_refused(tmp_path):
             weights.read(path, like, identity)
 
 
+def zeros(path, name, shape):
+    """An archive with one more array, of zeros, which compress to a thousandth."""
+    weights.write(path, PARAMS, "mine")
+    with (
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open(f"{name}.npy", "w") as file,
+    ):
+        header = {"descr": "<f2", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(bytes(10**7))
+
+
+@pytest.mark.parametrize("name", ["c", "b", "identity"])
+@pytest.mark.parametrize("shape", [(5_000_000,), (10**15,)])
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_what_is_too_large_is_not_unpacked(tmp_path, name, shape):
+    """Another array than those that are wanted, one of another shape, the seal itself."""
+    path = tmp_path / "weights.npz"
+    zeros(path, name, shape)
+    tracemalloc.start()
+    for read in (weights.read, lambda path, like, identity: weights.check_identity(path, identity)):
+        try:
+            read(path, PARAMS, "mine")
+        except UserError as error:
+            assert "another configuration" in str(error)
+        else:
+            assert read is not weights.read
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10**6
+
+
 def test_a_damaged_file_is_one_line(tmp_path):
     path = tmp_path / "weights.npz"
     weights.write(path, PARAMS, "mine")
@@ -61,7 +95,7 @@ def test_a_damaged_file_is_one_line(tmp_path):
         path.write_bytes(whole[:size])
         with pytest.raises(UserError, match="cannot read"):
             weights.read(path, PARAMS, "mine")
-    np.savez(path, a=np.array([object()]))  # never unpickled
+    np.savez(path, identity=np.array([object()]))  # never unpickled
     with pytest.raises(UserError, match="cannot read"):
         weights.read(path, PARAMS, "mine")
 

@@ -1,28 +1,45 @@
 """What a careless or hostile user does: refused in one line, before any work, and nothing lost."""
 
 import dataclasses
+import gc
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import experiments.__main__ as everything
 import leapjax as leap
-from experiments import babyai, report
-from experiments.common import experiment, plots, results, run, runtime
+from experiments import (
+    accuracy,
+    atari,
+    atari_energy,
+    babyai,
+    failures,
+    gymnasium,
+    landscape,
+    properties,
+    publish,
+    qualitative,
+    report,
+)
+from experiments.common import config, experiment, plots, program, results, run, runtime
 from experiments.common.config import configuration_hash, parse
 from leapjax import checkpoints, files, pretrained
 from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
+from leapjax.data import storage
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests.programs import ROOT, TOY_RUN, only_long
+from tests.programs import LONG, ROOT, TOY_RUN, only_long, seal, untrained_run
 
 
 @pytest.fixture(autouse=True)
@@ -39,20 +56,100 @@ def one_line(capsys, *arguments) -> str:
     return error
 
 
+# An empty value, as a variable that is not set leaves it.
+
+EVERYWHERE = (
+    "--level --method --preset --demonstrations --checkpoint --runs --play --loggers "
+    "--coordinator --masking --seeds --demos"
+).split()
+EMPTY = [
+    *((babyai.main, [option, ""], option) for option in EVERYWHERE),
+    *((babyai.main, [f"{option}="], option) for option in EVERYWHERE),
+    (babyai.main, ["--runs", "  "], "--runs"),
+    (babyai.main, ["--level", "PickUpLoc", "--seeds", "0", ""], "--seeds"),
+    (babyai.main, [""], "an argument"),
+    (gymnasium.main, ["--env", ""], "--env"),
+    (gymnasium.main, ["--dataset="], "--dataset"),
+    (gymnasium.main, ["--arguments", ""], "--arguments"),
+    (atari.main, ["--game", ""], "--game"),
+    (atari.main, ["collect", "--folder="], "--folder"),
+    (properties.main, ["--only", ""], "--only"),
+    (accuracy.main, [""], "an argument"),
+    (accuracy.main, ["runs/a", ""], "an argument"),
+    (publish.main, [""], "an argument"),
+    (failures.main, ["--gallery", "", "runs/a"], "--gallery"),
+    (landscape.main, ["--presets", "paper", ""], "--presets"),
+    (qualitative.main, ["--runs", ""], "--runs"),
+    (atari_energy.main, ["--checkpoint", ""], "--checkpoint"),
+    (everything.main, ["babyai", "--level="], "--level"),
+    (everything.main, [""], "an argument"),
+]
+
+
+@pytest.mark.parametrize(("main", "arguments", "option"), EMPTY)
+def test_an_empty_value_is_refused(workplace, capsys, main, arguments, option):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert said == f"error: {option} is empty: give it a value, or leave it out\n"
+    assert not list(workplace.iterdir())
+
+
+def test_a_value_may_have_any_other_shape():
+    program.check_values(["--arguments", '{"a": ""}', "--runs==", "--runs", "=", "--runs=a=", "-x"])
+    with pytest.raises(UserError, match="--level is empty"):
+        parse("babyai", ["--level", ""])
+
+
 # Checkpoints.
 
 
-def test_a_folder_in_which_checkpoints_would_be_lost(workplace, capsys):
-    assert "because of '[' in its name" in one_line(capsys, "--runs", "out/run[1]")
-    assert not (workplace / "out").exists()
-    for folder in (workplace / "a[1]", workplace / "b*", workplace / "gs:/c"):
+@pytest.mark.parametrize("name", ["a\\b", "run[1]", "b*", "what?", "gs:/c", "\udc80", "a\\..\\b"])
+def test_a_folder_in_which_checkpoints_would_be_lost(name, workplace):
+    for use in (Checkpoints, lambda folder: checkpoints.restore_params(folder, {})):
         with pytest.raises(UserError, match="cannot hold checkpoints"):
-            Checkpoints(folder)
-        with pytest.raises(UserError, match="cannot hold checkpoints"):
-            checkpoints.restore_params(folder, {})
+            use(workplace / name)
+    assert list(workplace.iterdir()) == []
+
+
+def test_a_folder_of_runs_in_which_checkpoints_would_be_lost(workplace, capsys):
+    said = one_line(capsys, "--runs", "C:\\Users\\me\\My Runs")
+    assert f"TensorStore takes it for {workplace}/C:/Users/me/My Runs" in said
+    assert "takes it for a pattern, with '*', '?' or '['" in one_line(capsys, "--runs", "run[1]")
+    assert list(workplace.iterdir()) == []
     (workplace / "file").write_text("")
     with pytest.raises(UserError, match="cannot write to"):
         Checkpoints(workplace / "file")
+
+
+ODD = [
+    "a b", " a ", "a#b", "a%41b", "ü日本", "a\nb", "~a", "a.", "...", "a:b", "-a", "a'b\"c",
+    "$HOME", "{a}", "7", "1.orbax-checkpoint-tmp", "x" * 255,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ODD if LONG else ["a #%41ü\n:.{7}'$HOME"])
+def test_an_odd_name_holds_checkpoints(name, workplace):
+    saved = Checkpoints(workplace / name)
+    saved.save(small(3.0))
+    saved.close()
+    again = Checkpoints(workplace / name)
+    restored = again.restore(small(0.0), skipped=pytest.fail)
+    again.close()
+    np.testing.assert_array_equal(restored.params["w"], 3.0)
+    found = checkpoints.restore_params(workplace / name, small(0.0).params)
+    np.testing.assert_array_equal(found["w"], 3.0)
+
+
+def test_a_checkpoint_that_is_written_somewhere_else(workplace, monkeypatch):
+    """Whatever the reason: it is found out after the first, not by the next start."""
+    monkeypatch.setattr(checkpoints, "check_path", lambda folder: None)
+    saved = Checkpoints(workplace / "a\\b")
+    saved.save(small(1.0))
+    with pytest.raises(UserError, match="was written, but is not found in"):
+        saved.save(small(2.0)._replace(step=jnp.int32(2)))
+    saved.close()
 
 
 def small(value: float) -> TrainState:
@@ -120,6 +217,188 @@ def test_a_setting_that_an_old_specification_lacks_has_its_default(toy_run, work
     (copy / "specification.json").write_text(json.dumps(specification))
     before, after = (leap.load(path).specification for path in (toy_run, copy))
     assert before == after
+
+
+def sealed(folder, **changes) -> Path:
+    """A run of nothing, whoever made it: its specification and parameters agree."""
+    (chosen,) = parse("gymnasium", ["--level", "CartPole-v1", "--method", "random"])
+    made = config.specify(chosen, 0, config.make_domain(chosen))
+    pretrained.save_specification(folder, dataclasses.replace(made, **changes))
+    seal(folder)
+    return folder
+
+
+@pytest.fixture
+def trap(workplace, monkeypatch):
+    """A module whose import leaves a file behind."""
+    (workplace / "evilmod.py").write_text(
+        "import pathlib\nimport gymnasium as gym\npathlib.Path('trap').touch()\n"
+        "gym.register('Evil-v0', 'gymnasium.envs.classic_control:CartPoleEnv',"
+        " max_episode_steps=500)\n"
+    )
+    monkeypatch.syspath_prepend(workplace)
+    yield workplace / "trap"
+    sys.modules.pop("evilmod", None)
+
+
+def test_code_that_a_checkpoint_names(workplace, trap):
+    copy = sealed(workplace / "copy")
+    values = json.loads((copy / "specification.json").read_text())
+    (copy / "specification.json").write_text(json.dumps(values | {"level": "evilmod:Evil-v0"}))
+    for level in (None, "CartPole-v1"):
+        with pytest.raises(UserError, match="another configuration"):
+            leap.load(copy, level=level)
+    whole = sealed(workplace / "whole", level="evilmod:Evil-v0")
+    read = pretrained.read_specification(whole)
+    for load in (
+        lambda: leap.load(whole),
+        lambda: leap.load(whole, level="CartPole-v1"),
+        lambda: pretrained.make_domain(read),
+        lambda: parse("gymnasium", ["--checkpoint", str(whole)]),
+    ):
+        with pytest.raises(UserError, match="would run the module evilmod: if you trust it"):
+            load()
+    assert not trap.exists()
+    options = ["--checkpoint", str(whole), "--level", "evilmod:Evil-v0"]
+    (asked,) = parse("gymnasium", options)  # as the user asks for
+    assert asked.level == "evilmod:Evil-v0" and trap.exists()
+    assert leap.load(whole).specification.level == "evilmod:Evil-v0"
+
+
+def test_code_that_a_caller_names(workplace, trap):
+    whole = sealed(workplace / "whole", level="evilmod:Evil-v0")
+    leap.load(whole, level="evilmod:Evil-v0")
+    assert trap.exists()
+
+
+def test_code_that_data_name(trap, monkeypatch):
+    described = storage.Described("evilmod:Evil-v0", 3)
+    monkeypatch.setattr(storage, "described", lambda name: described)
+    with pytest.raises(UserError, match="mine/data-v0 names the level evilmod:Evil-v0"):
+        parse("gymnasium", ["--demonstrations", "mine/data-v0"])
+    assert not trap.exists()
+
+
+SIZES = [
+    ("model", {"layers": 150}), ("domain_settings", {"rounds": 150}), ("model", {"width": 2**30}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("group", "size"), SIZES if LONG else SIZES[:1])
+def test_a_specification_of_a_network_that_nothing_can_build(workplace, monkeypatch, group, size):
+    """With parameters of another network: the seal is compared first. With its own: the sizes."""
+    folder = untrained_run(workplace / "run")
+    values = json.loads((folder / "specification.json").read_text())
+    values[group].update(size)
+    (folder / "specification.json").write_text(json.dumps(values))
+    with monkeypatch.context() as patch:
+        patch.setattr(pretrained, "make_domain", lambda *given: pytest.fail("built"))
+        with pytest.raises(UserError, match="another configuration"):
+            leap.load(folder)
+    seal(folder)
+    with pytest.raises(UserError, match="but only 1 arrays of at most 900 numbers were saved"):
+        leap.load(folder)
+
+
+# Paths and files.
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x/" * 3000, "a\0b", "folder/" + "x" * 300, 7, None])
+def test_a_path_that_the_system_cannot_look_for(name, workplace):
+    (workplace / "folder").mkdir()
+    uses = [leap.load, pretrained.read_specification, pretrained.find, checkpoints.newest]
+    uses += [checkpoints.check_path, Checkpoints, files.check_path]
+    uses += [lambda path: checkpoints.restore_params(path, {})]
+    uses += [lambda path: checkpoints.check_identity(path, "")]
+    for use in uses:
+        with pytest.raises(UserError, match="cannot look for|expected a path") as raised:
+            use(name if not isinstance(name, str) else Path(name))
+        assert len(str(raised.value)) < 200
+
+
+def test_paths_that_lead_nowhere(workplace):
+    (workplace / "file").write_text("")
+    (workplace / "loop").symlink_to("loop")
+    for name in ("nothing", "file", "file/x", "loop", "", "."):
+        with pytest.raises(UserError, match="not a checkpoint|symbolic links"):
+            leap.load(name)
+
+
+def test_files_of_text_that_have_no_end(workplace):
+    os.mkfifo(workplace / "pipe")
+    (workplace / "large").write_text("x" * 101)
+    for path in (workplace / "pipe", Path("/dev/zero"), workplace):
+        with pytest.raises(UserError, match="not a file"):
+            files.read_text(path)
+    with pytest.raises(UserError, match="larger than"):
+        files.read_text(workplace / "large", 100)
+    assert files.read_text(workplace / "large", 101) == "x" * 101
+    specification = workplace / "specification.json"
+    specification.write_text(" " * pretrained.LARGEST_SPECIFICATION + "{}")
+    with pytest.raises(UserError, match="larger than 1 MiB"):
+        leap.load(workplace)
+
+
+def test_links_that_were_planted_in_a_shared_folder(workplace):
+    mine, shared = workplace / "mine", workplace / "shared"
+    shared.mkdir()
+    mine.write_text("precious")
+    (shared / f".{os.getpid()}.row.json").symlink_to(mine)
+    (shared / ".lock").symlink_to(mine)
+    files.write_text(shared / "row.json", "new")
+    assert files.read_text(shared / "row.json") == "new"
+    with (
+        pytest.raises(UserError, match="cannot write to .*shared.*symbolic links"),
+        files.only_process_in(shared),
+    ):
+        pass
+    assert mine.read_text() == "precious"
+
+
+def test_a_folder_that_nobody_else_can_write_to(workplace):
+    made = workplace / "a" / "b"
+    files.make_private(made)
+    files.make_private(made)
+    assert made.stat().st_mode & 0o777 == made.parent.stat().st_mode & 0o777 == 0o700
+    for folder in (made, made.parent):
+        folder.chmod(0o777)
+        with pytest.raises(UserError, match=f"others can write to {folder}: "):
+            files.make_private(made)
+        folder.chmod(0o755)
+    made.parent.chmod(0o1777)  # as /tmp is
+    files.make_private(made)
+    made.parent.chmod(0o755)
+    (workplace / "link").symlink_to(made)
+    files.make_private(workplace / "link")
+    made.chmod(0o777)
+    with pytest.raises(UserError, match="others can write to"):
+        files.make_private(workplace / "link")
+    (workplace / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write to"):
+        files.make_private(workplace / "file")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+def test_a_folder_of_another_user(workplace):
+    made = workplace / "a" / "b"
+    files.make_private(made)
+    for folder in (made, made.parent):
+        os.chown(folder, 1234, -1)
+        with pytest.raises(UserError, match=f"{folder} belongs to another user"):
+            files.make_private(made)
+        os.chown(folder, 0, -1)
+
+
+def test_programs_that_others_may_have_compiled_are_not_run(workplace, capsys, monkeypatch):
+    before = jax.config.jax_compilation_cache_dir
+    (workplace / "shared").mkdir()
+    (workplace / "shared").chmod(0o777)
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(workplace / "shared"))
+    runtime.use_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir == before
+    said = capsys.readouterr().err
+    assert said.startswith("compiled programs are not kept: others can write to")
+    assert said.count("\n") == 1
 
 
 # Rows.
@@ -217,7 +496,7 @@ def test_a_training_curve_of_no_numbers(workplace):
 
 
 def test_the_report_where_there_are_no_rows(workplace, capsys):
-    assert report.main() == 2
+    assert report.main([]) == 2
     assert capsys.readouterr().err.startswith("error: cannot read")
 
 
@@ -234,15 +513,94 @@ def test_more_than_the_machine_has(options, capsys):
 
 @pytest.mark.parametrize("temperature", ["1e39", "nan", "-1"])
 def test_a_temperature_at_which_noise_is_no_number(temperature, capsys):
-    assert "a temperature must be in 0 .. 1e+30" in one_line(capsys, "--temperature", temperature)
+    assert "temperature must be" in one_line(capsys, "--temperature", temperature)
 
 
-def test_numbers_of_64_bits_are_refused():
-    with (
-        jax.enable_x64(True),
-        pytest.raises(UserError, match="unset JAX_ENABLE_X64"),
-    ):
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("jax_enable_x64", True),
+        ("jax_explicit_x64_dtypes", "allow"),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_threefry_partitionable", False),
+        ("jax_random_seed_offset", 5),
+        ("jax_high_dynamic_range_gumbel", True),
+        ("jax_default_matmul_precision", "bfloat16"),
+        ("jax_softmax_custom_jvp", True),
+        ("jax_disable_jit", True),
+        ("jax_no_tracing", True),
+        ("jax_no_execution", True),
+        ("jax_allow_f16_reductions", False),
+        ("jax_numpy_dtype_promotion", "strict"),
+        ("jax_numpy_rank_promotion", "raise"),
+        ("jax_debug_infs", True),
+        ("jax_default_device", "cpu"),
+        ("jax_transfer_guard_host_to_device", "disallow"),
+    ],
+)
+def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
+    monkeypatch.setattr(runtime, "connect", lambda cluster: pytest.fail("went on"))
+    before = getattr(jax.config, setting)
+    jax.config.update(setting, value)
+    try:
+        with pytest.raises(UserError, match=f"{setting} is .*unset {setting.upper()}, or use"):
+            runtime.start()
+    finally:
+        jax.config.update(setting, before)
+
+
+def test_settings_of_jax_that_break_nothing(monkeypatch):
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
+    with jax.debug_nans(True), jax.numpy_rank_promotion("warn"), jax.log_compiles(True):
         runtime.start()
+
+
+@pytest.mark.parametrize("count", [0, -2, 10**6])
+def test_a_number_of_devices_that_cannot_be_made(count, monkeypatch):
+    monkeypatch.setattr(
+        runtime, "jax", SimpleNamespace(config=SimpleNamespace(jax_num_cpu_devices=count))
+    )
+    with pytest.raises(UserError, match=f"JAX_NUM_CPU_DEVICES is {count}: expected a number in 1"):
+        runtime.use_every_core()
+
+
+def test_no_device_is_one_line(monkeypatch):
+    def fail():
+        raise AssertionError  # as JAX does where JAX_PLATFORMS is cuda and no plugin is installed
+
+    monkeypatch.setattr(runtime.jax, "devices", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    with pytest.raises(
+        UserError, match=r"no device with .*JAX_PLATFORMS=cuda.* \(AssertionError\)"
+    ):
+        runtime.check_devices()
+
+
+@only_long
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("JAX_NUM_CPU_DEVICES", "abc"), ("JAX_ENABLE_X64", "maybe"), ("JAX_DEFAULT_DEVICE", "cuda")],
+)
+@pytest.mark.parametrize("program", ["experiments", "experiments.stars", "benchmarks.planning"])
+def test_a_setting_that_jax_refuses_is_one_line(program, setting, value):
+    done = subprocess.run(
+        [sys.executable, "-m", program, "--help"], capture_output=True, text=True, cwd=ROOT,
+        env={**os.environ, setting: value}, check=False,
+    )  # fmt: skip
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 2 and line.startswith("error: cannot import JAX with ")
+    assert f"{setting}={value}" in line
+
+
+@only_long
+def test_a_terminal_of_ascii_shows_what_it_can():
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.stars", "--level", "St\u00e4r \u00b1"],
+        capture_output=True, cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"error: unknown level 'St?r ?': expected")
 
 
 @pytest.mark.parametrize("count", ["", " ", "many"])
@@ -293,6 +651,29 @@ def test_a_disk_without_room_is_refused_before_anything_is_written(workplace, mo
         saved.save(small(1.0))
     saved.close()
     assert list((workplace / "a").iterdir()) == []
+
+
+def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplog):
+    """One line says so; the threads of Orbax, asyncio and TensorStore say nothing."""
+    saved = Checkpoints(workplace / "a")
+    saved.save(small(1.0))
+    arrays = {str(i): jax.random.normal(jax.random.key(i), (200, 200)) for i in range(8)}
+    state = TrainState(arrays, (), jnp.int32(2))
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with pytest.raises(UserError, match=r"cannot write a checkpoint to .*/a \(File too large\)"):
+        saved.close()  # the first
+        saved = Checkpoints(workplace / "a")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, most))
+        try:
+            saved.save(state)
+            saved.close()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+    gc.collect()
+    said = capfd.readouterr()
+    assert (said.out, said.err, caplog.text) == ("", "", "")
+    found = checkpoints.restore_params(workplace / "a", small(0.0).params)
+    np.testing.assert_array_equal(found["w"], 1.0)
 
 
 def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):

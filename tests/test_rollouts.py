@@ -1,4 +1,5 @@
 import functools
+import math
 from typing import ClassVar
 
 import gymnasium as gym
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from leapjax.environments import GymnasiumAdapter, Transition
+from leapjax import rollouts
+from leapjax.environments import GymnasiumAdapter, Transition, closing
+from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History, join, stack_contexts
 from leapjax.types import Context
@@ -570,3 +573,257 @@ def test_actions_that_do_not_start_at_zero():
     for action in range(adapter.num_actions - 1):
         adapter.step(action)
     assert adapter.env.taken == [1, 2]
+
+
+# What enters.
+
+
+@pytest.mark.parametrize("wrong", [2**32, -1, 5.9, True, "5", math.nan])
+@pytest.mark.parametrize("edge", ["level seed", "seed"])
+def test_seeds_that_jax_does_not_tell_apart_are_refused(edge, wrong):
+    seeds, seed = ([1, wrong], 0) if edge == "level seed" else ([1], wrong)
+    with pytest.raises(UserError, match=f"{edge} must be"):
+        leap.evaluate(Corridor, seeds, walker(), jnp.int32(1), context=0, seed=seed)
+    assert not Corridor.made  # it is said before anything is made
+
+
+@pytest.mark.parametrize("wrong", [-1, 1.5, 2.0, True, math.nan, math.inf, "2"])
+@pytest.mark.parametrize("count", ["context", "executed", "iteration", "max_steps"])
+def test_counts_are_integers(count, wrong):
+    with pytest.raises(UserError, match=f"{count} must be"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), **{"context": 0, count: wrong})
+    assert not Corridor.made
+
+
+def test_integers_of_numpy_are_counts_and_seeds():
+    few = {"context": np.int8(0), "executed": np.int64(1), "max_steps": np.uint8(3)}
+    played = leap.evaluate(Corridor, np.array([0, 3]), walker(), jnp.int32(4), **few)
+    assert played.lengths.tolist() == [3, 3] and played.plans == 6
+
+
+# What an environment gives.
+
+
+class Strange(Corridor):
+    """A corridor whose second step gives something else."""
+
+    given: ClassVar[dict] = {}
+
+    def step(self, action: int) -> Transition:
+        found = super().step(action)
+        return found._replace(**self.given) if self.steps == 2 else found
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"reward": math.nan}, "reward of nan"),
+        ({"reward": -math.inf}, "reward of -inf"),
+        ({"reward": 1e39}, "reward of 1e[+]39"),  # not in the numbers that planners see
+        ({"score": math.nan}, "score of nan"),
+        (
+            {"observation": {"position": np.float32(np.nan), "goal": np.zeros(1)}},
+            "observation.*pos",
+        ),
+        (
+            {"observation": {"position": np.zeros(()), "goal": np.array([np.inf])}},
+            "observation.*go",
+        ),
+        ({"observation": {"position": np.zeros(())}}, "other shapes"),
+        ({"taken": NUM_ACTIONS}, "action taken"),
+        ({"taken": 0.5}, "action taken"),
+    ],
+)
+def test_values_that_no_data_may_have_are_refused(monkeypatch, given, says):
+    monkeypatch.setattr(Strange, "given", given)
+    with pytest.raises(UserError, match=f"{says}.* step 2 of level seed 7"):
+        leap.evaluate(Strange, [7], walker(), jnp.int32(4), context=1)
+
+
+def test_a_first_observation_that_is_not_finite_is_refused():
+    with pytest.raises(UserError, match="not finite at step 0 of level seed 3"):
+        History((np.zeros(2), np.array([1, np.nan], np.float16)), 0, NUM_ACTIONS, 3)
+    with pytest.raises(UserError, match="length must be at least 0"):
+        History(np.zeros(2), -1, NUM_ACTIONS)
+
+
+def test_rewards_may_not_add_up_to_more_than_a_planner_can_see():
+    history = History(np.zeros(1), 0, NUM_ACTIONS)
+    history.advance(0, np.zeros(1), 3e38)
+    with pytest.raises(UserError, match="return of 6e[+]38 at step 2:"):
+        history.advance(0, np.zeros(1), 3e38)
+
+
+# What is opened.
+
+
+class Held(Corridor):
+    """Counts how many are open."""
+
+    open: ClassVar[list["Held"]] = []
+    most = 0
+    fails_at = -1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open.append(self)
+        Held.most = max(Held.most, len(self.open))
+
+    def step(self, action: int) -> Transition:
+        if len(self.made) == self.fails_at:
+            raise StuckError
+        return super().step(action)
+
+    def close(self) -> None:
+        self.open.remove(self)
+
+
+@pytest.fixture
+def held(monkeypatch):
+    monkeypatch.setattr(Held, "open", [])
+    monkeypatch.setattr(Held, "most", 0)
+    monkeypatch.setattr(rollouts, "MOST_OPEN", 3)
+    return Held
+
+
+def test_few_environments_are_open_at_once_which_changes_nothing(held):
+    seeds = [5, 0, 3, 6, 20, 21, 22, 23]
+    reported = []
+    few, all_at_once = (
+        leap.evaluate(
+            make, seeds, stroller(), None, context=1, max_steps=9,
+            progress=lambda *numbers: reported.append(numbers),
+        )
+        for make in (held, Corridor)
+    )  # fmt: skip
+    first = next(i for i, each in enumerate(reported) if each[0] == len(seeds))
+    assert held.most == 3 and not held.open
+    assert reported[: first + 1] == sorted(reported[: first + 1])
+    for field in ("seeds", "successes", "lengths", "returns", "plans"):
+        np.testing.assert_array_equal(getattr(few, field), getattr(all_at_once, field), field)
+    assert len(set(few.lengths.tolist())) > 2
+
+
+@pytest.mark.parametrize("error", [StuckError, KeyboardInterrupt])
+def test_all_is_closed_where_playing_ends_early(held, error):
+    def progress(over, succeeded):
+        raise error
+
+    with pytest.raises(error):
+        leap.evaluate(held, range(9), walker(), jnp.int32(1), context=0, progress=progress)
+    assert held.most == 3 and not held.open
+
+
+def test_an_error_of_a_step_or_of_what_is_made_closes_the_rest(held, monkeypatch):
+    monkeypatch.setattr(held, "fails_at", 4)
+    with pytest.raises(StuckError):
+        leap.evaluate(held, range(9), walker(), jnp.int32(1), context=0)
+    assert held.most == 3 and not held.open
+    with pytest.raises(UserError, match="same environment twice"):
+        leap.evaluate(functools.cache(held), [0, 1], walker(), jnp.int32(1), context=0)
+    assert not held.open
+
+
+class Unclosable(Corridor):
+    def close(self) -> None:
+        raise OSError("the port is gone")
+
+
+def test_what_goes_wrong_first_is_what_is_told():
+    with pytest.raises(StuckError), closing(Unclosable()):
+        raise StuckError
+    with pytest.raises(OSError, match="port is gone"), closing(Unclosable()):
+        pass
+    with pytest.raises(StuckError):
+        leap.evaluate(Unclosable, [0], walker(), jnp.int32(1), context=0, progress=give_up_after(0))
+    with closing(Corridor()) as corridor:  # has nothing to close
+        corridor.reset(0)
+
+
+def remembering() -> leap.Energy:
+    """Goes right; says how many of the last two states a context holds encoded."""
+
+    def encode(params, context: Context):
+        known = jnp.zeros((2, 1)) if context.encoded is None else context.encoded
+        return context.step, jnp.concatenate([known, jnp.ones((1, 1))])
+
+    def total(params, memory, actions):
+        return jnp.sum(actions != RIGHT).astype(jnp.float32)
+
+    energy = leap.from_total(encode, total, NUM_ACTIONS)
+    return energy._replace(encoded=lambda memory: memory[1])
+
+
+def test_an_episode_that_begins_later_has_no_encoded_states_yet(monkeypatch):
+    monkeypatch.setattr(rollouts, "MOST_OPEN", 2)
+    recorder = Recorder(compiled(remembering()))
+    seeds = [3, 5, 0]  # the second is over first
+    episodes = leap.evaluate(Corridor, seeds, recorder, None, context=2, executed=1)
+    np.testing.assert_array_equal(episodes.lengths, [GOAL - start(seed) for seed in seeds])
+    assert episodes.plans == episodes.lengths.sum()
+    for contexts in recorder.contexts:  # what was encoded is that of the very episode
+        known = np.minimum(contexts.step, 2)
+        held = 0 if contexts.encoded is None else contexts.encoded.sum(axis=(1, 2))
+        np.testing.assert_array_equal(held, known)
+
+
+# What episodes share.
+
+ONE = Line()
+
+
+class Wrapped:
+    """An adapter inside another."""
+
+    num_actions = 4
+
+    def __init__(self, inner: GymnasiumAdapter) -> None:
+        self.inner = inner
+        self.reset, self.step = inner.reset, inner.step
+
+
+class Common(GymnasiumAdapter):
+    """The environment is the class's."""
+
+    env = ONE
+
+    def __init__(self) -> None:
+        super().__init__(ONE)
+        del self.env
+
+
+class Late(GymnasiumAdapter):
+    """Takes its environment when it is reset."""
+
+    def __init__(self) -> None:
+        super().__init__(Line())
+
+    def reset(self, seed: int):
+        self.env = ONE
+        return super().reset(seed)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: GymnasiumAdapter(ONE),
+        lambda: GymnasiumAdapter(gym.wrappers.TimeLimit(ONE, 5)),
+        lambda: GymnasiumAdapter(gym.wrappers.OrderEnforcing(gym.wrappers.TimeLimit(ONE, 5))),
+        lambda: Wrapped(GymnasiumAdapter(ONE)),
+        Common,
+        Late,
+    ],
+)
+def test_one_environment_in_two_adapters_is_found(make):
+    with pytest.raises(UserError, match="same environment twice"):
+        leap.evaluate(make, [0, 1], stayer(), None, context=0)
+    assert leap.evaluate(make, [0], stayer(), None, context=0, max_steps=4).lengths == [4]
+
+
+@functools.cache
+def stayer() -> leap.CompiledPlanner:
+    """Stays where it is, in a `Line`."""
+    energy = leap.from_total(
+        lambda params, context: (), lambda p, m, actions: actions.sum().astype(jnp.float32), 4
+    )
+    return compiled(energy)

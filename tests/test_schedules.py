@@ -77,3 +77,9 @@ def test_a_single_action_is_always_masked(masking):
 def test_unknown_masking_is_refused(masking):
     with pytest.raises(ValueError, match=r"unknown masking.*one, each, all, random"):
         sample_masks(jax.random.key(0), HORIZON, masking)
+
+
+@pytest.mark.parametrize("horizon", [0, -1, 2.0, True, None])
+def test_a_window_without_a_length_is_refused(horizon):
+    with pytest.raises(ValueError, match="horizon must be"):
+        sample_masks(jax.random.key(0), horizon, "one")

@@ -66,10 +66,23 @@ def test_more_episodes_narrow_the_interval():
     assert widths[-1] == pytest.approx(widths[0] / 10, rel=0.2)
 
 
-@pytest.mark.parametrize(("successes", "episodes"), [(0, 0), (1, 0), (-1, 5), (6, 5), (0, -1)])
+NO_COUNTS = [2.0, 2.5, True, "2", None, math.nan, [2]]
+
+
+@pytest.mark.parametrize(
+    ("successes", "episodes"),
+    [(0, 0), (1, 0), (-1, 5), (6, 5), (0, -1), *((each, 5) for each in NO_COUNTS),
+     *((1, each) for each in NO_COUNTS)],
+)  # fmt: skip
 def test_impossible_counts_are_refused(successes, episodes):
-    with pytest.raises(ValueError, match=f"{successes} successes of {episodes} episodes"):
+    with pytest.raises(ValueError, match="(successes|episodes) must be"):
         wilson_interval(successes, episodes)
+
+
+@pytest.mark.parametrize("z", [-1.0, math.nan, math.inf, "2", None])
+def test_impossible_standard_errors_are_refused(z):
+    with pytest.raises(ValueError, match="z must be"):
+        wilson_interval(1, 2, z)
 
 
 def test_one_seed_has_the_interval_of_its_episodes():
@@ -115,10 +128,24 @@ def test_the_interval_over_seeds_holds_the_truth_as_often_as_it_says():
     assert 185 <= held <= 199
 
 
-@pytest.mark.parametrize(("successes", "episodes"), [([], []), ([1], [0]), ([3, 6], [5, 5])])
+@pytest.mark.parametrize(
+    ("successes", "episodes"),
+    [([], []), ([1], [0]), ([3, 6], [5, 5]), ([5], [10, 20]), ([5, 6], [10]), (5, [10]), ([5], 10),
+     ([[5]], [[10]]), ([], [10]), (np.array([0.5]), [10]), (np.array([True]), [10]), ("5", "9"),
+     *(([each], [5]) for each in NO_COUNTS), *(([1, 1], [5, each]) for each in NO_COUNTS)],
+)  # fmt: skip
 def test_impossible_seeds_are_refused(successes, episodes):
-    with pytest.raises(ValueError, match="successes of"):
-        interval_over_seeds(successes, episodes)
+    for measure in (interval_over_seeds, lambda *outcome: aggregate([([1], [2]), outcome])):
+        with pytest.raises(ValueError, match="successes|episodes"):
+            measure(successes, episodes)
+
+
+@pytest.mark.parametrize("level", [0, 1, -0.5, 95, math.nan, "0.9", None])
+def test_impossible_levels_of_confidence_are_refused(level):
+    with pytest.raises(ValueError, match="level must be"):
+        interval_over_seeds([1], [2], level)
+    with pytest.raises(ValueError, match="level must be"):
+        aggregate([([1], [2])], level)
 
 
 def test_the_interquartile_mean_is_scipys_and_rliables():

@@ -6,6 +6,8 @@ from hypothesis import strategies as st
 
 from leapjax.data import seeds
 from leapjax.errors import UserError
+from leapjax.stars import graphs
+from leapjax.sudoku import boards
 
 TESTS = seeds.VALIDATION_START  # so many test levels
 VALIDATIONS = seeds.TRAINING_START - seeds.VALIDATION_START
@@ -49,15 +51,18 @@ def test_training_seeds_end_where_the_next_training_seeds_begin():
 )
 def test_episodes_stay_in_their_range(make, limit):
     assert len(make(limit - 10, 10)) == 10
-    for first, count in [(limit - 10, 11), (limit, 1), (-1, 1), (-5, 10), (limit * 3, 2)]:
+    for first, count in [(limit - 10, 11), (0, limit + 1)]:
         with pytest.raises(UserError, match="leave their range"):
             make(first, count)
-    for count in (0, -3):
-        with pytest.raises(UserError, match="at least one"):
+    for first in (limit, limit * 3, -1, -5, 2**70, 0.0, True):
+        with pytest.raises(UserError, match=r"the first \w+ seed must be"):
+            make(first, 1)
+    for count in (0, -3, 1.0, 2**70):
+        with pytest.raises(UserError, match=r"the number of \w+ episodes must be"):
             make(0, count)
 
 
-@pytest.mark.parametrize("seed", [-1, seeds.MAX_TRAINING_SEED, 10**9])
+@pytest.mark.parametrize("seed", [-1, seeds.MAX_TRAINING_SEED, 10**9, 1.0, True, 2**64])
 def test_a_training_seed_out_of_range_is_refused(seed):
     with pytest.raises(UserError, match="training seed"):
         seeds.training_seeds(seed)
@@ -73,3 +78,18 @@ def test_check_disjoint_refuses_exactly_what_is_shared(demonstrated, first, coun
         assert any(f"level seed {seed} is both" in str(raised.value) for seed in shared)
     else:
         seeds.check_disjoint(demonstrated, episodes)
+
+
+@pytest.mark.parametrize("wrong", [-1, 2**32, 5.9, True])
+def test_worlds_are_drawn_from_seeds_alone(wrong):
+    boards.draw(boards.find_level("Sudoku4x6"), 1)  # which True would be taken for
+    for draw, level in (
+        (boards.draw, boards.find_level("Sudoku4x6")),
+        (graphs.draw, graphs.find_level("Star3x5")),
+    ):
+        with pytest.raises(UserError, match="seed must be"):
+            draw(level, wrong)
+
+
+def test_seeds_of_64_bits_are_demonstrations_of_no_test_level():
+    seeds.check_disjoint([2**64 - 1, 2**32 + 5, -1], range(10))

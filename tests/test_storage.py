@@ -1,6 +1,10 @@
+import io
 import json
+import math
+import os
 import shutil
 import warnings
+import zlib
 from concurrent import futures
 from pathlib import Path
 
@@ -13,6 +17,7 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage
+from PIL import Image
 
 from leapjax import files
 from leapjax.babyai import levels, observations
@@ -368,11 +373,52 @@ def test_a_missing_part_of_an_episode(saved, minari_folder, field):
     refused()
 
 
-def test_no_episodes(saved, minari_folder):
-    path = minari_folder / NAME / "data" / "metadata.json"
-    metadata = json.loads(path.read_text())
-    path.write_text(json.dumps({**metadata, "total_episodes": 0, "total_steps": 0}))
+def test_no_episodes():
+    save([])
     assert "no episodes" in refused()
+
+
+@pytest.mark.parametrize(
+    ("announced", "says"),
+    [
+        ({"total_episodes": 4}, "4 episodes are announced, 5 are there"),
+        ({"total_episodes": 0, "total_steps": 0}, "0 episodes are announced, 5 are there"),
+        ({"total_steps": 1}, "1 steps are announced"),
+        ({"total_steps": None}, "None steps are announced"),
+    ],
+)
+def test_numbers_of_episodes_and_steps_that_are_not_so(saved, minari_folder, announced, says):
+    path = minari_folder / NAME / "data" / "metadata.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **announced}))
+    assert says in refused()
+
+
+@pytest.mark.parametrize("marks", ["terminations", "truncations"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda marks: np.arange(len(marks)) == 1, "ended with step 1, and it goes on to step"),
+        (lambda marks: np.ones_like(marks), "ended with step 0"),
+        (lambda marks: marks[:-1], "have shape"),
+        (lambda marks: np.append(marks, True), "have shape"),
+        (lambda marks: marks[-1], "have shape ()"),
+        (lambda marks: np.full(len(marks), np.nan), "must be true or false"),
+        (lambda marks: np.full(len(marks), 2), "must be true or false"),
+        (lambda marks: np.full(len(marks), b"yes"), "must be true or false"),
+    ],
+)
+def test_marks_of_the_end_that_contradict_the_episode(saved, minari_folder, marks, change, says):
+    with h5py.File(file_of(minari_folder)) as file:
+        before = file["episode_2"][marks][()]
+    replace(file_of(minari_folder), "episode_2", marks, change(before))
+    message = refused()
+    assert f"episode 2 of the Minari data set {NAME!r}: {marks}" in message and says in message
+
+
+def test_marks_of_the_end_in_numbers(saved, minari_folder):
+    ends = np.arange(len(saved[0].actions)) == len(saved[0].actions) - 1
+    replace(file_of(minari_folder), "episode_0", "terminations", ends.astype(np.float32))
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
 def test_another_level(saved):
@@ -436,12 +482,41 @@ def test_an_episode_without_actions(saved, minari_folder):
     assert "no actions" in refused()
 
 
+@pytest.mark.parametrize(
+    ("stored", "seed"),
+    [
+        (2**63 + 5, 2**63 + 5), (2**64 - 1, 2**64 - 1), (str(2**32), 2**32),
+        (-5, storage.UNKNOWN_SEED), (str(2**70), storage.UNKNOWN_SEED),
+        (None, storage.UNKNOWN_SEED),
+    ],
+)  # fmt: skip
+def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stored, seed):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        attributes = file["episode_0"].attrs
+        del attributes["seed"]
+        if stored is not None:
+            attributes["seed"] = np.uint64(stored) if stored == 2**64 - 1 else stored
+    loaded = storage.load(NAME, LEVEL)
+    assert loaded.demonstrations[0].seed == seed
+    assert loaded.demonstrations[1].seed == saved[1].seed
+    save(loaded.demonstrations)  # and again
+    assert_same(storage.load(NAME, LEVEL).demonstrations, loaded.demonstrations)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
 def test_rewards_that_are_not_finite(saved, minari_folder, bad):
     with h5py.File(file_of(minari_folder), "r+") as file:
         file["episode_1"]["rewards"][0] = bad
     message = refused()
     assert "episode 1" in message and "rewards: numbers that do not fit float32" in message
+
+
+@pytest.mark.parametrize("field", ["actions", "rewards", "terminations"])
+def test_a_group_in_the_place_of_an_array(saved, minari_folder, field):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        del file["episode_1"][field]
+        file["episode_1"].create_group(field)
+    assert f"{field} " in refused()
 
 
 def test_rewards_of_another_length(saved, minari_folder):
@@ -454,6 +529,153 @@ def test_actions_of_64_bits_do_not_wrap_around(saved, minari_folder):
     actions = saved[0].actions.astype(np.int64) + 2**32
     replace(file_of(minari_folder), "episode_0", "actions", actions)
     assert "actions run from" in refused()
+
+
+def in_infos(build):
+    """A change of what Minari reads beside the arrays that are needed."""
+    return lambda file: build(file["episode_0"].require_group("infos"))
+
+
+def diamonds(group):
+    """Each group is in the one before by two names: 2^40 ways lead to the last."""
+    for _ in range(40):
+        group["left"] = inner = group.file.create_group(None)
+        group["right"] = inner
+        group = inner
+
+
+def ring(group):
+    innermost = group.create_group("a/b/c")
+    innermost["again"] = group["a"]
+
+
+def chain(group):
+    for _ in range(500):
+        group = group.create_group("x")
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (in_infos(diamonds), "is an object that has another name too"),
+        (in_infos(ring), "is an object that has another name too"),
+        (in_infos(lambda group: group.__setitem__("root", group.file["/"])), "another name"),
+        (in_infos(lambda group: group.__setitem__("r", group.parent["rewards"])), "another name"),
+        (in_infos(chain), "is a group in 17 groups"),
+        (in_infos(lambda group: group.__setitem__("kind", np.dtype("f4"))), "not an array of this"),
+        (lambda file: file.move("episode_1", "episode_7"), "episode_1 is not there"),
+        (lambda file: file["episode_0"].__setitem__("x", file["episode_1"]), "another name"),
+    ],
+)
+def test_groups_that_are_no_tree_of_episodes(saved, minari_folder, build, says):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        build(file)
+    assert says in refused()
+
+
+def squeeze(group, name, shape):
+    """Half a gigabyte of zeros, in half a megabyte of a file."""
+    del group[name]
+    chunk = (2**22, *shape[1:])
+    array = group.create_dataset(name, shape, "u1", chunks=chunk, compression="gzip")
+    packed = zlib.compress(bytes(math.prod(chunk)), 9)
+    for start in range(0, shape[0], chunk[0]):
+        array.id.write_direct_chunk((start, *(0 for _ in shape[1:])), packed)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "says"),
+    [
+        ("observations/instruction", (2**27, 4), "instruction has shape (134217728, 4)"),
+        ("observations/pose", (2**29,), "pose has shape"),
+        ("actions", (2**29,), "rewards have shape"),
+        ("rewards", (2**29,), "rewards have shape"),
+        ("terminations", (2**29,), "terminations have shape"),
+    ],
+)
+def test_shapes_are_compared_before_anything_is_unpacked(
+    saved, minari_folder, monkeypatch, name, shape, says
+):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        squeeze(file["episode_0"], name, shape)
+    assert file_of(minari_folder).stat().st_size < 2**20
+    monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
+    assert says in refused()
+
+
+def test_what_does_not_fit_into_memory_is_not_unpacked(saved, minari_folder, monkeypatch):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        squeeze_infos = file["episode_3"].require_group("infos")
+        squeeze_infos["x"] = 0
+        squeeze(squeeze_infos, "x", (2**22,))
+    memory = {"SC_PAGE_SIZE": 2**10, "SC_PHYS_PAGES": 2**13}  # 8 MiB
+    monkeypatch.setattr(os, "sysconf", memory.__getitem__)
+    assert_same(storage.load(NAME, LEVEL, most=3).demonstrations, saved[:3])  # it is not needed
+    monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
+    assert "at least 0 GiB of memory would be needed" in refused()
+
+
+def test_an_array_is_not_widened_to_be_checked():
+    wide = np.broadcast_to(np.zeros((), np.uint8), (2**40,))  # takes a byte
+    assert storage._numbers(np.zeros((), np.int64), wide, "it") is wide
+
+
+PICTURE = np.zeros((32, 40, 3), np.uint8)
+
+
+def save_frames(frames):
+    """A data set of pictures that Minari keeps as JPEG."""
+    steps = len(frames) - 1
+    minari.create_dataset_from_buffers(
+        dataset_id=NAME,
+        buffer=[
+            EpisodeBuffer(
+                id=0, observations=list(frames), actions=[0] * steps, rewards=[1.0] * steps,
+                terminations=[False] * (steps - 1) + [True], truncations=[False] * steps,
+            )
+        ],
+        observation_space=gym.spaces.Box(0, 255, PICTURE.shape, np.uint8),
+        action_space=gym.spaces.Discrete(2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["alike", "different"])  # in frames of one length, or of several
+def test_pictures_that_minari_keeps_as_jpeg(kind):
+    rng = np.random.default_rng(0)
+    frames = np.stack([PICTURE] * 3)
+    if kind == "different":
+        frames = rng.integers(0, 256, (3, *PICTURE.shape)).astype(np.uint8)
+    save_frames(frames)
+    (found,) = storage.load(NAME, domain_of(PICTURE)).demonstrations
+    assert found.observations.shape == frames.shape
+    assert kind == "different" or not found.observations.any()
+    other = domain_of(np.zeros((32, 32, 3), np.uint8))
+    assert "observations has shape (3, 32, 40, 3), level Own needs (3, 32, 32, 3)" in refused(
+        domain=other
+    )
+
+
+@pytest.mark.parametrize("shape", [(3000, 3000, 3), (32, 40), (40, 32, 3)])
+def test_a_frame_of_another_size_is_not_unpacked(minari_folder, monkeypatch, shape):
+    save_frames(np.random.default_rng(0).integers(0, 256, (3, *PICTURE.shape)).astype(np.uint8))
+    packed = io.BytesIO()
+    Image.fromarray(np.zeros(shape, np.uint8)).save(packed, "JPEG")
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        file["episode_0/observations"][1] = np.frombuffer(packed.getvalue(), np.uint8)
+    monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
+    assert "a frame of shape" in refused(domain=domain_of(PICTURE))
+
+
+def test_bytes_of_varying_length_that_the_file_does_not_hold(minari_folder, saved):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        infos = file["episode_0"].require_group("infos")
+        infos["words"] = np.array(["a" * 1000] * 10, h5py.string_dtype())
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+    with (
+        h5py.File(file_of(minari_folder)) as file,
+        pytest.raises(ValueError, match="words claims 10000 bytes, which are not there"),
+    ):
+        storage._check_varying(file["episode_0/infos/words"], "words", 9_999)
 
 
 def other_data_set(observation_space, observations, action_space, actions, **episode) -> None:

@@ -1,6 +1,7 @@
 """Imports point one way, and the README says what is true."""
 
 import ast
+import importlib
 import inspect
 import os
 import re
@@ -13,7 +14,8 @@ import pytest
 
 import leapjax
 from experiments import report
-from experiments.common import results
+from experiments.common import results, runtime
+from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
 DOMAINS = tuple(f"leapjax.{name}" for name in ("babyai", "atari", "gymnasium", "stars", "sudoku"))
@@ -46,14 +48,14 @@ def test_the_library_never_imports_experiments():
 
 
 def test_the_core_imports_only_what_is_below_it():
-    may_import("leapjax/types.py")
+    may_import("leapjax/types.py", "checks")
     may_import("leapjax/errors.py")
     may_import("leapjax/checks.py", "errors")
-    may_import("leapjax/schedules.py")
+    may_import("leapjax/schedules.py", "checks")
     may_import("leapjax/energy.py", "types", "checks")
-    may_import("leapjax/sharding.py", "types")
+    may_import("leapjax/sharding.py", "types", "checks")
     may_import("leapjax/planners.py", "types", "checks")
-    may_import("leapjax/batching.py", "types", "checks", "planners", "sharding")
+    may_import("leapjax/batching.py", "types", "checks", "errors", "planners", "sharding")
     may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
     may_import("leapjax/environments.py", "types", "checks")
@@ -165,6 +167,51 @@ def test_the_readme_names_files_that_exist():
         assert (ROOT / name).exists(), name
     for name in re.findall(r"^(\S+/\S*)  +\S", readme, flags=re.MULTILINE):
         assert (ROOT / name).exists(), name
+
+
+PROGRAMS = [
+    f"{folder}.{path.stem}"
+    for folder in ("experiments", "benchmarks")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+    if '__name__ == "__main__"' in path.read_text()
+]
+
+
+def exit_code(main, arguments):
+    try:
+        return main(arguments)
+    except SystemExit as stopped:
+        return stopped.code
+
+
+# One of each way to be a program; the others are in the long form.
+USUAL = ("__main__", "publish", "report", "stars", "properties", "planning")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name.split(".")[1] in USUAL else only_long)
+        for name in PROGRAMS
+    ],
+)
+def test_every_program_says_how_it_is_used_and_refuses_what_it_does_not_know(
+    name, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    main = importlib.import_module(name).main
+    monkeypatch.setattr(runtime, "start", lambda *rest, **more: pytest.fail("something was begun"))
+    assert exit_code(main, ["--help"]) == 0
+    assert "usage" in capsys.readouterr().out.lower()
+    for arguments in (["--no-such-option", "3"], ["nothing-of-that-name"]):
+        assert exit_code(main, arguments) == 2
+        assert capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_program_can_be_found():
+    assert {"experiments.report", "experiments.publish", "benchmarks.planning"} <= set(PROGRAMS)
+    assert len(PROGRAMS) > 20
 
 
 def test_neither_imports_nor_a_command_line_start_a_backend():

@@ -332,8 +332,8 @@ def test_rules_go_on_where_the_board_is(less, solved, tmp_path, one_search):
     [
         (babyai, ["--method", "rules"], "GoToLocalS7N5 has no rules that are written as an energy"),
         (babyai, ["--rules", "1"], "--rules: GoToLocalS7N5 has no rules"),
-        (sudoku, ["--rules", "-1"], "--rules must be a number, at least 0, got -1.0"),
-        (sudoku, ["--rules", "nan"], "--rules must be a number"),
+        (sudoku, ["--rules", "-1"], "--rules must be at least 0, got -1.0"),
+        (sudoku, ["--rules", "nan"], "--rules must be finite, got nan"),
     ],
 )
 def test_rules_that_cannot_be_had_are_one_line(program, arguments, message, capsys):

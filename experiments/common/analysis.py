@@ -179,6 +179,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
         UserError: an unknown case, method or preset, or options that cannot be.
     """
     check_counts(options, "episodes")
+    len(options.played)  # raises where their seeds leave their range
     if not options.seeds:
         raise UserError("--seeds needs at least one seed")
     known = [case.name for case in analysis.cases]

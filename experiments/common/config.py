@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import hashlib
 import json
-import os
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
@@ -12,15 +12,16 @@ from typing import Annotated, Any, Generic, TypeVar
 import jax
 import tyro
 
-from experiments.common import loggers
+from experiments.common import loggers, memory, program
 from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
 from leapjax.agents.learning import TrainingConfig
+from leapjax.checks import check_integer, check_number
 from leapjax.data import seeds, storage
 from leapjax.data.seeds import UNSEEN
 from leapjax.data.storage import Described
-from leapjax.domain import Domain, blank_context
-from leapjax.domains import find_domain
+from leapjax.domain import Domain
+from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
 from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
@@ -93,6 +94,12 @@ class Config(Generic[M, D, P]):
 
 AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
 
+# Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
+# faster, and the last episodes of an evaluation would rather have smaller ones.
+PLANS_TOGETHER = 32
+SMALLEST_ENVIRONMENT = 1024  # bytes
+COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
+
 # What a result does not depend on, or what its row holds on its own.
 _NOT_HASHED = (
     "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
@@ -149,6 +156,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     Raises:
         UserError: an unknown level, method or preset, or options that cannot be.
     """
+    program.check_values(arguments)
     # These come first: they decide the defaults of all the rest, and of --help.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
@@ -163,6 +171,8 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     levels = find_domain(domain).levels
     data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
     level = chosen.level or (trained.level if trained else data.level or levels[0])
+    if not chosen.level:
+        check_imported(level, str(folder or chosen.demonstrations))
     if chosen.method == "all" and (folder is not None or chosen.pretrained):
         raise UserError("--method all: a planner that is trained already is of one method")
     configs = []
@@ -180,6 +190,9 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
             if trained and (trained.domain, trained.method) == (domain, one):
                 default = _as_trained(default, trained)
             given = _parse(arguments, default)
+            if method == "all" and not default.training.steps:
+                # --steps is for those that learn.
+                given = with_options(given, {"steps": 0})
             config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
             check(config)
             configs.append(config)
@@ -217,8 +230,11 @@ def check(config: AnyConfig) -> None:
         UserError: says what.
     """
     check_counts(config, "episodes")
-    if config.training.steps:  # where nothing is learned, nothing is needed to learn from
-        check_counts(config, "demos")
+    if config.training.steps and config.demos < 1:
+        raise UserError(
+            f"--demos must be at least 1, got {config.demos}: --steps {config.training.steps} "
+            "needs demonstrations to train on, and a method that learns nothing has none by default"
+        )
     if not config.seeds:
         raise UserError("--seeds needs at least one seed")
     for seed in config.seeds:
@@ -227,10 +243,10 @@ def check(config: AnyConfig) -> None:
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
     loggers.check(config.loggers)
-    if not config.checkpoint_seconds >= 0:
-        raise UserError(f"--checkpoint-seconds must be at least 0, got {config.checkpoint_seconds}")
-    if config.context < 0:
-        raise UserError(f"--context must be at least 0, got {config.context}")
+    if config.checkpoint_seconds != math.inf:  # never before the end
+        check_number("--checkpoint-seconds", config.checkpoint_seconds, 0)
+    check_integer("--context", config.context)
+    check_number("--rules", config.rules, 0)
     check_executed(config.executed, config.planner.horizon)
     check_target_return(config)
     checkpoints.check_path(config.runs)
@@ -247,8 +263,6 @@ def check(config: AnyConfig) -> None:
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.collect is None and domain.source is None:
         raise UserError(storage.no_demonstrator(domain))
-    if not 0 <= config.rules < float("inf"):  # false for NaN too
-        raise UserError(f"--rules must be a number, at least 0, got {config.rules}")
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     limit = domain.shortest_limit
@@ -257,7 +271,13 @@ def check(config: AnyConfig) -> None:
             f"--horizon {config.planner.horizon} is longer than an episode of {config.level} "
             f"may last: its step limit is {limit}"
         )
+    if config.checkpoint is None and config.context > domain.max_steps:
+        raise UserError(
+            f"--context {config.context} is longer than any episode of {config.level}: at most "
+            f"{domain.max_steps} steps come before a state"
+        )
     # An agent costs nothing to make, and says what its method cannot do.
+    check_memory(config, domain)
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
     fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
@@ -265,7 +285,6 @@ def check(config: AnyConfig) -> None:
             f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
             "begin at once (--fill together)"
         )
-    check_memory(config, domain)
 
 
 def check_target_return(config: AnyConfig) -> None:
@@ -288,34 +307,54 @@ def check_target_return(config: AnyConfig) -> None:
 def check_memory(config: AnyConfig, domain: Domain) -> None:
     """Refuses what would need more memory than the machine has, by what it needs at least.
 
+    This is arithmetic, which a number of any size passes at once. What is exact follows when the
+    programs of a run are compiled: `memory.check_program`.
+
     Raises:
         UserError: says which options ask for it.
     """
-    if not hasattr(os, "sysconf"):  # Windows does not say
-        return
-    model, search = config.model, config.planner
-    context = sum(leaf.nbytes for leaf in jax.tree.leaves(blank_context(domain, config.context)))
-    activations = 4 * 12 * model.layers * model.width * search.horizon
+    model, search, training = config.model, config.planner, config.training
+    horizon, paper = search.horizon, model.architecture == "paper"
+    observation = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
+    context = (observation + 8) * (config.context + 1)
+    tokens = 2 * (horizon + config.context) if paper else horizon
+    layer = layer_bytes(model, tokens)
+    times = domain.max_steps if paper else 0  # each has an embedding
+    embeddings = times + tokens + domain.num_actions
     needs = {
-        "--batch, --context": config.training.batch * (context + activations),
-        # Parameters of the transformer, their gradients and Adam's two moments.
-        "--width, --layers": 4 * 4 * 12 * model.layers * model.width**2,
-    }
-    # Noise and trace of a chunk of 128 plans, in 4 bytes each; or what is weighed, and energies.
-    if isinstance(search, GibbsConfig):
-        drawn = search.resampled * domain.num_actions + search.horizon
-        noise = 4 * 128 * search.restarts * search.iterations * drawn
-        needs["--iterations, --restarts"] = noise
-    else:
-        plans = getattr(search, "beams", getattr(search, "candidates", 1))
-        needs["--beams, --candidates"] = 4 * 128 * plans * (search.horizon + domain.num_actions)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for options, needed in needs.items():
-        if needed > memory:
-            raise UserError(
-                f"{options}: at least {needed >> 30} GiB of memory would be needed, and this "
-                f"machine has {memory >> 30}"
-            )
+        # Parameters, their gradients and Adam's two moments.
+        "--width, --layers, --max-steps": 4 * 4 * (
+            12 * model.layers * model.width**2 + model.width * embeddings
+        ),
+        "--episodes, --context": config.episodes * (context + SMALLEST_ENVIRONMENT),
+    }  # fmt: skip
+    if training.steps and config.checkpoint is None:
+        masking = getattr(config.method_settings, "masking", "one")
+        copies = horizon if masking in COPYING else 1
+        together = min(training.batch, training.microbatch or training.batch)
+        activations = together * copies * model.layers * layer
+        needs["--batch, --context, --horizon"] = training.batch * context + activations
+        source = domain.source
+        # A demonstration has two states at least.
+        states = 2 * config.demos if source is None else source.amount
+        needs["--demos" if source is None else f"--{source.unit}"] = states * observation
+    # Plans are made together. Each restart is scored, as are candidates: with T passes.
+    many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
+    scored = (many > 1 and not hasattr(search, "beams")) or search.score
+    passes = many * (horizon if scored else 1)
+    plans = min(PLANS_TOGETHER, config.episodes)
+    choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
+    drawn = getattr(search, "resampled", 1) * domain.num_actions + horizon
+    needs["--iterations, --restarts, --beams, --candidates, --horizon"] = plans * (
+        passes * layer + choices * drawn
+    )
+    memory.check(needs)
+
+
+def layer_bytes(model: ModelConfig, tokens: int) -> int:
+    """Bytes that a layer makes of so many tokens, at least."""
+    # Queries, keys, values and so on; and who attends to whom.
+    return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
 def make_domain(config: AnyConfig) -> Domain:
@@ -334,15 +373,13 @@ def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
 
 
 def check_counts(options: object, *names: str) -> None:
-    """Refuses options that count something and are not positive.
+    """Refuses options that count something and are not positive, or more than can be counted.
 
     Raises:
         UserError: says which.
     """
     for name in names:
-        if getattr(options, name) < 1:
-            option = name.replace("_", "-")
-            raise UserError(f"--{option} must be at least 1, got {getattr(options, name)}")
+        check_integer(f"--{name.replace('_', '-')}", getattr(options, name), 1)
 
 
 def check_executed(executed: int | None, horizon: int, of: str = "") -> None:

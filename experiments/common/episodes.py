@@ -32,7 +32,7 @@ def watched(
         executed: actions of each plan; None for all.
         most: plans; an episode that needs more is cut off. None: as many as it takes.
     """
-    history = rollouts.History(adapter.reset(level_seed), context, adapter.num_actions)
+    history = rollouts.History(adapter.reset(level_seed), context, adapter.num_actions, level_seed)
     replan = 0
     while most is None or replan < most:
         keys = plan_keys(seed, np.array([level_seed]), np.array([replan]))

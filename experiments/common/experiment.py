@@ -192,8 +192,7 @@ def run_one(
                 console.print(f"pictures: {folder}", highlight=False, markup=False)
 
         processes.first_does(write)
-    paper = "" if row["paper_success"] is None else f", paper {row['paper_success']}%"
-    console.print(f"success {results.percent(row)}, mean length {row['mean_length']:.1f}{paper}")
+    console.print(results.summarize(row))
     return row
 
 
@@ -216,12 +215,29 @@ def train(
     mesh = run.training_mesh(this.config)
     begun = functools.cache(lambda: run.compile_ahead(this, mesh, plays))
     if run.must_collect(this):
-        begun()  # programs compile meanwhile
+        if this.domain.with_statistics is None:  # a network that needs none of what is collected
+            begun()  # programs compile meanwhile
         run.collect(this)
     data = run.load(this)
+    this = run.measured(this, data)
     seeds.check_disjoint([d.seed for d in data], played)
     processes.first_does(lambda: stack.enter_context(files.only_process_in(this.folder)))
     return run.fit(this, data, mesh, lambda: begun()(), watch)
+
+
+def describe_success(this: Run) -> dict[str, Any]:
+    """What success means in a row, and how well the data do by it, where that is not plain."""
+    config, criterion = this.config, this.domain.criterion
+    if criterion is None:
+        return {}
+    same = config.play in (None, config.level)
+    data = run.read_outcome(config.checkpoint or this.folder) if same else None
+    return {
+        "criterion": str(criterion),
+        "criterion_given": criterion.given,
+        "data_success": None if data is None else data[0],
+        "data_return": None if data is None else data[1],
+    }
 
 
 def make_row(
@@ -257,6 +273,7 @@ def make_row(
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
         "paper_success": this.domain.paper_success.get(this.config.method),
+        **describe_success(this),
         "date": results.today(),
         "hash": name,
         "configuration": resolved(config, this.seed),

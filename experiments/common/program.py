@@ -19,8 +19,32 @@ FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can b
 
 
 def arguments_of(arguments: Sequence[str] | None) -> list[str]:
-    """The command line of a program: what was given, or the real one."""
-    return list(sys.argv[1:] if arguments is None else arguments)
+    """The command line of a program: what was given, or the real one.
+
+    Raises:
+        SystemExit: a value is empty; it is said in one line.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        check_values(given)
+    except UserError as error:
+        raise SystemExit(_end(f"error: {error}", 2)) from None
+    return given
+
+
+def check_values(arguments: Sequence[str]) -> None:
+    """Refuses empty values, which a shell makes of a variable that is not set.
+
+    Raises:
+        UserError: names the option.
+    """
+    option = "an argument"
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if name.startswith("--"):
+            option = name
+        if not (value if equals and name == option else argument).strip():
+            raise UserError(f"{option} is empty: give it a value, or leave it out")
 
 
 def renamed(arguments: Sequence[str], names: Mapping[str, str]) -> list[str]:

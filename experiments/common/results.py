@@ -14,65 +14,113 @@ import jax
 from rich.table import Table
 
 from experiments.common import runtime
+from experiments.common.schema import (
+    AMOUNT,
+    COUNT,
+    POSITIVE,
+    SEVERAL,
+    Absent,
+    Nullable,
+    Number,
+    Schema,
+    loads,
+    problem,
+)
 from leapjax import scores
 from leapjax.checkpoints import read_json
-from leapjax.errors import UserError
+from leapjax.checks import LARGEST_SEED
+from leapjax.errors import UserError, first_line
 from leapjax.files import only_process_in, read_text, write_text
 from leapjax.rollouts import Episodes
 
 Row = dict[str, Any]
-# What tables are made from; a float may be written as an integer.
+# What every row has; a float may be written as an integer.
 FIELDS = {
     "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
     "seed": int, "episodes": int, "successes": int, "mean_length": float,
     "compile_seconds": float, "train_seconds": float, "eval_seconds": float,
     "plans_per_second": float,
 }  # fmt: skip
+ROW: dict[str, Schema] = {
+    **FIELDS,
+    "seed": Number(0, LARGEST_SEED, whole=True),
+    "episodes": SEVERAL,
+    "successes": COUNT,
+    "mean_length": POSITIVE,
+    "compile_seconds": AMOUNT,
+    "train_seconds": AMOUNT,
+    "eval_seconds": AMOUNT,
+    "plans_per_second": POSITIVE,
+    # What only some rows have, and a terminal shows.
+    "demos_seconds": Absent(AMOUNT),
+    "mean_return": Absent(float),
+    "paper_success": Absent(Nullable(Number(0, 100))),
+    "configuration": Absent({"planner": Absent(dict)}),
+}
+# Rows of an experiment, and of an analysis, with what tables read.
+OF_EXPERIMENT: dict[str, Schema] = {
+    **ROW,
+    "train_steps": COUNT,
+    "iterations": SEVERAL,
+    "plans": SEVERAL,
+    "mean_return": float,
+    "return_error": Absent(Nullable(AMOUNT)),
+    "configuration": {"planner": {"temperature": Absent(AMOUNT)}},
+}
+OF_ANALYSIS: dict[str, Schema] = {
+    **ROW,
+    "case": str,
+    "way": str,
+    "plans": SEVERAL,
+    "first_pass_successes": Nullable(COUNT),
+    "violations": Nullable(COUNT),
+    "paper_success": Nullable(Number(0, 100)),
+    "versions": {"machine": str},
+}
 
 
-LARGEST = 1e18
-
-
-def read(path: Path) -> list[Row]:
+def read(path: Path, schema: Schema = ROW) -> list[Row]:
     """The rows of a file; none if there is no file.
 
+    Args:
+        path: of the file.
+        schema: what each row must be.
+
     Raises:
-        UserError: a line that is not a row, by its number.
+        UserError: a line is not a row, by its number; or two rows have one hash: a table would
+            count one seed twice.
     """
     if not path.exists():
         return []
     rows = []
+    line_of: dict[str, int] = {}  # by hash
     # Split where JSON lines are: other kinds of line end may be inside of a text.
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):
-            raise UserError(f"{path}, line {number}: not JSON") from None
-        wrong = _what_is_wrong(row)
+            row = loads(line)
+        except (ValueError, RecursionError) as error:
+            reason = "" if isinstance(error, json.JSONDecodeError) else f" ({first_line(error)})"
+            raise UserError(f"{path}, line {number}: not JSON{reason}") from None
+        wrong = problem(row, schema) or _contradiction(row)
         if wrong:
             raise UserError(f"{path}, line {number}: {wrong}")
+        first = line_of.setdefault(row["hash"], number)
+        if first != number:
+            raise UserError(
+                f"{path}, line {number}: the same hash, {row['hash'][:20]}, as line {first}, so "
+                "both are of one run: delete one of them"
+            )
         rows.append(row)
     return rows
 
 
-def _what_is_wrong(row: Any) -> str | None:
-    if not isinstance(row, dict):
-        return f"expected a JSON object, got {type(row).__name__}"
-    missing = [name for name in FIELDS if name not in row]
-    if missing:
-        return f"a row without {', '.join(missing)}"
-    optional = {} if row.get("paper_success") is None else {"paper_success": float}
-    for name, kind in {**FIELDS, **optional}.items():
-        value: Any = row[name]
-        expected = (int, float) if kind is float else kind
-        if not isinstance(value, expected) or isinstance(value, bool):
-            return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
-        if kind is not str and not -LARGEST < row[name] < LARGEST:  # NaN too
-            return f"{name} is {str(value)[:20]}: no number that a run could give"
-    if not 0 <= row["successes"] <= row["episodes"] or row["episodes"] < 1:
-        return f"{row['successes']} successes of {row['episodes']} episodes"
+def _contradiction(row: Row) -> str | None:
+    """What fields say against each other."""
+    for name in ("successes", "first_pass_successes"):
+        if (row.get(name) or 0) > row["episodes"]:
+            return f"{row[name]} {name} of {row['episodes']} episodes"
     return None
 
 
@@ -82,7 +130,16 @@ def folder(recorded: bool, runs: Path) -> Path:
 
 
 def record(path: Path, row: Row) -> None:
-    """Adds a row, in the place of one of the same configuration, atomically."""
+    """Adds a row, in the place of one of the same configuration, atomically.
+
+    Raises:
+        UserError: it holds a number that is not finite, which JSON has no word for.
+    """
+    for name, value in row.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError:
+            raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
     with only_process_in(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
@@ -168,6 +225,37 @@ def percent(row: Row) -> str:
     return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
 
 
+def summarize(row: Row) -> str:
+    """What a run has come to, in one line."""
+    paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
+    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
+    if "criterion" not in row:
+        return ", ".join(parts)
+    total = f"mean return {format_return(row)}"
+    parts.insert(1 if row["criterion_given"] else 0, total)
+    return f"{', '.join(parts)}; success: {row['criterion']}"
+
+
+def format_success(row: Row) -> str:
+    """A success rate, and that of the data where it is known."""
+    data = _find_number(row, "data_success")
+    return percent(row) + ("" if data is None else f" (data: {data:.1%})")
+
+
+def format_return(row: Row) -> str:
+    """A mean return, and that of the data where it is known."""
+    mean, data = _find_number(row, "mean_return"), _find_number(row, "data_return")
+    return ("-" if mean is None else f"{mean:.2f}") + (
+        "" if data is None else f" (data: {data:.2f})"
+    )
+
+
+def _find_number(row: Row, name: str) -> float | None:
+    """A number that a row need not have."""
+    value = row.get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def planner_name(row: Row) -> str:
     """How a row's plans were found, as far as it says."""
     configuration = row.get("configuration", {})
@@ -182,9 +270,18 @@ def planner_name(row: Row) -> str:
 
 
 def success_table(rows: Sequence[Row]) -> Table:
-    """Success rates beside the paper's."""
-    columns = ("level", "method", "planner", "seed", "success [95%]", "return", "length", "paper")
-    result = Table(*columns)
+    """Success rates beside the paper's.
+
+    The mean return comes first where a row's criterion of success was not given by the user.
+    """
+    measures = {"success [95%]": format_success, "return": format_return}
+    if any("criterion" in row and not row.get("criterion_given") for row in rows):
+        measures = dict(reversed(measures.items()))
+    criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})
+    result = Table(
+        *("level", "method", "planner", "seed", *measures, "length", "paper"),
+        caption="\n".join(criteria) or None,
+    )
     for row in rows:
         paper = row.get("paper_success")
         result.add_row(
@@ -192,8 +289,7 @@ def success_table(rows: Sequence[Row]) -> Table:
             f"{row['method']} ({row['preset']})",
             planner_name(row),
             str(row["seed"]),
-            percent(row),
-            f"{row['mean_return']:.2f}" if "mean_return" in row else "-",
+            *(measure(row) for measure in measures.values()),
             f"{row['mean_length']:.1f}",
             "-" if paper is None else f"{paper:.1f}%",
         )

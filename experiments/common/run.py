@@ -12,7 +12,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +21,8 @@ import numpy as np
 from jax.sharding import Mesh
 from rich.console import Console
 
-from experiments.common import loggers, plots
-from experiments.common.config import AnyConfig, resolved
+from experiments.common import loggers, memory, plots
+from experiments.common.config import PLANS_TOGETHER, AnyConfig, resolved
 from experiments.common.interruption import Interruption
 from experiments.common.loggers import About, Log
 from experiments.common.progress import Meter
@@ -32,8 +32,9 @@ from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
-from leapjax.domain import Domain, Source, blank_context
+from leapjax.domain import Domain, Source, apply_statistics, blank_context
 from leapjax.energy import compose
+from leapjax.environments import judge_episode
 from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
@@ -43,9 +44,7 @@ from leapjax.types import Agent, Demonstration, Energy, Params, TrainState
 
 Metrics = list[dict[str, float]]
 Watch = Callable[[Energy, Params], dict[str, float]]
-# One program is soon compiled. Larger chunks are a tenth faster, and the last episodes of an
-# evaluation would rather have smaller ones.
-CHUNK_SIZES = (32,)
+CHUNK_SIZES = (PLANS_TOGETHER,)
 REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
 DATA = "data.json"  # in the folder of a run: the demonstrations that it learns from
 
@@ -113,15 +112,18 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
     like = learning.blank_steps(domain) if config.demos else ()
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    memory.check_state(state)
 
     def training_programs() -> tuple[Any, TrainStep]:
         if config.training.steps:
-            return training.compile_ahead(agent, mesh, like)
+            begin, step = training.compile_ahead(agent, mesh, like)
+            memory.check_program(step.update)
+            return begin, step
         return training.make_begin(agent, mesh), training.make_train_step(agent, mesh)
 
     def warm_planner() -> None:
-        shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
-        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), shapes)
+        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), state.params)
         blank = Pretrained(run.specification, agent.energy, params, plan)
         warm_up(blank, domain, config.episodes, config.executed)
 
@@ -197,6 +199,16 @@ def load(run: Run) -> list[Demonstration]:
     return data
 
 
+def measured(run: Run, data: Sequence[Demonstration]) -> Run:
+    """A run whose network knows the statistics of what it learns from, if it needs any."""
+    statistics = run.domain.measure(data)
+    return dataclasses.replace(
+        run,
+        domain=apply_statistics(run.domain, statistics),
+        specification=dataclasses.replace(run.specification, statistics=statistics),
+    )
+
+
 def fit(
     run: Run,
     data: Sequence[Demonstration],
@@ -217,7 +229,7 @@ def fit(
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
     steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
     named = windows.fingerprint(windows.unpadded(steps) if data else ())
-    check_data(folder, named, [each.seed for each in data])
+    check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = programs()
     state, key = begin(run.seed)
     steps = sharding.replicate(steps, mesh)
@@ -286,10 +298,40 @@ def training_mesh(config: AnyConfig) -> Mesh:
         raise UserError(f"--batch, --fsdp: {error}") from None
 
 
-def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> None:
+def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
+    """How well demonstrations do, by the criterion that played episodes are judged by.
+
+    None where the environment has a measure of its own, which demonstrations do not keep.
+    """
+    criterion = domain.criterion
+    if criterion is None or not data:
+        return None
+    totals = [float(np.sum(d.rewards, dtype=np.float64)) for d in data]
+    successes = [
+        judge_episode(criterion, total, float(d.rewards[-1]), d.terminated, d.truncated)
+        for total, d in zip(totals, data, strict=True)
+    ]
+    return {"success": float(np.mean(successes)), "return": float(np.mean(totals))}
+
+
+def read_outcome(folder: Path) -> tuple[float, float] | None:
+    """Success rate and mean return of the data that a run learned from, where it noted them."""
+    found = noted_of(folder).get("outcome") if (folder / DATA).exists() else None
+    values = [found.get(name) for name in ("success", "return")] if isinstance(found, dict) else []
+    numbers = [float(each) for each in values if isinstance(each, float) and math.isfinite(each)]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+
+
+def check_data(
+    folder: Path,
+    fingerprint: str,
+    level_seeds: Sequence[int],
+    outcome: Mapping[str, Any] | None = None,
+) -> None:
     """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
 
-    Notes what they are, and their level seeds, for `demonstrated`.
+    Notes what they are, their level seeds for `demonstrated`, and their outcome for
+    `read_outcome`.
 
     Raises:
         UserError: the run was begun on others, or processes have read different ones.
@@ -302,7 +344,8 @@ def check_data(folder: Path, fingerprint: str, level_seeds: Sequence[int]) -> No
 
     def check() -> None:
         if not (folder / DATA).exists():
-            noted = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            noted: dict[str, Any] = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            noted |= {} if outcome is None else {"outcome": outcome}
             return files.write_text(folder / DATA, json.dumps(noted))
         before = noted_of(folder).get("fingerprint")
         if before != fingerprint:
@@ -363,7 +406,7 @@ def _training_settings(specification: Specification) -> dict[str, Any]:
         return found
 
     settings = flat(dataclasses.asdict(specification), "")
-    asked = {"method_settings.target_return"} | {
+    asked = {"method_settings.target_return", "statistics"} | {
         name for name in settings if name.startswith(("planner.", "signature."))
     }
     return {

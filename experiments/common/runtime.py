@@ -2,24 +2,69 @@
 
 import contextlib
 import dataclasses
-import logging
+import enum
 import os
 import platform
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 
+from experiments.common import startup
+from leapjax import files
+from leapjax.checks import check_at_least, check_types
 from leapjax.errors import UserError, first_line
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
+MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
 CONNECT_SECONDS = 120
+LAST_PORT = 2**16 - 1
 # How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
 # starts one process has too.)
 LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+
+
+class Promise(NamedTuple):
+    """A setting of JAX that one of our promises rests on."""
+
+    setting: str
+    allowed: Sequence[Any]
+    why: str
+
+
+_DRAWS = "what a seed draws would be something else"
+_STEPS = "leapjax traces, compiles and runs its programs itself"
+_TYPES = "leapjax mixes types and ranks as NumPy does"
+# Settings that only report, slow down or tune the compiler are not here.
+PROMISES = (
+    Promise("jax_enable_x64", (False,), "leapjax computes in 32 bits"),
+    Promise("jax_explicit_x64_dtypes", ("warn",), "leapjax computes in 32 bits"),
+    Promise("jax_default_matmul_precision", (None,), "a resumed run would end with other bits"),
+    Promise("jax_softmax_custom_jvp", (False,), "a resumed run would end with other bits"),
+    Promise("jax_default_prng_impl", ("threefry2x32",), _DRAWS),
+    Promise("jax_threefry_partitionable", (True,), _DRAWS),
+    Promise("jax_random_seed_offset", (0,), _DRAWS),
+    Promise("jax_high_dynamic_range_gumbel", (False,), _DRAWS),
+    Promise("jax_disable_jit", (False,), _STEPS),
+    Promise("jax_no_tracing", (False,), _STEPS),
+    Promise("jax_no_execution", (False,), _STEPS),
+    Promise("jax_allow_f16_reductions", (True,), "networks with --dtype bfloat16 need them"),
+    Promise("jax_numpy_dtype_promotion", ("standard",), _TYPES),
+    Promise("jax_numpy_rank_promotion", ("allow", "warn"), _TYPES),
+    Promise("jax_debug_infs", (False,), "masked logits and energies of partial plans are infinite"),
+    Promise("jax_default_device", (None,), "leapjax places batches on every device itself"),
+    *(
+        Promise(
+            f"jax_transfer_guard{direction}", (None, "allow", "log", "log_explicit"),
+            "leapjax moves data to and from the devices",
+        )
+        for direction in ("", "_host_to_device", "_device_to_device", "_device_to_host")
+    ),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +82,8 @@ class Cluster:
 
     def __post_init__(self) -> None:
         given = [self.coordinator, self.num_processes, self.process_id]
-        if self.fsdp < 1:
-            raise ValueError(f"fsdp must be at least 1, got {self.fsdp}")
+        check_types(self)
+        check_at_least(self, 1, "fsdp")
         if given == [None, None, None]:
             return
         if self.coordinator is None or self.num_processes is None or self.process_id is None:
@@ -49,25 +94,61 @@ class Cluster:
                 f"to {self.num_processes - 1}"
             )
         host, _, port = self.coordinator.rpartition(":")
-        if not host or not port.isdecimal():
-            raise ValueError(f"coordinator is {self.coordinator!r}: expected host:port")
+        if not host or not port.isdecimal() or len(port) > 5 or int(port) > LAST_PORT:
+            raise ValueError(
+                f"coordinator is {self.coordinator!r}: expected host:port, a port of at most "
+                f"{LAST_PORT}"
+            )
 
 
-def start(cluster: Cluster = Cluster()) -> None:
+def start(cluster: Cluster = Cluster(), cache: bool = True) -> None:
     """Every program's first step, before JAX has touched a device.
 
+    Args:
+        cluster: the processes that share the run.
+        cache: keep compiled programs; without, compile times are real.
+
     Raises:
-        UserError: the other processes cannot be reached, or JAX is set to compute in 64 bits.
+        UserError: a setting of JAX breaks a promise, the other processes cannot be reached, or
+            JAX can use no device.
     """
-    if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
-        raise UserError("leapjax computes in 32 bits: unset JAX_ENABLE_X64")
-    # Of a damaged checkpoint, or on a full disk, many parts fail at once. We say so in one line;
-    # asyncio and Orbax would log each of them that nobody asked for, with its traceback.
-    for name in ("asyncio", "absl"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    check_promises()
     use_every_core()
-    use_compilation_cache()
+    if cache:
+        use_compilation_cache()
     connect(cluster)
+    check_devices()
+
+
+def check_promises() -> None:
+    """Refuses settings of JAX under which something that we promise does not hold.
+
+    Raises:
+        UserError: names the setting.
+    """
+    for setting, allowed, why in PROMISES:
+        value = getattr(jax.config, setting, allowed[0])  # not every version has them all
+        value = value.name.lower() if isinstance(value, enum.Enum) else value
+        if value not in allowed:
+            raise UserError(
+                f"JAX's setting {setting} is {value!r}: {why}; unset {setting.upper()}, or use "
+                f"{' or '.join(map(repr, allowed))}"
+            )
+
+
+def check_devices() -> None:
+    """Starts JAX, if it was not.
+
+    Raises:
+        UserError: it has no device, as with JAX_PLATFORMS=cuda where there is no GPU.
+    """
+    try:
+        jax.devices()
+    except Exception as error:  # noqa: BLE001  (each platform raises its own)
+        raise UserError(
+            f"JAX can use no device{startup.settings_of_jax()} ({first_line(error)}): change "
+            "these settings, or install what they need"
+        ) from None
 
 
 def connect(cluster: Cluster) -> None:
@@ -125,8 +206,16 @@ def use_every_core() -> None:
     """Makes each core a JAX device of its own, as `leapjax.sharding` wants them.
 
     `JAX_NUM_CPU_DEVICES`, if set, has the last word.
+
+    Raises:
+        UserError: it is set to a number that JAX cannot make.
     """
     if "JAX_NUM_CPU_DEVICES" in os.environ:
+        asked: int = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
+        if asked != -1 and not 1 <= asked <= MOST_ASKED_FOR:  # -1: JAX's own default
+            raise UserError(
+                f"JAX_NUM_CPU_DEVICES is {asked}: expected a number in 1 .. {MOST_ASKED_FOR}"
+            )
         return
     with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
         jax.config.update("jax_num_cpu_devices", min(cores(), MOST_CPU_DEVICES))
@@ -143,16 +232,17 @@ def use_compilation_cache() -> None:
     """Keeps compiled programs in the user's cache folder: a second start takes seconds.
 
     Programs are compiled for one processor, so each kind has its own folder.
-    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
+    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off". A compiled program is code that
+    this process will run: where others can write to the folder, it is not used.
     """
     choice = os.environ.get("LEAPJAX_COMPILATION_CACHE", "")
     if choice == "off":
         return
-    home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
-    folder = Path(choice) if choice else home / "leapjax" / "xla" / processor()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # JAX would say so at every program, with its traceback
+        folder = Path(choice) if choice else files.cache_folder() / "xla" / processor()
+        files.make_private(folder.absolute())
+    except UserError as error:  # JAX would say so at every program, with its traceback
+        print(f"compiled programs are not kept: {error}", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

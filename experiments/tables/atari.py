@@ -97,12 +97,13 @@ def _mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
     Of several seeds the larger of two: from the spread of their means, which a few seeds may
     happen to hide, and from that of the games alone. None where the best action is always taken:
     a game without sticky actions then depends on its no-ops modulo the frame skip alone, so that
-    there are four, however many are played.
+    there are four, however many are played; and where a row is of one game.
     """
     means = np.array([row["mean_return"] for row in rows])
-    if any(row["configuration"]["planner"]["temperature"] == 0 for row in rows):
+    errors = np.array([row.get("return_error") for row in rows], float)  # NaN of one game
+    greedy = any(row["configuration"]["planner"].get("temperature") == 0 for row in rows)
+    if greedy or np.isnan(errors).any():
         return float(means.mean()), None
-    errors = np.array([row["return_error"] for row in rows])
     of_games = float(np.sqrt((errors**2).sum())) / len(rows)
     return float(means.mean()), max(scores.standard_error(means) or 0.0, of_games)
 

@@ -13,14 +13,14 @@ def speed(rows: Sequence[Row]) -> str:
         if row["batch"] != 256:
             continue
         same = ("preset", "horizon", "iterations")
-        alone = next(r for r in rows if r["batch"] == 1 and all(r[key] == row[key] for key in same))
+        alone = [r for r in rows if r["batch"] == 1 and all(r[key] == row[key] for key in same)]
         lines.append(
             [
                 f"T = {row['horizon']}, N = {row['iterations']}",
                 f"`{row['preset']}`",
                 f"{row['plans_per_second']:,.0f}",
                 f"{row['fraction_of_peak']:.0%}",
-                f"{1e3 * alone['seconds']:.1f} ms",
+                f"{1e3 * alone[0]['seconds']:.1f} ms" if alone else "-",
             ]
         )
     header = "plan | preset | plans per second | of the matrix-multiply peak | one alone"

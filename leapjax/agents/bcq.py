@@ -15,6 +15,7 @@ from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.agents.q_learning import look_around, seen_around
+from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.models.policy import Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
@@ -29,7 +30,9 @@ class Settings:
     logit_penalty: float = 0.01  # on the squares of the behaviour's logits
 
     def __post_init__(self) -> None:
+        check_types(self)
         learning.check_shares(self, "threshold", "discount", "target_rate")
+        check_within(self, 0, LARGEST, "logit_penalty")
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 from leapjax.agents import losses, q_learning
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
+from leapjax.checks import LARGEST, check_within
 from leapjax.types import Agent
 
 
@@ -29,8 +30,7 @@ class Settings(q_learning.Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.alpha < float("inf"):  # false for NaN too
-            raise ValueError(f"alpha must be at least 0, got {self.alpha}")
+        check_within(self, 0, LARGEST, "alpha")
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

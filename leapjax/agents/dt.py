@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 from leapjax.agents import returns
 from leapjax.agents.imitation import make_imitator
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.checks import check_types
 from leapjax.types import Agent
 
 
@@ -21,7 +22,7 @@ class Settings:
     target_return: float = 1.0  # of an episode, asked for while acting
 
     def __post_init__(self) -> None:
-        returns.check_target(self.target_return)
+        check_types(self)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

@@ -17,6 +17,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -37,10 +38,9 @@ class Settings:
     target_rate: float = 0.005  # how far the target network follows at each step
 
     def __post_init__(self) -> None:
+        check_types(self)
         learning.check_shares(self, "expectile", "discount", "target_rate")
-        for name in ("inverse_temperature", "largest_weight"):
-            if not 0 <= getattr(self, name) < float("inf"):  # false for NaN too
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+        check_within(self, 0, LARGEST, "inverse_temperature", "largest_weight")
 
 
 class Networks(nn.Module):

@@ -11,6 +11,7 @@ from leapjax import schedules
 from leapjax.agents import learning, returns
 from leapjax.agents.batches import run_batches, window_batches
 from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
@@ -44,11 +45,11 @@ class Settings:
     target_return: float = 1.0  # of an episode, asked for while acting
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.masking not in schedules.MASKINGS:
             raise ValueError(
                 f"unknown masking {self.masking!r}: expected one of {', '.join(schedules.MASKINGS)}"
             )
-        returns.check_target(self.target_return)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

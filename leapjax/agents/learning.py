@@ -1,7 +1,6 @@
 """What agents share: the setup they are made from, optimisation, one gradient step."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax import sharding
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_types, check_within
 from leapjax.data import windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
@@ -68,17 +67,14 @@ class TrainingConfig:
     run: int = 1  # windows in a row that make an example; each state of theirs is encoded once
 
     def __post_init__(self) -> None:
-        check_at_least(self, 0, "steps", "microbatch")
+        check_types(self, "clip")
+        check_at_least(self, 0, "steps", "microbatch", "warmup")
         check_at_least(self, 1, "batch", "run")
-        ranges = {
-            "learning_rate": (0, 10), "weight_decay": (0, 100), "final_fraction": (0, 1),
-            "warmup": (0, math.inf), "clip": (0, math.inf),
-        }  # fmt: skip
-        if self.clip == 0:
-            raise ValueError("clip must be positive, got 0: nothing would be learned")
-        for name, (low, high) in ranges.items():
-            if not low <= getattr(self, name) <= high:  # false for NaN too
-                raise ValueError(f"{name} must be in {low} .. {high}, got {getattr(self, name)}")
+        check_within(self, 0, 10, "learning_rate")
+        check_within(self, 0, 100, "weight_decay")
+        check_within(self, 0, 1, "final_fraction")
+        if self.clip <= 0:
+            raise ValueError(f"clip must be positive, got {self.clip}: nothing would be learned")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"betas must be in [0, 1), got {self.betas}")
         if self.batch % self.run:
@@ -382,14 +378,12 @@ def follow(
 
 
 def check_shares(settings: object, *names: str) -> None:
-    """Refuses settings that are shares and not in 0 .. 1.
+    """Checks settings that are shares.
 
     Raises:
-        ValueError: says which.
+        ValueError: names the first that is not in 0 .. 1.
     """
-    for name in names:
-        if not 0 <= getattr(settings, name) <= 1:  # false for NaN too
-            raise ValueError(f"{name} must be in 0 .. 1, got {getattr(settings, name)}")
+    check_within(settings, 0, 1, *names)
 
 
 def blank_steps(domain: Domain) -> Steps:

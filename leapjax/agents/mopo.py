@@ -22,7 +22,7 @@ from jax.sharding import Mesh
 from leapjax.agents import iql, learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
-from leapjax.checks import check_at_least
+from leapjax.checks import LARGEST, check_at_least, check_within
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
@@ -38,11 +38,10 @@ class Settings(iql.Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, 2, "members")
-        check_at_least(self, 1, "rollout")
+        check_at_least(self, 2, "members", most=100)
+        check_at_least(self, 1, "rollout", most=1000)
         learning.check_shares(self, "real_share")
-        if not 0 <= self.penalty < float("inf"):  # false for NaN too
-            raise ValueError(f"penalty must be at least 0, got {self.penalty}")
+        check_within(self, 0, LARGEST, "penalty")
 
 
 class Predicted(NamedTuple):

@@ -10,9 +10,12 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import NETWORK_PRESETS, Method, Setup
+from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.energy import autoregressive
+from leapjax.errors import UserError
 from leapjax.models.alternating import AlternatingModel
+from leapjax.models.trajectory import MOST_LAYERS
 from leapjax.planners import BeamConfig
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -24,13 +27,18 @@ class Settings:
     state_weight: float = 1.0  # of the states' loss beside the actions'
 
     def __post_init__(self) -> None:
-        if not 0 <= self.state_weight < float("inf"):  # false for NaN too
-            raise ValueError(f"state_weight must be at least 0, got {self.state_weight}")
+        check_types(self)
+        check_within(self, 0, LARGEST, "state_weight")
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """PlaTe as an `Agent`; its energy is the negative log-likelihood of a plan."""
     sizes, last = setup.sizes, setup.domain.num_actions - 1  # the end action
+    if setup.model.architecture != "paper" and setup.horizon > MOST_LAYERS:
+        raise UserError(
+            f"--horizon {setup.horizon}: PlaTe with architecture {setup.model.architecture} "
+            f"encodes each state of a plan by itself, so its horizon is at most {MOST_LAYERS}"
+        )
     module = AlternatingModel(setup.model, sizes, setup.encoder())
     optimizer = learning.make_optimizer(setup.training)
 

@@ -11,6 +11,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import Prepare, Setup
+from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -25,6 +26,7 @@ class Settings:
     target_rate: float = 0.005  # how far the target network follows at each step
 
     def __post_init__(self) -> None:
+        check_types(self)
         learning.check_shares(self, "discount", "target_rate")
 
 

@@ -26,7 +26,7 @@ class Settings(q_learning.Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, 1, "q_heads")
+        check_at_least(self, 1, "q_heads", most=10_000)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

@@ -36,13 +36,3 @@ def returns_to_go(context: Context, now: jax.Array) -> jax.Array:
     """`[K + 1]`: what was to come at the past states and the current one, given `now []`."""
     later = jnp.cumsum(context.rewards[::-1])[::-1]
     return now + jnp.append(later, 0.0)
-
-
-def check_target(target: float) -> None:
-    """Refuses a target return that is not a number.
-
-    Raises:
-        ValueError: says what it is.
-    """
-    if not abs(target) < float("inf"):  # false for NaN too
-        raise ValueError(f"target_return must be a number, got {target}")

@@ -4,6 +4,7 @@ import numpy as np
 from ale_py.vector_env import AtariVectorEnv
 
 from leapjax.atari.games import FRAME_SKIP, HEIGHT, WIDTH, Game
+from leapjax.checks import check_integer
 from leapjax.environments import Transition
 
 
@@ -30,12 +31,18 @@ class AtariAdapter:
 
     def reset(self, seed: int) -> np.ndarray:
         """Starts the game of a seed: the frame `[84, 84]` uint8."""
+        check_integer("the seed of a game", seed)  # ALE's are int32
         if self._begun is not None:  # what it is busy with is of the game before
             self._env.recv()
             self._begun = None
         observations, _ = self._env.reset(seed=seed)
         self.frame, self.score = np.array(observations[0, -1]), 0.0
         return self.frame
+
+    def close(self) -> None:
+        """Ends the game; `frame` and `score` stay."""
+        self._env.close()
+        del self._env  # ale-py ends a game's thread when nothing refers to it
 
     def begin(self, action: int) -> None:
         """Begins to take an action, in a thread of the game's own."""

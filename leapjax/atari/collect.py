@@ -174,7 +174,7 @@ def _known(
         _count([manifest])
         noises = [each["noise"] for each in manifest["games"]]
         of = manifest["game"], manifest.get("run", run)
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
     if of != (game.name, run):
         raise UserError(

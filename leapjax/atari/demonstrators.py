@@ -11,6 +11,7 @@ import numpy as np
 
 from leapjax.atari.emulator import MOST_NOOPS, SCREEN, Emulator
 from leapjax.atari.games import GAMES, MAX_STEPS, Game
+from leapjax.checks import check_seed
 
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
 # what to do now; leaves the emulator as it found it. One plays one game, from its start on.
@@ -65,7 +66,7 @@ def play(game: Game, seed: int, noise: float, most_steps: int = MAX_STEPS) -> Pl
         most_steps: after how many decisions to stop; some games hardly end.
     """
     starts, noises, thoughts = (
-        np.random.default_rng(part) for part in np.random.SeedSequence(seed).spawn(3)
+        np.random.default_rng(part) for part in np.random.SeedSequence(check_seed(seed)).spawn(3)
     )
     emulator, demonstrator = Emulator(game), make_demonstrator(game)
     emulator.reset(int(starts.integers(MOST_NOOPS + 1)))

@@ -14,7 +14,8 @@ from leapjax.atari import replay
 from leapjax.atari.augmentation import mirrored, shifted
 from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
 from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_types, check_within
+from leapjax.data.seeds import MAX_TRAINING_SEED
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
@@ -40,14 +41,13 @@ class Settings:
     shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "transitions", "replay_run", "max_steps", "features")
-        check_at_least(self, 0, "shift")
-        if not 0 <= self.sticky <= 1:  # false for NaN too
-            raise ValueError(f"sticky must be in 0 .. 1, got {self.sticky}")
-        if self.max_steps > MOST_STEPS:
-            raise ValueError(f"max_steps must be at most {MOST_STEPS}, got {self.max_steps}")
-        if self.shift >= WIDTH:
-            raise ValueError(f"shift must be less than {WIDTH}, got {self.shift}")
+        check_types(self)
+        check_at_least(self, 1, "transitions")
+        check_at_least(self, 1, "replay_run", most=MAX_TRAINING_SEED)  # each has seeds of its own
+        check_at_least(self, 1, "features", most=10_000)
+        check_at_least(self, 1, "max_steps", most=MOST_STEPS)
+        check_at_least(self, 0, "shift", most=WIDTH - 1)
+        check_within(self, 0, 1, "sticky")
 
 
 def make(name: str, settings: Settings) -> Domain:

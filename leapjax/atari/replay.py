@@ -23,7 +23,6 @@ import math
 import os
 import re
 import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ import numpy as np
 
 from leapjax import files
 from leapjax.atari.games import GAMES, HEIGHT, WIDTH, Game
+from leapjax.checks import check_seed
 from leapjax.data.storage import UNKNOWN_SEED
 from leapjax.domain import Collection
 from leapjax.errors import UserError, first_line
@@ -53,6 +53,7 @@ _PARTS = tuple(f"$store$_{name}" for name in _STORED)
 
 _BLOCK = 2**19  # bytes that are unpacked at once
 _LEVEL = 4  # of gzip's compression: twice as fast as the default, and hardly larger
+_EXPANSION = 1032  # bytes that gzip can make of one, at most
 _FORMAT = 1  # raised whenever what a conversion holds changes: old ones are then unused
 _FRAMES, _STEPS, _UNFINISHED = "frames.npy", "steps.npz", ".unfinished"
 
@@ -165,7 +166,7 @@ def read(
     maker of data may write none, but then nobody knows whether the first trajectory of a shard is
     whole, and it counts as cut.
 
-    The frames are unpacked once, into a memory-mapped file beside the data (in a temporary
+    The frames are unpacked once, into a memory-mapped file beside the data (in this user's cache
     folder, where that is read-only). A later call with the same arguments only opens it, until
     a shard is changed. What was converted may be deleted whenever nobody uses it.
 
@@ -192,11 +193,15 @@ def read(
     logs = _existing_logs(folder, game, run)
     numbers = _complete_shards(logs, shards)
     key = _key(logs, numbers, transitions, seed)
-    places = _places(logs.parent)
-    for place in places:
+    beside, cached = _places(logs.parent)
+    if (beside / key).is_dir():
+        return _load(beside / key)
+    place = beside
+    if not _is_writable(beside):
+        files.make_private(cached)  # what is there already was made by this user alone
+        place = cached
         if (place / key).is_dir():
             return _load(place / key)
-    place = next((place for place in places if _is_writable(place)), places[-1])
     with files.only_process_in(place, wait=True):
         if not (place / key).is_dir():  # another process may have made it meanwhile
             _convert(logs, _choose(logs, numbers, transitions, seed), game, place / key)
@@ -259,10 +264,9 @@ def _key(logs: Path, numbers: list[int], transitions: int, seed: int) -> str:
 
 
 def _places(run: Path) -> tuple[Path, Path]:
-    """Where conversions of a run may be: beside the data, or in a temporary folder."""
-    name = hashlib.sha256(str(run.resolve()).encode()).hexdigest()[:16]
-    user = getattr(os, "getuid", lambda: 0)()  # Windows has a temporary folder for each anyway
-    return run / "leapjax", Path(tempfile.gettempdir()) / f"leapjax-dqn-replay-{user}" / name
+    """Where conversions of a run may be: beside the data, or in this user's cache folder."""
+    name = hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16]
+    return run / "leapjax", files.cache_folder() / "dqn-replay" / name
 
 
 def _is_writable(place: Path) -> bool:
@@ -306,6 +310,12 @@ def _open(logs: Path, number: int, name: str) -> Iterator[_Array]:
             raise UserError(
                 f"{path} holds {found} of shape {shape}, expected {dtype} of shape [{expected}]: "
                 "it is not of DQN-Replay"
+            )
+        claimed, room = dtype.itemsize * math.prod(shape), _EXPANSION * path.stat().st_size
+        if claimed > room:
+            raise UserError(
+                f"{path} claims to hold {claimed} bytes, and has room for {room}: copy it again or "
+                "delete all parts of its shard"
             )
         yield _Array(path, file, dtype, row, shape[0])
 
@@ -385,7 +395,7 @@ def _choose(logs: Path, numbers: list[int], transitions: int, seed: int) -> _Cho
     Raises:
         UserError: there are none.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     left, waiting = list(numbers), dict[int, list[_Span]]()
     chosen, dropped, total = list[_Span](), Counter[str](), 0
     while left and total < transitions:
@@ -488,6 +498,8 @@ def _load(folder: Path) -> Collection:
     """Opens a conversion."""
     try:
         frames = np.load(folder / _FRAMES, mmap_mode="r", allow_pickle=False)
+        if max(files.read_sizes(folder / _STEPS).values()) > 2**16 + frames.nbytes:
+            raise ValueError("more steps than frames")
         with np.load(folder / _STEPS, allow_pickle=False) as stored:
             steps = dict(stored)
         lengths = steps["lengths"]

@@ -41,6 +41,10 @@ class BabyAIAdapter:
         self._instruction = vocabulary.encode(self.env.mission, self.level.words)
         return self.observe()
 
+    def close(self) -> None:
+        """Closes the environment; the state that it is in can still be looked at."""
+        self.env.close()
+
     @property
     def misled(self) -> bool:
         """Whether an episode ended in front of another match than the goal that was observed."""

@@ -13,6 +13,7 @@ from leapjax.babyai.levels import Level
 from leapjax.babyai.observations import Observation
 from leapjax.data import seeds
 from leapjax.domain import Collection
+from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
@@ -110,20 +111,20 @@ def collect(
     """
     if count < 1:
         raise UserError(f"at least one demonstration is needed, got {count}")
-    adapter = BabyAIAdapter(level)
     found: list[Demonstration] = []
     dropped = Counter({FAILED: 0, OTHER_GOAL: 0})
     level_seeds = seeds.training_seeds(seed)
-    while len(found) < count:
-        if dropped.total() > 100 + 10 * len(found):
-            raise UserError(
-                f"{dropped.total()} of {dropped.total() + len(found)} demonstrations of "
-                f"{level.name} were dropped: the bot cannot solve this level"
-            )
-        demonstration = demonstrate(adapter, next(level_seeds), dropped)
-        if demonstration is not None:
-            found.append(demonstration)
-            progress(len(found))
+    with closing(BabyAIAdapter(level)) as adapter:
+        while len(found) < count:
+            if dropped.total() > 100 + 10 * len(found):
+                raise UserError(
+                    f"{dropped.total()} of {dropped.total() + len(found)} demonstrations of "
+                    f"{level.name} were dropped: the bot cannot solve this level"
+                )
+            demonstration = demonstrate(adapter, next(level_seeds), dropped)
+            if demonstration is not None:
+                found.append(demonstration)
+                progress(len(found))
     return Collection(found, dropped)
 
 

@@ -1,5 +1,6 @@
 """BabyAI as a `Domain`: what a run needs of a level."""
 
+import contextlib
 import functools
 
 import flax.linen as nn
@@ -31,8 +32,9 @@ def make(name: str, options: Settings) -> Domain:
         UserError: an unknown level.
     """
     level = levels.find_level(name)
-    env = levels.make_environment(level)
-    side = max(env.width, env.height)
+    with contextlib.closing(levels.make_environment(level)) as env:
+        side = max(env.width, env.height)
+        longest, shortest = levels.longest_episode(level, env), levels.shortest_limit(env)
 
     def state_tokens(model: ModelConfig, context: int) -> nn.Module:
         del context
@@ -52,14 +54,14 @@ def make(name: str, options: Settings) -> Domain:
         make_adapter=lambda: BabyAIAdapter(level),
         collect=functools.partial(demonstrations.collect, level),
         actions=ACTIONS,
-        max_steps=levels.longest_episode(level, env),
+        max_steps=longest,
         blank=observations.blank(side, level.words),
         encoders={"paper": state_tokens, "leapjax": context_tokens},
         augmentations=augmentation.chosen(options),
         extras=augmentation.way,
         check=functools.partial(check, level=level),
         replay=functools.partial(replay.replay, level=level),
-        shortest_limit=levels.shortest_limit(env),
+        shortest_limit=shortest,
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
         paper_success=levels.paper_success(level.name),
     )

@@ -11,6 +11,7 @@ from leapjax.babyai.adapter import END, BabyAIAdapter
 from leapjax.babyai.levels import Level
 from leapjax.babyai.observations import Observation
 from leapjax.domain import Recording
+from leapjax.environments import closing
 from leapjax.types import Demonstration
 
 NO_SEED = "without the seed of their reset"
@@ -35,7 +36,14 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
         return DONE
     if not (recording.rewards > 0).any():
         return FAILED
-    adapter = BabyAIAdapter(level)
+    with closing(BabyAIAdapter(level)) as adapter:
+        return _replayed(recording, adapter, images, missions)
+
+
+def _replayed(
+    recording: Recording, adapter: BabyAIAdapter, images: np.ndarray, missions: np.ndarray
+) -> Demonstration | str:
+    """A recorded episode played again; or why it is no demonstration."""
     states = [adapter.reset(recording.seed)]
     same = _is(adapter, images[0], missions[0])
     success = terminated = truncated = False

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from leapjax.babyai.levels import Level, find_level
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_types, check_within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,11 +26,13 @@ class Settings:
     radius: int = 3  # how far around the agent its cells are read one by one
 
     def __post_init__(self) -> None:
-        check_at_least(self, 1, "channels", "sweeps")
-        check_at_least(self, 0, "rounds", "fields", "radius", "word_heads")
-        for name in ("clutter", "false_starts", "detours"):
-            if not 0 <= getattr(self, name) <= 1:  # false for NaN too
-                raise ValueError(f"{name} must be in 0 .. 1, got {getattr(self, name)}")
+        check_types(self)
+        check_at_least(self, 1, "channels", most=10_000)
+        check_at_least(self, 1, "sweeps", most=10_000)  # no way in any level is longer
+        check_at_least(self, 0, "rounds", most=200)  # each is compiled by itself
+        check_at_least(self, 0, "fields", "word_heads", most=1000)
+        check_at_least(self, 0, "radius", most=100)  # no level is larger
+        check_within(self, 0, 1, "clutter", "false_starts", "detours")
 
 
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place

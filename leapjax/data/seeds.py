@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
+from leapjax.checks import check_integer
 from leapjax.errors import UserError
 
 # Test levels come first, so that anyone's `--test-seed 1000` is a test episode. The first
@@ -20,13 +21,12 @@ def test_seeds(first: int, episodes: int) -> range:
     Raises:
         UserError: none, or seeds that training or validation may use.
     """
-    return _within(range(first, first + episodes), 0, VALIDATION_START, "test")
+    return _within(first, episodes, 0, VALIDATION_START, "test")
 
 
 def validation_seeds(first: int, episodes: int) -> range:
     """Level seeds on which choices are made."""
-    start = VALIDATION_START + first
-    return _within(range(start, start + episodes), VALIDATION_START, TRAINING_START, "validation")
+    return _within(first, episodes, VALIDATION_START, TRAINING_START, "validation")
 
 
 def training_seeds(seed: int) -> Iterator[int]:
@@ -35,8 +35,7 @@ def training_seeds(seed: int) -> Iterator[int]:
     Raises:
         UserError: a training seed out of range.
     """
-    if not 0 <= seed < MAX_TRAINING_SEED:
-        raise UserError(f"a training seed must be in 0 .. {MAX_TRAINING_SEED - 1}, got {seed}")
+    seed = check_integer("a training seed", seed, 0, MAX_TRAINING_SEED - 1)
     start = TRAINING_START + seed * TRAINING_STRIDE
     return itertools.islice(itertools.count(start), TRAINING_STRIDE)
 
@@ -55,12 +54,17 @@ def check_disjoint(demonstrations: list[int], episodes: range) -> None:
         )
 
 
-def _within(seeds: range, low: int, high: int, kind: str) -> range:
-    if len(seeds) < 1:
-        raise UserError(f"at least one {kind} episode is needed, got {len(seeds)}")
-    if seeds[0] < low or seeds[-1] >= high:
+def _within(first: int, episodes: int, low: int, high: int, kind: str) -> range:
+    """So many level seeds from `low + first` on.
+
+    Raises:
+        UserError: not integers, none, or seeds that reach `high`.
+    """
+    episodes = check_integer(f"the number of {kind} episodes", episodes, 1)
+    first = check_integer(f"the first {kind} seed", first, 0, high - low - 1)
+    if first + episodes > high - low:
         raise UserError(
-            f"{kind} seeds {seeds[0] - low} .. {seeds[-1] - low} leave their range "
+            f"{kind} seeds {first} .. {first + episodes - 1} leave their range "
             f"0 .. {high - low - 1}; the seeds beyond it belong to other episodes"
         )
-    return seeds
+    return range(low + first, low + first + episodes)

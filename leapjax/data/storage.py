@@ -4,7 +4,8 @@ A data set of the user's own, of the same observations, is read in the same way.
 are a dictionary by field, or one array where they are an array.
 """
 
-import functools
+import contextlib
+import io
 import json
 import math
 import os
@@ -12,9 +13,9 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import h5py
@@ -23,15 +24,22 @@ import minari
 import numpy as np
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.episode_data import EpisodeData
-from minari.dataset.minari_storage import MinariStorage
+from minari.dataset.minari_storage import MinariStorage, is_image_space
+from minari.serialization import deserialize_space
 from minari.storage.datasets_root_dir import get_dataset_path
+from PIL import Image
 
 from leapjax import files
-from leapjax.domain import Collection, Domain, Recording, Source
+from leapjax.checks import MOST, check_fits, check_integer
+from leapjax.domain import Collection, Described, Domain, Recording, Source
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
+DEEPEST = 16  # groups in groups
+SLAB = 2**28  # bytes that are read at once where sizes are not known yet
+SPACES = ("observation_space", "action_space")  # in the metadata
+STEPWISE = ("actions", "rewards", "terminations", "truncations")  # arrays of an episode
 SCRATCH, LOCK = ".leapjax-unfinished-", ".leapjax-lock"  # hidden: Minari passes them over
 BEFORE = "before"  # where in such a folder what a new data set replaces is kept
 ARRAY_ROOM = 2**12  # bytes that HDF5 takes for an array, beside what it holds
@@ -85,9 +93,11 @@ def no_demonstrator(domain: Domain) -> str:
 def observation_space(blank: PyTree) -> gym.Space:
     """The Minari space of observations like `blank`: of their shapes and types."""
     if isinstance(blank, np.ndarray):
-        whole = np.issubdtype(blank.dtype, np.integer)
-        limits = np.iinfo(blank.dtype) if whole else None
-        low, high = (limits.min, limits.max) if limits else (-np.inf, np.inf)
+        low, high = -np.inf, np.inf
+        if blank.dtype == bool:
+            low, high = 0, 1
+        elif np.issubdtype(blank.dtype, np.integer):
+            low, high = np.iinfo(blank.dtype).min, np.iinfo(blank.dtype).max
         return gym.spaces.Box(low, high, blank.shape, blank.dtype.type)
     return gym.spaces.Dict({name: observation_space(x) for name, x in _fields(blank).items()})
 
@@ -247,14 +257,24 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
             f"the data set {name!r} is of an earlier version, which kept no rewards: without "
             "--demonstrations it is made anew"
         )
+    folder = get_dataset_path(name) / "data"
+    with _reading(name):
+        outlines = _inspect(folder)
     _check_arguments(name, domain)
+    with _reading(name):
+        recorded = described(name)._replace(spaces=_read_spaces(folder, domain))
+        domain.check_recorded(recorded, f"the Minari data set {name!r}")
+    for index, outline in enumerate(outlines):
+        _check_outline(outline, domain, _name_episode(index, name))
+    with _reading(name):
+        _check_total(folder, outlines)
+    _check_memory(name, outlines[:most], domain)
     found: list[Demonstration] = []
     dropped: Counter[str] = Counter()
     for episode, seed in _episodes(name):
         if most is not None and len(found) >= most:
             break
-        where = f"episode {episode.id} of the Minari data set {name!r}"
-        result = _demonstration(episode, seed, domain, where)
+        result = _demonstration(episode, seed, domain, _name_episode(episode.id, name))
         if isinstance(result, str):
             dropped[result] += 1
         else:
@@ -264,6 +284,10 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         only = f" that can be used, only {reasons(collection)}" if dropped else ""
         raise UserError(f"the Minari data set {name!r} has no episodes{only}")
     return collection
+
+
+def _name_episode(episode: int, name: str) -> str:
+    return f"episode {episode} of the Minari data set {name!r}"
 
 
 def _version(name: str) -> int | None:
@@ -298,23 +322,42 @@ def reasons(collection: Collection) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in collection.dropped.items())
 
 
-def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
-    """The episodes of a data set, one by one, and the seeds of their resets.
-
-    Raises:
-        UserError: it is damaged.
-    """
+@contextlib.contextmanager
+def _reading(name: str) -> Iterator[None]:
+    """Says in one line that a data set is damaged, whatever h5py and Minari raise."""
     try:
-        _inspect(get_dataset_path(name) / "data")
-        dataset = minari.load_dataset(name)
-        metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
-        for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
-            yield episode, int(details.get("seed", UNKNOWN_SEED))
-    except Exception as error:  # noqa: BLE001  (h5py and Minari raise many kinds)
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # noqa: BLE001
         again = "delete it and it is made again, or " if _version(name) is not None else ""
         raise UserError(
             f"the Minari data set {name!r} cannot be read ({first_line(error)}): {again}restore it"
         ) from None
+
+
+def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
+    """The episodes of an inspected data set, one by one, and the seeds of their resets.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    with _reading(name):
+        dataset = minari.load_dataset(name)
+        metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+        for episode, details in zip(dataset.iterate_episodes(), metadata, strict=True):
+            yield episode, _seed(details.get("seed"))
+
+
+def _seed(value: Any) -> int:
+    """The seed of a reset as a data set holds it: of 64 bits, which is all that it can hold.
+
+    Anything else is unknown, so that a demonstration can always be stored again.
+    """
+    try:
+        return check_integer("the seed of an episode", value, 0, 2**64 - 1)
+    except UserError:
+        return UNKNOWN_SEED
 
 
 def _demonstration(
@@ -322,9 +365,14 @@ def _demonstration(
 ) -> Demonstration | str:
     """An episode as it was stored, or played again; or why it cannot be used."""
     actions = _actions(episode.actions, where)
-    rewards = _rewards(episode.rewards, where, len(actions))
+    rewards = _rewards(episode.rewards, where)
+    terminated, truncated = (
+        _read_mark(getattr(episode, marks), f"{where}: {marks}") for marks in STEPWISE[2:]
+    )
     if domain.replay is not None:
-        again = domain.replay(Recording(episode.observations, actions, rewards, seed))
+        again = domain.replay(
+            Recording(episode.observations, actions.astype(np.int64), rewards, seed)
+        )
         if again is not None:
             return again
     last = domain.num_actions - 2
@@ -335,23 +383,19 @@ def _demonstration(
     observations = _like(domain.blank, episode.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
     domain.check(observations, where)
-    narrow = functools.partial(_narrowed, where=where)
+
+    def narrowed(path: Any, values: np.ndarray, like: np.ndarray) -> np.ndarray:
+        name = jax.tree_util.keystr(path, simple=True) or "observations"
+        return check_fits(f"{where}: {name}", values, like.dtype)
+
     return Demonstration(
-        jax.tree.map(narrow, domain.blank, observations),
+        jax.tree.map_with_path(narrowed, observations, domain.blank),
         actions.astype(np.int32),
         rewards,
-        bool(np.asarray(episode.terminations).reshape(-1)[-1:].any()),
-        bool(np.asarray(episode.truncations).reshape(-1)[-1:].any()),
+        terminated,
+        truncated,
         seed,
     )
-
-
-class Described(NamedTuple):
-    """What a data set says of itself; what is wrong with that is said when it is loaded."""
-
-    level: str | None = None  # the id of the environment that it was recorded in
-    episodes: int | None = None
-    arguments: Mapping[str, Any] | None = None  # of that environment
 
 
 def described(name: str) -> Described:
@@ -362,40 +406,77 @@ def described(name: str) -> Described:
         count = metadata.get("total_episodes")
     except (OSError, ValueError, AttributeError, RecursionError):
         return Described()
-    count = count if isinstance(count, int) and count > 0 else None
+    known = Described(episodes=count if isinstance(count, int) and count > 0 else None)
     try:
         spec = json.loads(metadata["env_spec"])
-        level, arguments = spec["id"], spec.get("kwargs")
+        level, arguments, most = spec["id"], spec.get("kwargs"), spec.get("max_episode_steps")
+        wrappers = spec.get("additional_wrappers")
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return Described(episodes=count)
-    arguments = arguments if isinstance(arguments, dict) else None
-    return Described(level if isinstance(level, str) else None, count, arguments)
+        return known
+    listed = isinstance(wrappers, list) and all(isinstance(each, dict) for each in wrappers)
+    return known._replace(
+        level=level if isinstance(level, str) else None,
+        arguments=arguments if isinstance(arguments, dict) else None,
+        wrappers=wrappers if listed else None,
+        max_steps=most if isinstance(most, int) else None,
+    )
 
 
-def _inspect(folder: Path) -> None:
-    """Refuses what must not even be opened by Minari and HDF5.
+def _read_spaces(folder: Path, domain: Domain) -> dict[str, gym.Space]:
+    """The spaces of inspected data, but for one that `save` has made of shapes and types."""
+    metadata = _read_metadata(folder)
+    found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
+    if found["observation"] == observation_space(domain.blank):
+        del found["observation"]
+    return found
+
+
+def _inspect(folder: Path) -> list[PyTree]:
+    """Refuses what must not even be opened by Minari and HDF5; reads no array.
 
     Without its spaces Minari makes the environment that the data names, which runs code of
     the data's choice. Sizes that are only claimed, and files elsewhere that are linked to,
     would be read.
 
+    Returns:
+        An outline of each episode: see `_outline`.
+
     Raises:
         ValueError: says what.
     """
-    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
-    if not isinstance(metadata, dict):
-        raise ValueError("metadata.json is not a JSON object")
+    metadata = _read_metadata(folder)
     if metadata.get("data_format") != "hdf5":
         raise ValueError(f"its format is {metadata.get('data_format')!r}, expected 'hdf5'")
-    for name in ("observation_space", "action_space"):
+    for name in SPACES:
         if not isinstance(metadata.get(name), str):
             raise ValueError(f"metadata.json has no {name}")
         _check_sizes(json.loads(metadata[name]))
-    with h5py.File(folder / "main_data.hdf5") as file:
+    spaces = [deserialize_space(metadata[name]) for name in SPACES]
+    jpeg = bool(metadata.get("jpeg_encoding", True))  # as Minari reads it
+    path = folder / "main_data.hdf5"
+    with h5py.File(path) as file:
         total = metadata.get("total_episodes")
-        if not isinstance(total, int) or not 0 <= total <= len(file):
+        if not isinstance(total, int) or total != len(file):
             raise ValueError(f"{total} episodes are announced, {len(file)} are there")
-        _check_group(file)
+        outlines = _outline(file, path.stat().st_size)
+        names = [f"episode_{index}" for index in range(total)]
+        missing = [name for name in names if not isinstance(outlines.get(name), dict)]
+        if missing:
+            raise ValueError(f"{missing[0]} is not there")
+        episodes = [outlines[name] for name in names]
+        for index, outline in enumerate(episodes) if jpeg else ():
+            for part, space in zip(("observations", "actions"), spaces, strict=True):
+                if part in outline:
+                    stored = file[names[index]][part]
+                    outline[part] = _with_frames(outline[part], stored, space)
+    return episodes
+
+
+def _read_metadata(folder: Path) -> dict[str, Any]:
+    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+    if not isinstance(metadata, dict):
+        raise ValueError("metadata.json is not a JSON object")
+    return metadata
 
 
 def _check_sizes(space: Any) -> None:
@@ -413,44 +494,186 @@ def _check_sizes(space: Any) -> None:
             _check_sizes(part)
 
 
-def _check_group(group: h5py.Group) -> None:
-    for name in group:
-        link = group.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{name} is a link to somewhere else")
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            _check_group(item)
-            continue
-        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
-            raise ValueError(f"{name} is not an array of this file")
-        # gzip makes at most 1 byte of 1032.
-        if item.nbytes > 1032 * item.id.get_storage_size() + 1024:
-            raise ValueError(f"{name} claims {item.nbytes} bytes, which are not there")
+def _outline(file: h5py.File, file_size: int) -> dict[str, Any]:
+    """Says which arrays a file holds, without reading them.
+
+    Its objects have to be a tree, as Minari writes it: where an object has two names, whoever
+    follows all names may never come to an end.
+
+    Returns:
+        A dictionary by name; for each group one like it, and for each array one of its shape and
+        type that takes no memory.
+
+    Raises:
+        ValueError: links, an object of two names, groups too deep, arrays that are not in the file.
+    """
+    outline: dict[str, Any] = {}
+    known = {_identity(file)}
+    groups: list[tuple[h5py.Group, dict[str, Any], int]] = [(file, outline, 0)]
+    while groups:
+        group, found, depth = groups.pop()
+        if depth > DEEPEST:
+            raise ValueError(f"{group.name[:60]} is a group in {depth} groups")
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"{name} is a link to somewhere else")
+            item = group[name]
+            identity = _identity(item)
+            if identity in known:
+                raise ValueError(f"{name} is an object that has another name too")
+            known.add(identity)
+            if isinstance(item, h5py.Group):
+                found[name] = {}
+                groups.append((item, found[name], depth + 1))
+                continue
+            if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual:
+                raise ValueError(f"{name} is not an array of this file")
+            array = found[name] = np.broadcast_to(np.zeros((), item.dtype), item.shape)
+            # gzip makes at most 1 byte of 1032.
+            if array.nbytes > 1032 * item.id.get_storage_size() + 1024:
+                raise ValueError(f"{name} claims {array.nbytes} bytes, which are not there")
+            if array.dtype.hasobject:
+                _check_varying(item, name, file_size)
+    return outline
+
+
+def _identity(item: Any) -> tuple[int, int]:
+    """Tells the objects of HDF5 files apart, whatever names lead to them."""
+    info = h5py.h5o.get_info(item.id)
+    return info.fileno, info.addr
+
+
+def _check_varying(array: h5py.Dataset, name: str, file_size: int) -> None:
+    """Refuses elements of varying length that are longer together than the file they are in."""
+    total, at_once = 0, max(16, SLAB // file_size)
+    for start in range(0, array.shape[0] if array.shape else 0, at_once):
+        total += sum(len(each) for each in np.ravel(array[start : start + at_once]))
+        if total > file_size:
+            raise ValueError(f"{name} claims {total} bytes, which are not there")
+
+
+def _with_frames(outline: Any, stored: Any, space: gym.Space) -> Any:
+    """The outline of what Minari makes of stored arrays, some of which are JPEG frames.
+
+    Raises:
+        ValueError: a frame of another size than the space says.
+    """
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) and isinstance(outline, dict):
+        parts = (
+            dict(space.spaces)
+            if isinstance(space, gym.spaces.Dict)
+            else {f"_index_{index}": part for index, part in enumerate(space.spaces)}
+        )
+        return {
+            name: _with_frames(part, stored[name], parts[name]) if name in parts else part
+            for name, part in outline.items()
+        }
+    if not is_image_space(space) or isinstance(outline, dict):
+        return outline
+    assert space.shape is not None  # of an image
+    largest = 2 * math.prod(space.shape) + 4096  # bytes, of a frame in a file
+    for start in range(0, len(stored), at_once := max(1, SLAB // largest)):
+        for frame in stored[start : start + at_once]:
+            with Image.open(io.BytesIO(frame)) as image:  # reads the header
+                shape = (image.height, image.width, len(image.getbands()))
+            if shape[: len(space.shape)] != space.shape or len(frame) > largest:
+                raise ValueError(
+                    f"a frame of shape {shape} in {len(frame)} bytes, its space is {space.shape}"
+                )
+    return np.broadcast_to(np.zeros((), np.uint8), (len(stored), *space.shape))
+
+
+def _check_outline(outline: PyTree, domain: Domain, where: str) -> None:
+    """Refuses an episode by the shapes and types of its arrays, before they are read.
+
+    Raises:
+        UserError: arrays are missing, or their lengths contradict each other or the domain.
+    """
+    for part in ("observations", *STEPWISE):
+        if part not in outline:
+            raise UserError(f"{where} has no {part}")
+    steps = _numbers(np.zeros((), np.int64), outline["actions"], f"{where}: actions").shape
+    if len(steps) != 1:
+        raise UserError(f"{where}: actions have shape {steps}, expected one per step")
+    if steps == (0,):
+        raise UserError(f"{where} has no actions")
+    for part in STEPWISE[1:]:
+        if np.shape(outline[part]) != steps:
+            raise UserError(
+                f"{where}: {part} have shape {np.shape(outline[part])}, expected {steps}"
+            )
+    stored = outline["observations"]
+    # Others may be played again.
+    if domain.replay is None or _holds_fields(domain.blank, stored):
+        observations = _like(domain.blank, stored, where)
+        _check_shapes(observations, domain, steps[0] + 1, where)
+
+
+def _holds_fields(blank: PyTree, stored: Any) -> bool:
+    dictionaries = isinstance(stored, dict) and not isinstance(blank, np.ndarray)
+    return dictionaries and set(_fields(blank)) <= set(stored)
+
+
+def _check_total(folder: Path, outlines: Sequence[PyTree]) -> None:
+    """Refuses data whose episodes are not as long together as they say.
+
+    Raises:
+        ValueError: says how long they are.
+    """
+    steps = sum(len(outline["actions"]) for outline in outlines)
+    announced = _read_metadata(folder).get("total_steps")
+    if announced != steps:
+        raise ValueError(f"{announced} steps are announced, {steps} are there")
+
+
+def _check_memory(name: str, outlines: Sequence[PyTree], domain: Domain) -> None:
+    """Refuses, before anything is unpacked, what does not fit into memory.
+
+    Raises:
+        UserError: says how much would be needed.
+    """
+    state = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
+    kept = sum((len(outline["actions"]) + 1) * (state + 8) for outline in outlines)
+    read = [sum(leaf.nbytes for leaf in jax.tree.leaves(outline)) for outline in outlines]
+    # While an episode is checked, it is in memory twice.
+    files.check_memory(kept + 2 * max(read, default=0), f"the Minari data set {name!r}")
 
 
 def _actions(values: Any, where: str) -> np.ndarray:
+    """The actions of an episode `[n]`, n > 0, in the type that they are stored in."""
     actions = _numbers(np.zeros((), np.int64), values, f"{where}: actions")
-    if actions.ndim != 1:
-        raise UserError(f"{where}: actions have shape {actions.shape}, expected one per step")
-    if len(actions) == 0:
-        raise UserError(f"{where} has no actions")
-    if actions.min() < 0:
+    if actions.min() < 0 or actions.max() > MOST:
         raise UserError(
             f"{where}: actions run from {actions.min()} to {actions.max()}, expected 0 or more"
         )
     return actions
 
 
-def _rewards(values: Any, where: str, steps: int) -> np.ndarray:
+def _rewards(values: Any, where: str) -> np.ndarray:
     rewards = _numbers(np.zeros((), np.float32), values, f"{where}: rewards")
-    if rewards.shape != (steps,):
-        raise UserError(f"{where}: rewards have shape {rewards.shape}, expected ({steps},)")
-    return _narrowed(np.zeros((), np.float32), rewards, f"{where}: rewards")
+    return check_fits(f"{where}: rewards", rewards, np.dtype(np.float32))
+
+
+def _read_mark(marks: Any, what: str) -> bool:
+    """How an episode ended, from a mark `[n]` for each of its steps.
+
+    Raises:
+        UserError: marks that are neither true nor false, or an end before the last step.
+    """
+    values = np.asarray(marks)
+    if values.dtype.kind not in "biuf" or not np.isin(values, (0, 1)).all():
+        raise UserError(f"{what} must be true or false")
+    if values[:-1].any():
+        step = int(np.argmax(values != 0))
+        raise UserError(
+            f"{what} say that the episode ended with step {step}, and it goes on to step "
+            f"{len(values) - 1}: split it there"
+        )
+    return bool(values[-1])
 
 
 def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") -> PyTree:
-    """What was stored, in the structure of `blank`, in types wide enough for every check."""
+    """What was stored, in the structure of `blank`, in the types that it is stored in."""
     if isinstance(blank, np.ndarray):
         return _numbers(blank, stored, f"{where}: {name}")
     parts = _fields(blank)
@@ -473,10 +696,10 @@ def _numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
     if np.issubdtype(blank.dtype, np.integer):
         if not np.issubdtype(array.dtype, np.integer):
             raise UserError(f"{what} must be integers, got {array.dtype}")
-        return array.astype(np.int64)  # wide enough for what the range check must still see
+        return array
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise UserError(f"{what} must be numbers, got {array.dtype}")
-    return array.astype(np.float64)
+    return array
 
 
 def _check_shapes(observations: PyTree, domain: Domain, states: int, where: str) -> None:
@@ -488,16 +711,6 @@ def _check_shapes(observations: PyTree, domain: Domain, states: int, where: str)
                 f"{where}: {name} has shape {array.shape}, level {domain.level} needs "
                 f"{(states, *blank.shape)}"
             )
-
-
-def _narrowed(blank: np.ndarray, array: np.ndarray, where: str) -> np.ndarray:
-    """An array in the type of `blank`, if it fits."""
-    with np.errstate(over="ignore"):
-        narrow = array.astype(blank.dtype)
-    exact = not np.issubdtype(blank.dtype, np.floating)
-    if not (np.array_equal(narrow, array) if exact else np.isfinite(narrow).all()):
-        raise UserError(f"{where}: numbers that do not fit {blank.dtype}, or are not finite")
-    return narrow
 
 
 def exists(name: str) -> bool:

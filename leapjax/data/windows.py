@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token
+from leapjax.types import Array, Context, Demonstration, PyTree, Window, pad_token, to_plain_dicts
 
 ALIGNMENT = 64  # bytes
 SAMPLINGS = ("episode", "step", "start")
@@ -77,7 +77,7 @@ def concatenate(
         return jax.tree.map(lambda *leaves: _joined(leaves, padded), *parts)
 
     return Steps(
-        observations=join(*(d.observations for d in demonstrations)),
+        observations=join(*(to_plain_dicts(d.observations) for d in demonstrations)),
         state=join(np.arange(len(step), dtype=np.int32) + episode),
         actions=join(actions),
         rewards=join(*rewards),

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from leapjax.checks import check_at_least
+from leapjax.checks import check_at_least, check_types
 from leapjax.errors import UserError
 from leapjax.models.dropout import Dropout
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
@@ -22,6 +22,7 @@ from leapjax.types import Context, PyTree
 ARCHITECTURES = ("paper", "leapjax")
 ATTENTIONS = ("full", "causal")
 DTYPES = ("float32", "bfloat16")
+MOST_LAYERS = 200  # each is compiled by itself, which takes about a second
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +39,7 @@ class ModelConfig:
     neighbours: bool = False  # LEAP's token of an action also holds the actions beside it
 
     def __post_init__(self) -> None:
+        check_types(self)
         if self.architecture not in ARCHITECTURES:
             raise ValueError(
                 f"unknown architecture {self.architecture!r}: "
@@ -47,7 +49,8 @@ class ModelConfig:
             raise ValueError(
                 f"unknown attention {self.attention!r}: expected one of {', '.join(ATTENTIONS)}"
             )
-        check_at_least(self, 1, "layers", "heads", "width")
+        check_at_least(self, 1, "layers", most=MOST_LAYERS)
+        check_at_least(self, 1, "heads", "width")
         if self.neighbours and (self.architecture, self.attention) != ("leapjax", "full"):
             raise ValueError(
                 "neighbours needs architecture 'leapjax', where actions stand side by side, and "

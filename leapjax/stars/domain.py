@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.typing import Dtype
 
+from leapjax.checks import check_types
 from leapjax.domain import Augmentation, Domain, DomainType
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
@@ -28,6 +29,9 @@ class Settings:
 
     augment: bool = True  # draw names and the order of edges anew: every window is a new graph
     fewer_arms: bool = False  # with augment: leave out some arms, a random number of them
+
+    def __post_init__(self) -> None:
+        check_types(self)
 
 
 class GraphTokens(nn.Module):

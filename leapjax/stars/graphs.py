@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.checks import check_seed
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Collection, level_numbers
 from leapjax.environments import Transition
@@ -63,7 +64,7 @@ def find_level(name: str) -> Star:
 
 def draw(star: Star, seed: int) -> tuple[Graph, np.ndarray]:
     """The graph of a seed, and the nodes `[length]` that lead to its goal."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     names = rng.permutation(star.labels)[: star.nodes].astype(np.int32)
     arms = names[1:].reshape(star.arms, star.length)
     ways = np.concatenate([np.full((star.arms, 1), names[0]), arms], axis=1)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.checks import check_seed
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Collection, level_numbers
 from leapjax.environments import Transition
@@ -127,14 +128,15 @@ def solutions(
     return found
 
 
-@functools.lru_cache(maxsize=10_000)  # every way to search is measured on the same boards
+# Every way to search is measured on the same boards. By type, as 5.0 is not the seed 5.
+@functools.lru_cache(maxsize=10_000, typed=True)
 def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`.
 
     Neither may be changed. Cells of a random solution are emptied in random order, as long as the
     rest have one solution; where no more can be, another is begun.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     while True:
         (solution,) = solutions(np.zeros(size.cells, np.int32), 1, rng)
         clues, order = solution.copy(), rng.permutation(size.cells).tolist()

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.checks import check_types
 from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
 from leapjax.models.transformer import embed
@@ -24,6 +25,9 @@ class Settings:
     """Sudoku: augmentation."""
 
     augment: bool = True  # every window becomes one of another board, by what keeps the rules
+
+    def __post_init__(self) -> None:
+        check_types(self)
 
 
 class BoardTokens(nn.Module):

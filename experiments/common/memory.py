@@ -1,0 +1,58 @@
+"""What a run needs of memory, judged before it begins: a machine without any left kills it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from leapjax.files import check_memory
+from leapjax.types import PyTree, TrainState
+
+
+def check(needs: Mapping[str, int]) -> None:
+    """Refuses what needs more memory than the machine has.
+
+    Args:
+        needs: bytes, by the options that ask for them.
+
+    Raises:
+        UserError: names the options.
+    """
+    for options, needed in needs.items():
+        check_memory(needed, options)
+
+
+def check_state(state: TrainState) -> None:
+    """Refuses a network that is too large to be trained here.
+
+    Args:
+        state: shapes of all that training changes. Gradients are as large as the parameters.
+
+    Raises:
+        UserError: says how large it is.
+    """
+    sizes = "--width, --layers, and sizes of the method and the domain"
+    check({sizes: _bytes(state) + _bytes(state.params)})
+
+
+def check_program(program: Any) -> None:
+    """Refuses a step of training whose program, as it was compiled, does not fit.
+
+    Args:
+        program: compiled for the devices of this machine.
+
+    Raises:
+        UserError: says how much it needs.
+    """
+    found = program.memory_analysis()
+    if found is None or jax.default_backend() != "cpu":  # GPUs have memory of their own
+        return
+    device = found.temp_size_in_bytes + found.argument_size_in_bytes
+    options = "--batch (or a smaller --microbatch), --context and the sizes of the network"
+    check({options: device * jax.local_device_count()})
+
+
+def _bytes(tree: PyTree) -> int:
+    leaves = jax.tree.leaves(tree)
+    return sum(int(np.prod(leaf.shape, dtype=object)) * leaf.dtype.itemsize for leaf in leaves)

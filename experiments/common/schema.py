@@ -1,0 +1,147 @@
+"""Which JSON values can be used: a schema, and what is wrong with a value.
+
+A schema is a type, one of the classes below, or a dictionary: an object with at least these
+fields. `int` and `float` are finite numbers, a float may be written as an integer.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+LARGEST = 1e18  # of numbers that a run could give
+
+
+class Number(NamedTuple):
+    """A number between two bounds, which it may reach."""
+
+    least: float = -LARGEST
+    most: float = LARGEST
+    whole: bool = False
+
+
+class OneOf(NamedTuple):
+    """One of some texts."""
+
+    texts: Sequence[str]
+
+
+class Each(NamedTuple):
+    """An array whose elements have one schema."""
+
+    schema: Any
+    least: int = 0  # elements
+
+
+class Named(NamedTuple):
+    """An object whose values have one schema, whatever their names."""
+
+    schema: Any
+    least: int = 0  # values
+
+
+class Absent(NamedTuple):
+    """A field that may be missing."""
+
+    schema: Any
+
+
+class Nullable(NamedTuple):
+    """A value that may be null."""
+
+    schema: Any
+
+
+Schema = Any
+COUNT = Number(0, whole=True)
+SEVERAL = Number(1, whole=True)
+AMOUNT = Number(0)
+POSITIVE = Number(1e-12)
+KINDS = {str: "str", bool: "bool", dict: "object", list: "array"}
+
+
+def loads(text: str) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: it is not JSON, or an object names a field twice.
+        RecursionError: it is nested too deeply.
+    """
+    return json.loads(text, object_pairs_hook=_object)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"an object names {twice!r} twice")
+    return found
+
+
+def problem(value: Any, schema: Schema, name: str = "") -> str | None:
+    """What is wrong with a value, with the path of the field; None if nothing is.
+
+    Args:
+        value: parsed JSON.
+        schema: what it must be.
+        name: path of the value from the outermost one.
+    """
+    if isinstance(schema, Absent):
+        schema = schema.schema
+    if isinstance(schema, Nullable):
+        return None if value is None else problem(value, schema.schema, name)
+    if schema in (int, float):
+        schema = Number(whole=schema is int)
+    if isinstance(schema, Number):
+        return _problem_of_number(value, schema, name)
+    if isinstance(schema, OneOf):
+        if value in schema.texts:
+            return None
+        return f"{name} is {_shown(value)}, expected one of {', '.join(schema.texts)}"
+    if isinstance(schema, dict):
+        return _wrong_type(value, dict, name) or _problem_of_fields(value, schema, name)
+    if isinstance(schema, Each | Named):
+        kind = list if isinstance(schema, Each) else dict
+        if wrong := _wrong_type(value, kind, name):
+            return wrong
+        if len(value) < schema.least:
+            return f"{name or 'the value'} is empty".strip()
+        parts = enumerate(value) if isinstance(schema, Each) else value.items()
+        found = (problem(part, schema.schema, f"{name}[{key!r}]") for key, part in parts)
+        return next((each for each in found if each), None)
+    return _wrong_type(value, schema, name)
+
+
+def _problem_of_fields(value: dict[str, Any], fields: dict[str, Schema], name: str) -> str | None:
+    missing = [
+        each for each, of in fields.items() if each not in value and not isinstance(of, Absent)
+    ]
+    if missing:
+        return f"{name or 'a row'} without {', '.join(missing)}"
+    path = f"{name}." if name else ""
+    found = (problem(value[each], of, path + each) for each, of in fields.items() if each in value)
+    return next((each for each in found if each), None)
+
+
+def _problem_of_number(value: Any, number: Number, name: str) -> str | None:
+    kind = int if number.whole else float
+    if isinstance(value, bool) or not isinstance(value, int if number.whole else int | float):
+        return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
+    if not -LARGEST < value < LARGEST:  # NaN too
+        return f"{name} is {_shown(value)}: no number that a run could give"
+    if not number.least <= value <= number.most:
+        most = "" if number.most == LARGEST else f" and at most {number.most}"
+        return f"{name} is {_shown(value)}, expected at least {number.least}{most}"
+    return None
+
+
+def _wrong_type(value: Any, kind: type, name: str) -> str | None:
+    if isinstance(value, kind):
+        return None
+    if not name:
+        return f"expected a JSON {KINDS[kind]}, got {type(value).__name__}"
+    return f"{name} is a {type(value).__name__}, expected {KINDS[kind]}"
+
+
+def _shown(value: Any) -> str:
+    return str(value)[:20]

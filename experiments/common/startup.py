@@ -1,0 +1,67 @@
+"""What a program does before it imports JAX: signals, output, JAX's own settings.
+
+Imports only the standard library: importing JAX takes seconds.
+"""
+
+import contextlib
+import io
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+from experiments.common.interruption import SIGNALS, Interrupted
+
+COMMAND = "leapjax"  # the installed script
+
+
+def is_program() -> bool:
+    """Whether the interpreter is about to run a module of this package as a program.
+
+    While `python -m` looks for a module, and imports the packages that hold it, its name for the
+    program is "-m".
+    """
+    program = next(iter(getattr(sys, "argv", ())), "")
+    return program == "-m" or Path(program).stem == COMMAND
+
+
+def prepare() -> None:
+    """Lets signals end the program at once, makes every text printable, and imports JAX.
+
+    Exits with 2, and one line, if JAX cannot be imported: it reads its settings then.
+    """
+    for number in SIGNALS:
+        signal.signal(number, end)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    try:
+        import jax  # noqa: F401, PLC0415
+    except Exception as error:  # noqa: BLE001  (each setting raises its own)
+        message = f"error: cannot import JAX{settings_of_jax()}: {error or type(error).__name__}"
+        print(" ".join(message.split()), file=sys.stderr)
+        sys.exit(2)
+
+
+def end(number: int, _: FrameType | None = None) -> None:
+    """The signal handler until `interruptible` has its own.
+
+    It raises nothing: an import, or a callback of the interpreter, may drop what is raised.
+    """
+    stopped = Interrupted(number)
+    with contextlib.suppress(Exception):  # what is being printed cannot be flushed
+        sys.stdout.flush()
+    with contextlib.suppress(OSError):  # nobody reads it any more
+        os.write(2, f"stopped by {stopped}\n".encode())
+    os._exit(stopped.exit_code)
+
+
+def settings_of_jax() -> str:
+    """The settings of JAX and XLA in the environment, for a message; empty if there are none."""
+    given = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if _is_setting(name)]
+    return f" with {', '.join(given)}" if given else ""
+
+
+def _is_setting(name: str) -> bool:
+    return name.startswith("JAX_") or name == "XLA_FLAGS"

@@ -1,0 +1,138 @@
+"""Whether a data set was recorded in the environment that is played."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from leapjax.domain import Described
+from leapjax.errors import UserError
+
+UNBOUNDED = 2.0**31 - 1  # larger bounds only say that there are none, each version another
+# Wrappers of Gymnasium that change neither observations, nor rewards, nor what actions do.
+WATCHING = frozenset(
+    {
+        "AddWhiteNoise", "HumanRendering", "ObstructView", "OrderEnforcing", "PassiveEnvChecker",
+        "RecordEpisodeStatistics", "RecordVideo", "RenderCollection", "TimeLimit",
+    }
+)  # fmt: skip
+
+
+def describe_environment(env: gym.Env) -> Described:
+    """Says of an environment what data sets say of the one that they were recorded in."""
+    spaces = {"observation": env.observation_space, "action": env.action_space}
+    if env.spec is None:
+        return Described(spaces=spaces)
+    return Described(
+        level=env.spec.id,
+        wrappers=[
+            {"name": each.name, "entry_point": each.entry_point, "kwargs": _as_json(each.kwargs)}
+            for each in env.spec.additional_wrappers
+        ],
+        max_steps=env.spec.max_episode_steps,
+        spaces=spaces,
+    )
+
+
+def check_recorded(recorded: Described, where: str, played: Described) -> None:
+    """Refuses data of another environment than the one that is played.
+
+    Wrappers are not rebuilt: data would then choose which code is imported.
+
+    Args:
+        recorded: what the data say of their environment.
+        where: they are from.
+        played: the environment; `max_steps` is None where the user has chosen it.
+
+    Raises:
+        UserError: names the wrappers, the limit of steps or the space that differs.
+    """
+    level = played.level
+    if recorded.wrappers is not None and played.wrappers is not None:
+        theirs, ours = _select_changing(recorded.wrappers), _select_changing(played.wrappers)
+        if theirs != ours:
+            raise UserError(
+                f"{where} was recorded with {_list_wrappers(theirs)}, and {level} is played with "
+                f"{_list_wrappers(ours)}: write a module that registers {level} with the wrappers "
+                f"of the data (gymnasium.register, additional_wrappers), and play MODULE:{level}"
+            )
+    if None not in (recorded.max_steps, played.max_steps) and (
+        recorded.max_steps != played.max_steps
+    ):
+        raise UserError(
+            f"{where} was recorded with episodes of at most {recorded.max_steps} steps, and "
+            f"{level} ends them after {played.max_steps}: choose one as max_steps"
+        )
+    for part, space in played.spaces.items():
+        if part in recorded.spaces:
+            _check_space(recorded.spaces[part], space, part, where, level)
+
+
+def _select_changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
+    """Name and arguments of each wrapper that changes what is observed, rewarded or done."""
+    return [
+        (each.get("name"), each.get("kwargs"))
+        for each in wrappers
+        if not (
+            str(each.get("entry_point")).startswith("gymnasium.wrappers")
+            and each.get("name") in WATCHING
+        )
+    ]
+
+
+def _list_wrappers(wrappers: Sequence[tuple[Any, Any]]) -> str:
+    names = [f"{name} {json.dumps(kwargs)}" if kwargs else str(name) for name, kwargs in wrappers]
+    return f"the wrappers {', '.join(names)}" if names else "no wrappers"
+
+
+def _as_json(value: Any) -> Any:
+    """A value as it is after it was written as JSON; what JSON does not have as its `repr`."""
+
+    def convert(other: Any) -> Any:
+        return other.tolist() if isinstance(other, np.ndarray | np.generic) else repr(other)
+
+    try:
+        return json.loads(json.dumps(value, default=convert))
+    except (TypeError, ValueError, RecursionError):  # keys that are no text, or a cycle
+        return repr(value)
+
+
+def _check_space(
+    recorded: gym.Space, played: gym.Space, part: str, where: str, level: str | None
+) -> None:
+    """Refuses a space of other values; data may have more parts than are looked at.
+
+    Raises:
+        UserError: names the part that differs.
+    """
+    both = gym.spaces.Dict
+    if isinstance(recorded, both) and isinstance(played, both):
+        for key in played.spaces.keys() & recorded.spaces.keys():
+            _check_space(recorded[key], played[key], f"{part}[{key!r}]", where, level)
+    elif not _is_same(recorded, played):
+        raise UserError(
+            f"{where} says that each {part} is in {recorded}, and in {level} it is in {played}: "
+            "play the environment that the data were recorded in, its version, arguments and "
+            "wrappers included"
+        )
+
+
+def _is_same(recorded: Any, played: Any) -> bool:
+    """Whether two spaces hold the same values, whatever types these are stored in."""
+    if type(recorded) is not type(played) or recorded.shape != played.shape:
+        return False
+    if isinstance(played, gym.spaces.Box):
+        return np.allclose(_bounds(recorded), _bounds(played))
+    if isinstance(played, gym.spaces.Discrete):
+        return (recorded.start, recorded.n) == (played.start, played.n)
+    if isinstance(played, gym.spaces.MultiDiscrete):
+        pairs = ((recorded.start, played.start), (recorded.nvec, played.nvec))
+        return all(np.array_equal(*pair) for pair in pairs)
+    return True
+
+
+def _bounds(space: gym.spaces.Box) -> np.ndarray:
+    bounds = np.stack([space.low, space.high]).astype(np.float64)
+    return np.where(np.abs(bounds) >= UNBOUNDED, np.copysign(np.inf, bounds), bounds)

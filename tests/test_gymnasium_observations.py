@@ -1,0 +1,373 @@
+"""What an observation space declares reaches the network, or is refused by name."""
+
+import dataclasses
+import json
+from typing import ClassVar
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from experiments import gymnasium as program
+from experiments.common import config, results
+from leapjax import pretrained
+from leapjax.data import storage
+from leapjax.domain import apply_statistics, blank_context
+from leapjax.errors import UserError
+from leapjax.gymnasium.domain import Settings, make
+from leapjax.gymnasium.observations import (
+    MOST_INPUTS,
+    Part,
+    StateTokens,
+    blank_of,
+    check_choices,
+    check_precision,
+    measure_parts,
+    parts_of,
+)
+from leapjax.gymnasium.scaling import BINS, UNMEASURED, count_bins, find_knots, scale_numbers
+from leapjax.types import Demonstration
+from tests.parameters import random_like
+from tests.programs import SMALL, only_long
+from tests.quick import quick_jit
+from tests.test_gymnasium import recorded
+
+
+class Sign(gym.Env):
+    """A row of three states, each one of two; the first asks for action 0, the second for 1."""
+
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(0, 1000, (1,))
+    states: ClassVar = [100, 200]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left, self.wrong = 3, False
+        return self.seen(), {}
+
+    def seen(self):
+        self.which = int(self.np_random.integers(2))
+        return np.array([self.states[self.which]], self.observation_space.dtype)
+
+    def step(self, action):
+        self.wrong |= int(action) != self.which
+        self.left -= 1
+        return self.seen(), float(self.left == 0 and not self.wrong), self.left == 0, False, {}
+
+
+class Far(Sign):
+    """Integers that no float32 has, beside another two that are far away."""
+
+    observation_space = spaces.Box(-(2**31), 2**31 - 1, (1,), np.int32)
+    states: ClassVar = [2 * 10**9 + 1, 2 * 10**9 + 2]
+
+
+class Long(Sign):
+    """Integers that int32 does not have."""
+
+    observation_space = spaces.Box(0, 2**40, (1,), np.int64)
+    states: ClassVar = [2**32 + 2, 2**32 + 2]
+
+
+class Stray(Sign):
+    """A choice that there is not."""
+
+    observation_space = spaces.MultiDiscrete([3])
+    states: ClassVar = [3, 3]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered():
+    kinds = [Sign, Far, Long, Stray]
+    for kind in kinds:
+        entry = f"tests.test_gymnasium_observations:{kind.__name__}"
+        gym.register(f"{kind.__name__}-v0", entry, max_episode_steps=9)
+    yield
+    for kind in kinds:
+        del gym.registry[f"{kind.__name__}-v0"]
+
+
+def right(seen):
+    return int(seen[0] % 2 == 0) if seen[0] > 10**6 else int(seen[0] == 200)
+
+
+def features_of(states, knots=None):
+    """Features `[n, 16]` of numbers `[n]`, scaled by themselves.
+
+    They are computed beside others, so that all tests share a few programs of one shape.
+    """
+    states = np.asarray(states)
+    knots = find_knots(states[:, None], BINS) if knots is None else knots
+    table = np.zeros((12, 2), states.dtype)
+    table[: len(states), 0] = states
+    others = tuple(float(number) for number in range(BINS + 1))
+    found = scale_numbers(jnp.asarray(table), (*knots, others))
+    return np.asarray(found)[: len(states), :BINS]
+
+
+FEW = [
+    ([100, 200], "float32"), ([1e-6, 2e-6], "float32"), ([1e9, 1.1e9], "float32"),
+    ([1e6 - 1, 1e6, 1e6 + 1], "float32"), ([-3.4e38, 0, 3.4e38], "float32"),
+    ([0, 0.5, 1, 1e9], "float32"), ([-1e-30, 1e-30, 1], "float32"),
+    ([2**31 - 2, 2**31 - 1], "int32"), ([-(2**31), -(2**31) + 1, 0, 2**31 - 1], "int32"),
+    ([2**32 - 2, 2**32 - 1], "uint32"), ([0, 1], "uint8"), ([254, 255], "uint8"),
+    ([-128, 127], "int8"), ([30000, 30001], "int16"), ([False, True], "bool"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("states", "dtype"), FEW)
+def test_states_of_any_size_and_type_are_far_apart(states, dtype):
+    found = features_of(np.array(states, dtype))
+    assert np.isfinite(found).all()
+    for index, one in enumerate(found):
+        for other in found[:index]:
+            assert np.abs(one - other).max() == 2  # from one end of an interval to the other
+
+
+def test_many_values_are_told_apart_where_they_are():
+    rng = np.random.default_rng(0)
+    usual = rng.uniform(0, 1, 2000)
+    odd = np.where(rng.random(2000) < 0.05, 1e9, usual)  # "nothing seen"
+    two = np.concatenate([usual, 1e6 + usual])
+    tail = np.where(rng.random(2000) < 0.99, 0, rng.integers(1, 256, 2000))  # dark pictures
+    counts = np.floor(rng.pareto(1.0, 2000) * 5)
+    for states, one, other in [
+        (odd, 0.3, 0.6), (two, 0.25, 0.75), (two, 1e6 + 0.25, 1e6 + 0.75), (tail, 0, 20),
+        (tail, 100, 140), (counts, 0, 3), (1e6 * usual - 5e5, -1e5, 1e5), (-usual, -0.9, -0.8),
+    ]:  # fmt: skip
+        knots = find_knots(states.astype(np.float32)[:, None], BINS)
+        assert len(knots[0]) <= BINS + 1 and list(knots[0]) == sorted(set(knots[0]))
+        assert set(knots[0]) <= set(states.astype(np.float32).tolist())  # so that they are exact
+        found = features_of(np.array([one, other], np.float32), knots)
+        assert np.abs(found[0] - found[1]).sum() > 0.5, (one, other)
+
+
+def test_integers_are_subtracted_exactly():
+    rng = np.random.default_rng(0)
+    for dtype in (np.int32, np.uint32):
+        limits = np.iinfo(dtype)
+        ends = rng.integers(limits.min, limits.max, (50, 2), dtype, endpoint=True)
+        low, high = np.sort(ends, axis=1).T
+        states = rng.integers(low, high, dtype=dtype, endpoint=True)
+        knots = tuple((float(a), float(b)) for a, b in zip(low, high, strict=True))
+        exact = 2 * (states - low.astype(float)) / (high - low.astype(float)) - 1
+        found = quick_jit(lambda x, of=knots: scale_numbers(x, of))(states[None])[0]
+        np.testing.assert_allclose(found, exact, atol=1e-6)
+
+
+def test_beyond_the_training_data_features_go_on_and_stay_small():
+    knots = ((0.0, 1.0, 3.0),)
+    states = np.array([-1e30, -10, -1, -1e-3, 0, 0.5, 1, 2, 3, 3.001, 9, 3e38], np.float32)
+    found = features_of(states, knots)
+    assert np.isfinite(found).all() and np.abs(found).max() < 200
+    assert (np.diff(found.sum(axis=1)) > 0).all()
+    assert found[3, :3] == pytest.approx([-1.002, -1, 0], abs=1e-5)
+    # Of what never changed nothing could be learned.
+    assert not features_of(np.array([5, 7], np.float32), ((5.0,),)).any()
+    # Without data no size is expected.
+    seen = features_of(np.array([-1e6, -3, -0.02, 0, 0.005, 2, 100, 200, 1e9]), UNMEASURED)
+    assert (np.diff(seen.sum(axis=1)) > 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("space", "part", "dtype"),
+    [
+        (spaces.Box(-1, 1, (2,), np.float64), "vector", np.float32),
+        (spaces.Box(-1, 1, (2,), np.float16), "vector", np.float32),
+        (spaces.Box(-1, 1, (), np.longdouble), "vector", np.float32),
+        (spaces.Box(0, 2**64 - 1, (2,), np.uint64), "vector", np.uint32),
+        (spaces.Box(-9, 9, (2,), np.int64), "vector", np.int32),
+        (spaces.Box(0, 1, (2,), bool), "vector", bool),
+        (spaces.Box(0, 1, (4, 7, 5, 3)), "vector", np.float32),
+        (spaces.Box(0, 1, (5, 5)), "vector", np.float32),
+        (spaces.Box(0, 255, (84, 84), np.uint8), "picture", np.uint8),
+        (spaces.Box(0, 1, (10, 10, 4), bool), "picture", bool),
+        (spaces.Box(0, 1, (3, 64, 64)), "picture", np.float32),
+        (spaces.MultiBinary([2, 3]), "vector", np.int8),
+        (spaces.Discrete(3, dtype=np.uint8), "choices", np.int32),
+        (spaces.MultiDiscrete([[2, 3], [4, 5]], dtype=np.int8), "choices", np.int32),
+    ],
+)
+def test_arrays_have_types_that_jax_computes_with(space, part, dtype):
+    blank = blank_of(space, "it")
+    assert blank.dtype == dtype and blank.shape == space.shape
+    assert jnp.asarray(blank).dtype == dtype
+    assert parts_of(space)[0].kind == part
+
+
+@pytest.mark.parametrize(
+    ("space", "says"),
+    [
+        (spaces.Text(5), "it is a Text: expected Box"),
+        (spaces.Tuple([spaces.Discrete(2)]), "it is a Tuple: .*FlattenObservation"),
+        (spaces.Sequence(spaces.Discrete(2)), "it is a Sequence"),
+        (spaces.Graph(spaces.Discrete(2), None), "it is a Graph"),
+        (spaces.OneOf([spaces.Discrete(2)]), "it is a OneOf"),
+        (spaces.Dict(), "expected a Dict with names"),
+        (spaces.Dict(inner=spaces.Dict()), r"it\['inner'\] is Dict"),
+        (spaces.Dict({1: spaces.Discrete(2), "a": spaces.Discrete(2)}), "a Dict with names"),
+        (spaces.Box(0, 1, (0,)), r"it is of shape \(0,\): it holds no numbers"),
+        (spaces.Box(0, 1, (5, 0, 3), np.uint8), "holds no numbers"),
+        (spaces.Discrete(10**9), "one-hot code of 1000000000 numbers: .*TransformObservation"),
+        (spaces.Dict(at=spaces.MultiDiscrete([2, 10**6])), r"it\['at'\] is MultiDiscrete"),
+        (spaces.MultiDiscrete([500] * 1000), "one-hot code of 500000 numbers"),
+        (spaces.Discrete(3, start=2**40), "do not fit int32"),
+        (spaces.Box(0, 1, (70_000,)), "70000 numbers: expected at most 65536"),
+        (spaces.MultiBinary(10**6), "1000000 numbers: expected at most 65536"),
+        (spaces.Box(0, 255, (2000, 1000, 3), np.uint8), "at most 1048576; .*ResizeObservation"),
+    ],
+    ids=str,
+)
+def test_spaces_that_no_network_reads_are_refused_by_name(space, says):
+    with pytest.raises(UserError, match=says):
+        blank_of(space, "it")
+
+
+def test_choices_far_from_zero_are_counted_from_their_first():
+    assert parts_of(spaces.Discrete(3, start=10**9)) == (Part("choices", 3, 10**9),)
+    assert parts_of(spaces.Discrete(3, start=5)) == (Part("choices", 8, 0),)
+    near = spaces.MultiDiscrete([3, 4], start=[10**9, 10**9 + 1])
+    assert parts_of(near) == (Part("choices", 5, 10**9),)
+    small = spaces.MultiDiscrete([200], start=np.array([100], np.uint8), dtype=np.uint8)
+    check_choices(small, np.array([[255]]), "it")
+
+
+PICTURES = {
+    "binary": ((6, 5, 1), np.uint8, 1), "bright": ((6, 6, 3), np.uint8, 255),
+    "gray": ((20, 14), np.uint8, 90), "first": ((3, 14, 14), np.float32, 1e-3),
+    "board": ((8, 8, 11), bool, True), "thin": ((1, 30, 3), np.float32, 1e6),
+    "tiny": ((1, 1, 3), np.int32, 2), "wide": ((2, 4, 9), np.int16, -300),
+}  # fmt: skip
+
+
+def demonstration(observations):
+    states = len(jax.tree.leaves(observations)[0])
+    zeros = np.zeros(states - 1)
+    return Demonstration(observations, zeros.astype(np.int32), zeros, True, False, 0)
+
+
+def pictures():
+    """Two states: all pictures are dark, all are bright."""
+    return {
+        name: np.stack([np.zeros(shape, dtype), np.full(shape, bright, dtype)])
+        for name, (shape, dtype, bright) in PICTURES.items()
+    }
+
+
+def test_the_channels_of_pictures_are_found():
+    parts = (Part("picture"),) * len(PICTURES)
+    found = measure_parts(parts, [demonstration(pictures())])
+    assert [len(knots) for knots in found] == [1, 11, 3, 3, 1, 1, 3, 2]  # in alphabetic order
+    assert found[0] == ((0.0, 1.0),) and found[2] == ((0.0, 255.0),) * 3
+
+
+@only_long
+def test_pictures_of_any_layout_and_range_are_read():
+    space = spaces.Dict({
+        name: spaces.Box(0, 1, shape, dtype) for name, (shape, dtype, _) in PICTURES.items()
+    })  # fmt: skip
+    parts, blank, states = parts_of(space), blank_of(space, "it"), pictures()
+    assert {part.kind for part in parts} == {"picture"}
+    statistics = measure_parts(parts, [demonstration(states)])
+    module = StateTokens(parts, 8, 0, statistics=statistics)
+    context = blank_context(make("Sign-v0", Settings()), 0)._replace(
+        observation=blank, past=jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), blank)
+    )
+    params = random_like(jax.eval_shape(module.init, jax.random.key(0), context))
+    encode = quick_jit(module.apply)
+    dark = encode(params, context)
+    for name in PICTURES:
+        corner = blank[name].copy()
+        corner.flat[-1] = states[name][1].flat[-1]  # one number of it
+        seen = encode(params, context._replace(observation={**blank, name: corner}))
+        assert np.abs(seen - dark).max() > 1e-3, name
+
+
+def test_statistics_are_of_the_training_data_and_only_of_numbers():
+    assert measure_parts((Part("choices", 3),), [demonstration(np.zeros(2, np.int32))]) == ()
+    assert measure_parts((Part("vector"),), []) == ()
+    rng = np.random.default_rng(0)
+    several = [demonstration(rng.normal(size=(n, 2)).astype(np.float32)) for n in (5, 40, 9)]
+    (knots,) = measure_parts((Part("vector"),), several)
+    states = np.concatenate([each.observations for each in several])
+    assert [column[0] for column in knots] == states.min(axis=0).tolist()
+    assert [column[-1] for column in knots] == states.max(axis=0).tolist()
+    # All numbers of a large array share their knots: they are kept with the checkpoint.
+    large = demonstration(np.arange(3 * 20_000, dtype=np.float32).reshape(3, 20_000))
+    (shared,) = measure_parts((Part("vector"),), [large])
+    assert len(shared) == 1 and len(shared[0]) == count_bins(20_000) + 1 == 5
+    assert (shared[0][0], shared[0][-1]) == (0, 3 * 20_000 - 1)
+    assert count_bins(1) == BINS and count_bins(MOST_INPUTS // 4) == 4
+
+
+def test_statistics_are_kept_with_the_specification(tmp_path):
+    domain = make("Sign-v0", Settings())
+    data = [demonstration(np.array([[100], [200], [200]], np.float32))]
+    (chosen,) = config.parse("gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"])
+    before = config.specify(chosen, 0, domain)
+    after = dataclasses.replace(before, statistics=domain.measure(data))
+    assert after.statistics == (((100.0, 200.0),),)
+    assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before
+    assert pretrained.identity(before) != pretrained.identity(after)
+    pretrained.save_specification(tmp_path, after)
+    assert pretrained.parse_specification(tmp_path) == after
+    made = pretrained.make_domain(after).encoders["paper"](chosen.model, 0)
+    assert made.statistics == after.statistics
+    for wrong in [(), ((1.0,), (2.0,))], [((1.0, 1.0),)], [((2.0, 1.0),)], [((np.nan,),)], [((),)]:
+        with pytest.raises(UserError, match="not of this observation space: train it again"):
+            apply_statistics(domain, tuple(wrong))
+
+
+def test_changes_that_float32_cannot_hold_are_refused():
+    space = spaces.Dict(now=spaces.Box(0, np.inf, (2,), np.float64), near=spaces.Box(0, 1, (1,)))
+    steps = np.arange(4.0)[:, None]
+    near = 1 + 1e-9 * steps
+    check_precision(space, {"now": np.hstack([steps, 1e5 + steps]), "near": near}, "it")
+    check_precision(space, {"now": np.hstack([steps, 1 + 1e-15 * steps]), "near": near}, "it")
+    check_precision(space, {"now": np.hstack([steps, 1e300 * steps]), "near": near}, "it")
+    with pytest.raises(UserError, match=r"it: now: the numbers at \[1\] change by too little"):
+        check_precision(space, {"now": np.hstack([steps, 1.7e9 + steps]), "near": near}, "it")
+
+
+def test_what_does_not_fit_is_refused_in_data_and_in_play(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    domain = make("Long-v0", Settings())
+    name = recorded("my/long-v0", "Long-v0", lambda seen: 0, 1)
+    says = "numbers that do not fit int32, or are not finite, such as 4294967298"
+    with pytest.raises(UserError, match=f"episode 0 of .*: observations: {says}"):
+        storage.load(name, domain)
+    with pytest.raises(UserError, match=f"an observation of Long-v0: {says}"):
+        domain.make_adapter().reset(0)
+    with pytest.raises(UserError, match="an observation of Stray-v0: a choice of 3, expected 0 to"):
+        make("Stray-v0", Settings()).make_adapter().reset(0)
+
+
+@only_long
+@pytest.mark.parametrize("level", ["Sign-v0", "Far-v0"])
+def test_states_of_any_size_are_learned_from(level, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
+    (tmp_path / "data").mkdir()
+    name = recorded("my/states-v0", level, right, 40)
+    sizes = "--width 32 --layers 1 --batch 32 --episodes 40 --no-pictures --success-return 1"
+    options = [*sizes.split(), "--dataset", name, "--steps", "300"]
+    assert program.main(options) == 0
+    (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
+    assert row["successes"] == 40
+    (folder,) = (tmp_path / "runs").glob("gymnasium-*-seed0-*")
+    assert program.main(options) == 0 and "continuing at step 300" in capsys.readouterr().out
+    again = ["--checkpoint", str(folder), "--episodes", "40", "--no-pictures"]
+    assert program.main(again) == 0  # rebuilt with the statistics that it was trained with
+    both = results.read(tmp_path / "runs" / "gymnasium.jsonl")
+    assert [row["successes"] for row in both] == [40, 40]
+    # As a version before statistics left it.
+    path = folder / pretrained.SPECIFICATION
+    values = json.loads(path.read_text())
+    del values["statistics"]
+    values["signature"]["parts"] = [["numbers", 0, 0]]
+    path.write_text(json.dumps(values))
+    assert program.main(again) == 2
+    assert "trained with another parts; train it again" in capsys.readouterr().err
