@@ -16,7 +16,7 @@ from leapjax.data.windows import Window
 from leapjax.energy import pseudo_likelihood
 from leapjax.pretrained import Origin
 from leapjax.types import mask_token
-from tests.programs import seal, untrained_run
+from tests.programs import only_long, seal, untrained_run
 
 ACTIONS, HORIZON, END = 4, 5, 3
 DOMAIN = BABYAI.make("GoToLocalS7N5", Settings())
@@ -118,6 +118,7 @@ def test_a_users_data_set_is_what_was_learned_from():
     assert [d.seed for d in learned] == [d.seed for d in collection.demonstrations[:2]]
 
 
+@only_long
 def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch, capsys):
     run = untrained_run(tmp_path / "run")
     assert accuracy.main([str(run), "--demos", "4", "--samples", "9"]) == 0

@@ -62,6 +62,7 @@ def test_a_constraint_is_asked_for_and_counted(place, capsys):
     assert rows(place, "properties", "results") == [row]
 
 
+@only_long
 def test_constraints_remember_what_models_do_not_see(place):
     lengths = []
 
@@ -295,6 +296,7 @@ def toy_landscape(place, monkeypatch):
     return found, arguments
 
 
+@only_long
 def test_the_landscape_is_watched_while_it_forms(toy_landscape, place):
     found, arguments = toy_landscape
     assert [entry["step"] for entry in found["training"]] == [20, 40]

@@ -415,6 +415,7 @@ def test_there_is_nothing_to_compare_with_one_reward():
         atari_energy.correlate(cost_planner(2), games, 2)
 
 
+@only_long
 def test_collecting_goes_on_where_it_was_stopped(collected):
     folder, arguments = collected
     logs = replay.replay_logs(folder, BREAKOUT, 1)
@@ -438,6 +439,7 @@ def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
     assert not multiprocessing.active_children()
 
 
+@only_long
 def test_processes_end_when_the_first_is_killed():
     program = (
         "import os, time\n"
@@ -575,7 +577,7 @@ def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys,
 @pytest.mark.parametrize(
     "options",
     [
-        "--method dt",
+        pytest.param("--method dt", marks=only_long),
         pytest.param("--method cql", marks=only_long),
         pytest.param("--method bc", marks=only_long),
         pytest.param("--method qr_dqn", marks=only_long),

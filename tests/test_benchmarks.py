@@ -104,6 +104,7 @@ def test_a_plan_of_a_method_is_measured_as_the_method_plans(monkeypatch):
     assert plan.actions.shape == (2, 1)  # of one action
 
 
+@only_long
 def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, quick_begin):
     monkeypatch.setattr(training, "preset", tiny_preset)
     monkeypatch.setattr(training, "matmul_peak", lambda *rest: 100.0)  # measured for planning
@@ -125,6 +126,7 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, qui
     assert 0.9 * products < row["flops_per_step"] < 1.1 * products
 
 
+@only_long
 def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkeypatch):
     monkeypatch.setattr(atari, "preset", lambda *names: with_options(preset(*names), SMALL))
     rows = tmp_path / "rows.json"

@@ -174,6 +174,7 @@ def test_iql():
     assert_is(case, loss)
 
 
+@only_long
 @pytest.mark.parametrize("share", [pytest.param(1.0, marks=only_long), 0.5])
 def test_mopo(share):
     """Of the data alone; and of what is imagined, two steps far, too."""

@@ -24,6 +24,7 @@ from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 from leapjax.types import TrainState
+from tests.programs import only_long
 
 LEVEL = "GoToLocalS7N5"
 
@@ -40,6 +41,7 @@ def parse(*arguments):
     return found
 
 
+@only_long
 def test_options_of_training_are_not_for_methods_that_learn_nothing():
     found = config.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
     steps = {each.method: each.training.steps for each in found}

@@ -19,6 +19,7 @@ from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from leapjax.types import nothing_encoded
 from tests.parameters import random_parameters
+from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.recorder import Recorder
 
@@ -45,6 +46,7 @@ def episode(domain: Domain, length: int, steps: int, act: Callable[[History], np
         history.advance(action, found.observation, found.reward, encoded)
 
 
+@only_long
 @pytest.mark.parametrize(
     ("name", "length"),
     [("babyai", 3), ("gymnasium", 3), ("atari", 1), ("atari", 2), ("atari", 3), ("atari", 6)],

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tests.programs import ROOT
+from tests.programs import ROOT, only_long
 
 
 @pytest.mark.parametrize(
@@ -14,7 +14,10 @@ from tests.programs import ROOT
     [
         ("plan_with_my_energy", [], r"(9\d|100)% of 256 plans keep to the constraint"),
         ("train_on_my_data", ["2", "1"], r"mean return \d+, success \d+%"),
-        ("add_a_constraint", ["4"], r"without left turns: success \d+%, 0 left turns"),
+        pytest.param(
+            *("add_a_constraint", ["4"], r"without left turns: success \d+%, 0 left turns"),
+            marks=only_long,
+        ),
         ("pure_environment", ["20"], r"20 mazes: success (9\d|100)%"),
     ],
 )

@@ -8,7 +8,7 @@ from experiments.failures import Cause
 from leapjax.babyai.adapter import END
 from leapjax.babyai.demonstrations import make_bot
 from leapjax.babyai.levels import find_level
-from tests.programs import untrained_run
+from tests.programs import only_long, untrained_run
 
 LEFT, FORWARD, PICKUP = 0, 2, 3
 
@@ -60,6 +60,7 @@ def test_a_recorder_knows_the_way_that_was_walked():
     assert found.cells[-1] == tuple(found.env.agent_pos)
 
 
+@only_long
 def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
     run = untrained_run(tmp_path / "run", "--method", "random")
     assert failures.main([str(run), "--episodes", "6"]) == 0

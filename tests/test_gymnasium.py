@@ -34,7 +34,7 @@ from leapjax.gymnasium.observations import Part, StateTokens, blank_of, check_ch
 from leapjax.rollouts import evaluate
 from leapjax.types import Demonstration, Plan
 from tests.parameters import random_like
-from tests.programs import SMALL
+from tests.programs import SMALL, only_long
 
 WAY = 5
 
@@ -381,6 +381,7 @@ def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch, q
         gym.registry.pop("Theirs-v0", None)
 
 
+@only_long
 def test_data_of_other_arguments_are_refused_until_they_are_given(
     tmp_path, monkeypatch, capsys, quick_begin
 ):

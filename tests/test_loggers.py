@@ -13,7 +13,7 @@ from experiments.common import config, experiment, loggers, progress, results
 from leapjax import domains, scores
 from leapjax.errors import UserError
 from tests.frozen_lake import FROZEN_LAKE
-from tests.programs import LAKE, SMALL
+from tests.programs import LAKE, SMALL, only_long
 
 TRAINED = [*SMALL, "--demos", "3", "--steps", "4"]
 
@@ -63,6 +63,7 @@ def sent(monkeypatch):
     return heard
 
 
+@only_long
 def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch):
     monkeypatch.delenv("WANDB_MODE", raising=False)
     arguments = [*TRAINED, "--loggers", "tensorboard", "wandb", "--record"]

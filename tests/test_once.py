@@ -141,6 +141,7 @@ METHODS = [
 ]
 
 
+@only_long
 @pytest.mark.parametrize("name", METHODS)
 def test_methods_learn_the_same_from_what_is_seen_at_once(name, monkeypatch):
     """The loss and the gradient of a step are those without, the encoder's included."""

@@ -34,6 +34,7 @@ from tests.enumerable import (
     random_table,
     total_variation,
 )
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
@@ -969,6 +970,7 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
 # Mistakes.
 
 
+@only_long
 @settings(max_examples=12, deadline=None)
 @given(st.data())
 def test_plans_of_any_shape(data):

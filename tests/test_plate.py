@@ -16,6 +16,7 @@ from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
 from tests.parameters import random_parameters
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 HORIZON = 4
@@ -152,6 +153,7 @@ def trained():
     return agent, state.params, metrics
 
 
+@only_long
 def test_plans_are_the_demonstrators_ways(trained):
     agent, params, metrics = trained
     assert metrics[-1]["accuracy"] == 1 and metrics[-1]["state_error"] < 0.02

@@ -9,7 +9,7 @@ import pytest
 from leapjax import pretrained
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
-from tests.programs import untrained_run
+from tests.programs import only_long, untrained_run
 from tests.quick import quick_jit
 
 
@@ -55,6 +55,7 @@ def test_a_planner_says_how_it_searches_and_what_it_plays(tmp_path):
     assert dataclasses.replace(asked, planner=trained.planner, level=trained.level) == trained
 
 
+@only_long
 def test_it_plays_a_level_of_longer_episodes(tmp_path):
     """A network that knows what time it is counts no further than it has learned to."""
     folder = untrained_run(tmp_path, "--level", "GoToLocalS7N1", "--architecture", "paper")

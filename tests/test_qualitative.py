@@ -13,7 +13,7 @@ from leapjax.babyai.adapter import END, BabyAIAdapter
 from leapjax.babyai.levels import find_level
 from leapjax.babyai.observations import agent_cell
 from leapjax.types import Plan
-from tests.programs import untrained_run
+from tests.programs import only_long, untrained_run
 
 LEVEL = find_level("GoToLocalS7N5")
 FORWARD, RIGHT = 2, 1
@@ -63,6 +63,7 @@ def test_a_way_is_what_a_plan_would_do_and_is_drawn():
     assert len(changed) > 30 and (changed == COLOURS[0]).all()
 
 
+@only_long
 def test_both_figures_are_drawn(tmp_path, monkeypatch):
     untrained = pretrained.load(untrained_run(tmp_path, "--level", "GoToBehindObstacles"))
     monkeypatch.chdir(tmp_path)

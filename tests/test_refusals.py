@@ -653,6 +653,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_written(workplace, mo
     assert list((workplace / "a").iterdir()) == []
 
 
+@only_long
 def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplog):
     """One line says so; the threads of Orbax, asyncio and TensorStore say nothing."""
     saved = Checkpoints(workplace / "a")
@@ -726,6 +727,7 @@ def test_a_bot_that_never_decides_is_a_failed_demonstration():
     assert collected.dropped[demonstrations.FAILED] > 0
 
 
+@only_long
 def test_a_level_that_the_bot_never_solves_is_refused():
     with pytest.raises(UserError, match="101 of 101 demonstrations .* were dropped"):
         demonstrations.collect(levels.find_level("BabyAI-KeyInBox-v0"), 1000, seed=0)

@@ -62,6 +62,7 @@ def memories(agent, params):
     return quick_jit(jax.vmap(agent.energy.encode, (None, 0)))(params, mixed.contexts(0))
 
 
+@only_long
 def test_cloning_does_what_was_done_most_often():
     agent, state, _ = trained("bc")
     actions = acts(agent, state.params)
@@ -72,8 +73,8 @@ def test_cloning_does_what_was_done_most_often():
 @pytest.mark.parametrize(
     ("name", "architecture", "past"),
     [
-        ("bcq", "leapjax", 0),
-        ("iql", "leapjax", 0),
+        pytest.param("bcq", "leapjax", 0, marks=only_long),
+        pytest.param("iql", "leapjax", 0, marks=only_long),
         pytest.param("mopo", "leapjax", 0, marks=only_long),
         pytest.param("bcq", "paper", 2, marks=only_long),
     ],
@@ -156,6 +157,7 @@ def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_ot
     assert metrics[-1]["ensemble"] < metrics[0]["ensemble"]
 
 
+@only_long
 def test_the_target_network_follows_slowly():
     agent, state, _ = trained("iql")
     batch = quick_jit(agent.batch)(jax.random.key(5), mixed.steps())

@@ -23,6 +23,7 @@ from leapjax.stars.domain import Settings, make
 from leapjax.stars.graphs import Star, StarAdapter
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
+from tests.programs import only_long
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -235,6 +236,7 @@ def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path)
         assert animation.width == star_animation.side_of(star)  # one planner
 
 
+@only_long
 def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     monkeypatch.chdir(tmp_path)
     few = [s for s in searches.SEARCHES if s.name in ("all at once", "most certain first")]

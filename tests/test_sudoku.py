@@ -296,6 +296,7 @@ def one_search(tmp_path, monkeypatch):
     monkeypatch.setattr(searches, "BEST_OF_MANY", only)
 
 
+@only_long
 def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_search, quick_begin):
     toy = "--level Sudoku4x8 --episodes 8 --no-pictures".split()
     network = "--steps 2 --demos 2 --batch 2 --width 8 --heads 2 --layers 1".split()
