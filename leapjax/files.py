@@ -16,6 +16,8 @@ LARGEST_TEXT = 2**26  # bytes of a file of text: more is not ours, and parsing t
 
 try:
     import fcntl
+    import grp
+    import pwd
 except ImportError:  # not on Windows: there, nothing keeps two processes apart
     fcntl = None  # type: ignore[assignment]
 
@@ -163,10 +165,25 @@ def _check_private(folder: Path, sticky: bool) -> None:
     if status.st_uid not in (user, 0):
         raise UserError(f"{folder} belongs to another user (uid {status.st_uid}): name another")
     mode = status.st_mode
-    # By convention, the group with a user's own number has no other members.
-    others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid != user)
+    others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _is_own_group(status.st_gid))
     if others and not (sticky and mode & stat.S_ISVTX):
         raise UserError(f"others can write to {folder}: name another, or run chmod go-w on it")
+
+
+def _is_own_group(group: int) -> bool:
+    """Whether a group is this user's own, as systems make one for each user.
+
+    By convention it has the number or the name of the user. The numbers differ where a group was
+    made for something else before.
+    """
+    user = os.getuid()
+    if group == user:
+        return True
+    try:
+        found, name = grp.getgrgid(group), pwd.getpwuid(user).pw_name
+    except KeyError:
+        return False
+    return found.gr_name == name and set(found.gr_mem) <= {name}
 
 
 def flush(path: Path) -> None:
@@ -248,7 +265,7 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
         # Not a link: what it leads to would be emptied.
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         file = os.fdopen(os.open(folder / ".lock", flags, 0o666), "ab+", buffering=0)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a null byte
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
     with file:
         if fcntl is not None:
