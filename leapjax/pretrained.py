@@ -255,7 +255,7 @@ def _trace_parameters(
         )
     try:
         return jax.eval_shape(agent.init, jax.random.key(0)).params
-    except (ArithmeticError, TypeError, ValueError) as error:
+    except (ArithmeticError, MemoryError, TypeError, ValueError) as error:
         raise UserError(f"{folder}: its network cannot be built: {first_line(error)}") from error
 
 

@@ -25,7 +25,7 @@ from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.data import storage
-from leapjax.domain import Collection, Domain
+from leapjax.domain import Collection, Described, Domain
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
@@ -346,6 +346,14 @@ def test_a_file_of_garbage(saved, minari_folder):
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\x00", "[" * 100_000])
 def test_damaged_metadata(saved, minari_folder, text):
     (minari_folder / NAME / "data" / "metadata.json").write_text(text)
+    assert "cannot be read" in refused()
+
+
+def test_metadata_that_have_no_end(saved, minari_folder):
+    path = minari_folder / NAME / "data" / "metadata.json"
+    path.unlink()
+    os.mkfifo(path)
+    assert storage.described(NAME) == Described()
     assert "cannot be read" in refused()
 
 

@@ -235,10 +235,7 @@ def check(config: AnyConfig) -> None:
             f"--demos must be at least 1, got {config.demos}: --steps {config.training.steps} "
             "needs demonstrations to train on, and a method that learns nothing has none by default"
         )
-    if not config.seeds:
-        raise UserError("--seeds needs at least one seed")
-    for seed in config.seeds:
-        seeds.training_seeds(seed)
+    check_seeds(config.seeds)
     episode_seeds(config)
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
@@ -285,6 +282,20 @@ def check(config: AnyConfig) -> None:
             f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
             "begin at once (--fill together)"
         )
+
+
+def check_seeds(training: Sequence[int]) -> None:
+    """Refuses training seeds that are out of range, or one seed twice.
+
+    Raises:
+        UserError: says which.
+    """
+    if not training:
+        raise UserError("--seeds needs at least one seed")
+    for seed in training:
+        seeds.training_seeds(seed)
+        if training.count(seed) > 1:
+            raise UserError(f"--seeds names {seed} twice: both would be one run")
 
 
 def check_target_return(config: AnyConfig) -> None:

@@ -402,7 +402,7 @@ def described(name: str) -> Described:
     """What a data set says of itself, as far as it does."""
     path = datasets_folder() / name / "data" / "metadata.json"
     try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
+        metadata = json.loads(files.read_text(path))
         count = metadata.get("total_episodes")
     except (OSError, ValueError, AttributeError, RecursionError):
         return Described()
@@ -473,7 +473,11 @@ def _inspect(folder: Path) -> list[PyTree]:
 
 
 def _read_metadata(folder: Path) -> dict[str, Any]:
-    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+    try:
+        text = files.read_text(folder / "metadata.json")
+    except UserError as error:  # whoever inspects says what to do
+        raise ValueError(str(error)) from None
+    metadata = json.loads(text)
     if not isinstance(metadata, dict):
         raise ValueError("metadata.json is not a JSON object")
     return metadata
