@@ -143,7 +143,8 @@ def own_demonstration(blank) -> Demonstration:
     rng = np.random.default_rng(0)
     states = jax.tree.map(lambda x: (100 * rng.random((4, *x.shape))).astype(x.dtype), blank)
     rewards = rng.normal(size=3).astype(np.float32)
-    return Demonstration(states, np.array([0, 1, 1], np.int32), rewards, True, False, seed=3)
+    actions, unknown = np.array([0, 1, 1], np.int32), storage.UNKNOWN_SEED
+    return Demonstration(states, actions, rewards, True, False, unknown)
 
 
 @pytest.mark.parametrize("blank", [ARRAY, FIELDS, NESTED], ids=["array", "fields", "nested"])
