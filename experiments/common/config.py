@@ -27,6 +27,7 @@ from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
+from leapjax.rollouts import MOST_OPEN
 
 M = TypeVar("M")
 D = TypeVar("D")
@@ -273,8 +274,8 @@ def check(config: AnyConfig) -> None:
             f"--context {config.context} is longer than any episode of {config.level}: at most "
             f"{domain.max_steps} steps come before a state"
         )
-    # An agent costs nothing to make, and says what its method cannot do.
     check_memory(config, domain)
+    # An agent costs nothing to make, and says what its method cannot do.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
     fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
@@ -337,7 +338,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         "--width, --layers, --max-steps": 4 * 4 * (
             12 * model.layers * model.width**2 + model.width * embeddings
         ),
-        "--episodes, --context": config.episodes * (context + SMALLEST_ENVIRONMENT),
+        "--episodes, --context": (context + SMALLEST_ENVIRONMENT)
+        * min(config.episodes, MOST_OPEN),
     }  # fmt: skip
     if training.steps and config.checkpoint is None:
         masking = getattr(config.method_settings, "masking", "one")
@@ -364,7 +366,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
 
 def layer_bytes(model: ModelConfig, tokens: int) -> int:
     """Bytes that a layer makes of so many tokens, at least."""
-    # Queries, keys, values and so on; and who attends to whom.
+    # Queries, keys, values and so on; and the weights of attention.
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
