@@ -68,7 +68,7 @@ def report(options: Options) -> None:
             )
     runtime.start()
     for run in options.runs:
-        Console().print(describe(pretrained.load(run), options, run.name))
+        Console(markup=False).print(describe(pretrained.load(run), options, run.name))
 
 
 def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:

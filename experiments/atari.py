@@ -78,7 +78,7 @@ def run(options: Collect) -> None:
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
-    console = Console()
+    console = Console(markup=False)
     transitions = options.transitions or preset(options.game, "leapjax")["transitions"]
     with Meter(console, "transitions", transitions) as meter:
         made = collect(

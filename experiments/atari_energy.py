@@ -68,7 +68,7 @@ def report(options: Options) -> None:
         memory.check({"--windows": options.windows * horizon * layer})
     runtime.start()
     path = results.folder(options.record, options.runs) / RESULTS
-    console = Console()
+    console = Console(markup=False)
     for checkpoint in options.checkpoint:
         planner = pretrained.load(checkpoint)
         specification = planner.specification
@@ -81,7 +81,7 @@ def report(options: Options) -> None:
         )
     picture = options.runs / "atari-energy.png"
     plots.energy_against_reward(found, picture)
-    console.print(f"picture: {picture}", highlight=False, markup=False)
+    console.print(f"picture: {picture}", highlight=False)
 
 
 def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def report(options: Options) -> None:
     """Plays validation levels, prints the tables, draws the gallery."""
     check_counts(options, "episodes")
     check_integer("--drawn", options.drawn)
-    console = Console()
+    console = Console(markup=False)
     played = seeds.validation_seeds(0, options.episodes)
     if options.gallery is not None:
         check_picture(options.gallery)
@@ -123,7 +123,7 @@ def report(options: Options) -> None:
     if failed and options.drawn > 0:
         path = options.gallery or options.runs[0] / "failures.png"
         draw(failed[: options.drawn], path)
-        console.print(f"gallery: {path}", highlight=False, markup=False)
+        console.print(f"gallery: {path}", highlight=False)
 
 
 def only_level(runs: Sequence[Path], executed: int | None) -> Level:

@@ -80,7 +80,7 @@ def report(options: Options, interruption: Interruption) -> None:
         raise UserError("--record: what is recorded is trained for the preset's number of --steps")
     folder = results.folder(options.record, options.runs)
     files.check_writable(folder)
-    console = Console()
+    console = Console(markup=False)
     wanted = []
     for preset in options.presets:
         config = configs.preset("babyai", options.level, "leap", preset)
@@ -99,7 +99,7 @@ def report(options: Options, interruption: Interruption) -> None:
     console.print(table(found))
     keep(folder / RESULTS, found)
     plots.landscape(found, options.runs / "landscape.png")
-    console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False, markup=False)
+    console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False)
 
 
 def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:

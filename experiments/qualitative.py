@@ -25,7 +25,7 @@ from experiments.common.analysis import Way, Work
 from experiments.common.episodes import watched
 from experiments.common.interruption import Interruption
 from experiments.common.pictures import save_sheet
-from leapjax import pretrained
+from leapjax import files, pretrained
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.constraints import in_half
 from leapjax.babyai.levels import find_level
@@ -95,10 +95,12 @@ def draw(options: Options, interruption: Interruption) -> None:
         properties.ANALYSIS,
         analysis.Options(runs=options.runs),
         results.versions(),
-        Console(),
+        Console(markup=False),
         interruption,
     )
     folder = Path("docs") if options.record else options.runs
+    for where in (folder, options.runs):  # not after hours of work
+        files.check_writable(where)
     refined = [each for level in PLANNED for each in refinement(level, options.test_seed)]
     asked = [unlearned(work, *names, options) for names in ASKED]
     sheets = (refined, 1 + len(ITERATIONS)), (asked, len(asked))

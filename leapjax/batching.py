@@ -77,7 +77,12 @@ class CompiledPlanner:
                 of 64 bits, in contexts or parameters, that do not fit 32.
             NotANumber: the energy of some action was NaN or -inf; it holds the plans.
         """
-        keys = keys if hasattr(keys, "dtype") else jnp.stack(list(keys))
+        if not hasattr(keys, "dtype"):
+            if not isinstance(keys, Sequence) or isinstance(keys, str):
+                raise UserError(f"keys must be an array, one for each context, got {keys!r}")
+            if not len(keys):
+                raise ValueError("no contexts to plan for")
+            keys = jnp.stack([jnp.asarray(key) for key in keys])
         typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
         if keys.ndim != (1 if typed else 2):
             raise ValueError(
@@ -93,7 +98,7 @@ class CompiledPlanner:
                     f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
                     f"dimension must be the number of keys, {batch}"
                 )
-            if not isinstance(leaf, jax.Array) and np.asarray(leaf).dtype.kind not in "biuf":
+            if not isinstance(leaf, jax.Array) and not _is_real(np.asarray(leaf).dtype):
                 raise ValueError(
                     f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
                     "numbers: encode it first"
@@ -201,6 +206,12 @@ def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
         chunks.append((start, size, min(size, left)))
         start += size
     return chunks
+
+
+def _is_real(dtype: np.dtype) -> bool:
+    """Whether JAX computes with a type, or with a shorter one in its place: reals and booleans."""
+    kinds = (np.bool_, np.integer, jnp.floating)
+    return dtype.itemsize <= 8 and any(jnp.issubdtype(dtype, kind) for kind in kinds)
 
 
 def check_fit(name: str, tree: PyTree) -> None:

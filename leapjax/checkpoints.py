@@ -11,7 +11,6 @@ import logging
 import math
 import os
 import shutil
-import sys
 import traceback
 import types
 import typing
@@ -223,20 +222,13 @@ def check_path(folder: Path) -> None:
 
 @functools.cache
 def hush_orbax() -> None:
-    """Keeps Orbax from printing what this module says in one line.
+    """Keeps Orbax from logging what this module says in one line.
 
     Of a full disk or a damaged checkpoint many threads of Orbax fail at once, and log each
-    failure with its traceback. TensorStore then tells event loops that are closed already.
+    failure with its traceback.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).addFilter(lambda record: not _is_of_orbax(record))
-    before = sys.unraisablehook
-
-    def hook(failure: Any) -> None:
-        if failure.object is not None or str(failure.exc_value) != "Event loop is closed":
-            before(failure)
-
-    sys.unraisablehook = hook
 
 
 def _is_of_orbax(record: logging.LogRecord) -> bool:

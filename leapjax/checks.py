@@ -7,14 +7,15 @@ import dataclasses
 import math
 import operator
 import typing
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from leapjax.errors import UserError
 
+T = TypeVar("T")
 MOST = 2**31 - 1  # the largest int32, the integers that JAX computes with
 LARGEST = float(np.finfo(np.float32).max)  # the largest number that JAX computes with
 LARGEST_SEED = 2**32 - 1  # the largest seed that JAX's random keys tell from all others
@@ -73,6 +74,17 @@ def check_number(name: str, value: Any, least: float = -LARGEST, most: float = L
     raise UserError(f"{name} must be {bound}, got {number}")
 
 
+def check_kind(value: T, kind: type[T]) -> T:
+    """Returns a value of one class.
+
+    Raises:
+        UserError: it is of another.
+    """
+    if not isinstance(value, kind):
+        raise UserError(f"expected {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
 def check_seed(value: Any, name: str = "seed") -> int:
     """Returns a seed: an integer in 0 .. 2^32 - 1, the seeds that JAX tells apart.
 
@@ -88,14 +100,37 @@ def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.nd
     Raises:
         UserError: one of them is no seed.
     """
-    if np.ndim(values) != 1:
+    try:
+        flat = np.ndim(values) == 1
+    except ValueError:  # lists of several lengths
+        flat = False
+    if not flat:
         raise UserError(f"{name}s must be a sequence of integers, got {_shown(values)}")
-    if isinstance(values, np.ndarray | jax.Array) and len(values):
+    whole = isinstance(values, np.ndarray | jax.Array) and np.issubdtype(values.dtype, np.integer)
+    if whole and len(values):
         array = np.asarray(values)  # of one type, so that its extremes speak for all
         for extreme in (array.min(), array.max()):
             check_seed(extreme, name)
         return array.astype(np.uint32)
     return np.array([check_seed(value, name) for value in values], np.uint32)
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Returns a boolean of Python.
+
+    Args:
+        name: of the flag, for the message.
+        value: true or false in any type, or 1 or 0; an array may hold one of these.
+
+    Raises:
+        UserError: anything else.
+    """
+    if isinstance(value, bool):
+        return value
+    array = np.asarray(value)
+    if array.size != 1 or array.dtype.kind not in "biuf" or array.item() not in (0, 1):
+        raise UserError(f"{name} must be true or false, got {_shown(value)}")
+    return bool(array.item())
 
 
 def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray:
@@ -110,6 +145,17 @@ def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray
         UserError: no sequence, or one of them is not an integer, or out of range.
     """
     return np.array([check_integer(name, value, least) for value in _items(name, values)], np.int64)
+
+
+def check_numbers(
+    name: str, values: Sequence[Any], least: float = -LARGEST, most: float = LARGEST
+) -> list[float]:
+    """Returns finite floats of Python; see `check_number`.
+
+    Raises:
+        UserError: no sequence, or one of them is no such number.
+    """
+    return [check_number(name, value, least, most) for value in _items(name, values)]
 
 
 def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ...]:
@@ -245,7 +291,7 @@ def check_within(config: object, least: float, most: float, *names: str) -> None
 def _items(name: str, values: Any) -> list[Any]:
     """What a sequence holds."""
     try:
-        if isinstance(values, str | bytes):
+        if isinstance(values, str | bytes | Mapping):  # whose items are keys
             raise TypeError
         # Of an array of JAX as NumPy's, whose booleans and integers can be told apart.
         return list(np.asarray(values) if hasattr(values, "dtype") else values)

@@ -7,13 +7,14 @@ that are out of range, and energies that are NaN; inside, a plan says whether it
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.checks import check_indices, check_number
+from leapjax.checks import check_indices, check_kind, check_numbers
+from leapjax.errors import UserError, first_line
 from leapjax.types import (
     Energy,
     Params,
@@ -53,7 +54,7 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
         actions, positions = _check_query(actions, positions, num_actions)
         tokens = actions.at[positions].set(mask)
         scores = logits(params, memory, tokens, positions)
-        chex.assert_shape(scores, (positions.shape[0], num_actions))
+        scores = _check_floats("logits", scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     total = _sum_of_conditionals(conditional, num_actions)
@@ -80,7 +81,7 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, num_actions)
         scores = logits(params, memory, actions, positions)
-        chex.assert_shape(scores, (positions.shape[0], num_actions))
+        scores = _check_floats("logits", scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -107,9 +108,8 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
 
     def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
-        energy = jnp.asarray(total(params, memory, actions), jnp.float32)
-        if energy.shape:
-            raise ValueError(f"a total must be one number, got shape {energy.shape}")
+        energy = _check_floats("a total", total(params, memory, actions), ())
+        energy = jnp.asarray(energy, jnp.float32)
         return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
     def conditional(
@@ -141,8 +141,7 @@ def single_action(
     """
 
     def energies(params: Params, memory: PyTree) -> jax.Array:
-        found = scores(params, memory)
-        chex.assert_shape(found, (num_actions - 1,))
+        found = _check_floats("scores", scores(params, memory), (num_actions - 1,))
         return jnp.append(-found, jnp.inf)
 
     def conditional(
@@ -194,13 +193,16 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
         ValueError: no energies, different action sets, or weights that are negative, not
             finite or not as many as the energies.
     """
-    energies = tuple(energies)
-    weights = [1.0] * len(energies) if weights is None else list(weights)
+    if isinstance(energies, Energy):  # a tuple itself, of functions
+        raise UserError("compose takes a sequence of energies, got one energy")
+    energies = tuple(check_kind(energy, Energy) for energy in energies)
+    if weights is None:
+        weights = [1.0] * len(energies)
+    weights = check_numbers("weights", weights, 0)
     if not energies:
         raise ValueError("compose needs at least one energy")
     if len(weights) != len(energies):
         raise ValueError(f"{len(energies)} energies need as many weights, got {len(weights)}")
-    weights = [check_number("a weight", weight, 0) for weight in weights]
     action_sets = {energy.num_actions for energy in energies}
     if len(action_sets) > 1:
         raise ValueError(
@@ -212,6 +214,12 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     active = [index for index, weight in enumerate(weights) if weight >= np.finfo(np.float32).tiny]
 
     def encode(params: Params, context: PyTree) -> PyTree:
+        counted = isinstance(params, Sequence | np.ndarray | jax.Array)
+        if not counted or len(params) != len(energies):
+            raise UserError(
+                f"params of {len(energies)} composed energies must be a tuple of as many, got "
+                f"{type(params).__name__}" + (f" of {len(params)}" if counted else "")
+            )
         return tuple(energy.encode(p, context) for energy, p in zip(energies, params, strict=True))
 
     def conditional(
@@ -266,13 +274,16 @@ def constrain(
             positive (+inf for never) where it is not.
         partial: the penalty takes plans that hold MASK, the number of actions, too.
     """
-    complete = energy.num_actions - 1  # the last action
+    complete = check_kind(energy, Energy).num_actions - 1  # the last action
+
+    def judge(context: PyTree, plan: jax.Array) -> jax.Array:
+        return _check_floats("a penalty", penalty(context, plan), ())
 
     def known(context: PyTree, plan: jax.Array) -> jax.Array:
         """The penalty of what a plan says so far."""
         if partial:
-            return penalty(context, plan)
-        judged = penalty(context, jnp.minimum(plan, complete))
+            return judge(context, plan)
+        judged = judge(context, jnp.minimum(plan, complete))
         return jnp.where(jnp.all(plan <= complete), judged, 0.0)
 
     def encode(params: Params, context: PyTree) -> PyTree:
@@ -296,13 +307,13 @@ def constrain(
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
         actions = _check_plan(actions, energy.num_actions)
-        return _check_total(energy.total(params, inner, actions) + penalty(context, actions))
+        return _check_total(energy.total(params, inner, actions) + judge(context, actions))
 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
         actions = _check_plan(actions, energy.num_actions)
         # What one penalty allows, even rewards, makes no other violation good.
-        mine = jnp.maximum(penalty(context, actions), 0.0)
+        mine = jnp.maximum(judge(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
 
     return energy._replace(
@@ -324,7 +335,7 @@ def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
     def encode(params: Params, context: PyTree) -> PyTree:
         return energy.encode(params, function(context))
 
-    return energy._replace(encode=encode, encoded=nothing_encoded)
+    return check_kind(energy, Energy)._replace(encode=encode, encoded=nothing_encoded)
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
@@ -343,7 +354,7 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
         ValueError: the energy accepts no MASK, the actions are none, all, or none of its own, or
             it is constrained: what is MASK would not be judged.
     """
-    chosen = check_indices("neutral actions", actions, energy.num_actions)
+    chosen = check_indices("neutral actions", actions, check_kind(energy, Energy).num_actions)
     if energy.violation is not no_violation:
         raise ValueError("neutral comes before constrain: constrain what it returns")
     if not energy.accepts_mask:
@@ -425,7 +436,8 @@ def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> ja
         # NumPy keeps 64 bits, which JAX would cut off.
         values = jnp.asarray(values) if traced else np.asarray(values)
         values = values if values.size else values.astype(np.int32)  # an empty list has no type
-    chex.assert_rank(values, 1)
+    if values.ndim != 1:
+        raise UserError(f"{name} must be a sequence of integers, got shape {values.shape}")
     if not jnp.issubdtype(values.dtype, jnp.integer):
         raise ValueError(f"{name} must be integers, got {values.dtype}")
     if not isinstance(values, jax.core.Tracer) and values.size:
@@ -433,6 +445,27 @@ def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> ja
         if int(seen.min()) < 0 or int(seen.max()) >= end:
             raise ValueError(f"{name} {seen} are not all in {expected}")
     return jnp.asarray(values, jnp.int32)
+
+
+def _check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
+    """Real numbers of a shape as JAX's array of floats: unsigned integers have no negatives.
+
+    Raises:
+        UserError: another shape, or no real numbers.
+    """
+    try:
+        # Python's integers may be larger than those of JAX.
+        array = jnp.asarray(float(values) if isinstance(values, int) else values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"{name} must be numbers: {first_line(error)}") from error
+    if array.shape != shape:
+        expected = f"{name} must be of shape {shape}" if shape else f"{name} must be one number"
+        raise UserError(f"{expected}, got shape {array.shape}")
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if not (jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == bool):
+        raise UserError(f"{name} must be real numbers, got {array.dtype}")
+    return array.astype(jnp.float32)
 
 
 def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:

@@ -1,12 +1,14 @@
 """Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
 
 import contextlib
+import inspect
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import gymnasium as gym
 
 from leapjax.checks import check_number
+from leapjax.errors import UserError
 from leapjax.types import Array, PyTree, to_plain_dicts
 
 A = TypeVar("A", bound="Adapter")
@@ -68,7 +70,7 @@ class Criterion(NamedTuple):
     Attributes:
         least_return: that the episode has to reach; None: it has to terminate with a positive
             reward.
-        given: by the user; otherwise by the environment's `reward_threshold`, or by nobody.
+        given: whether the user gave it; if not, it is the environment's `reward_threshold`.
     """
 
     least_return: float | None
@@ -113,7 +115,8 @@ def judge_episode(
     """
     if criterion.least_return is None:
         return bool(terminated and reward > 0)
-    # So far, for who ends it early; but what is lost on the way is known at the end alone.
+    # A positive return may be reached before the end, and the planner may stop there. A return of
+    # 0 or less holds from the start, so only the end shows whether it is kept.
     over = terminated or truncated or criterion.least_return > 0
     return bool(over and total >= criterion.least_return)
 
@@ -148,13 +151,13 @@ def closing(adapter: A) -> Iterator[A]:
 def environments_of(adapter: Adapter) -> list[object]:
     """The Gymnasium environments that an adapter steps, without their wrappers.
 
-    Those that are attributes of the adapter, of its class, or of another adapter inside it.
+    Finds attributes of the adapter, of its class, and of other adapters inside it. Lists are not
+    searched: a list of environments that all adapters know says nothing of which one is stepped.
     """
     found: list[object] = []
     owners: list[Any] = [adapter]
     for owner in owners:
-        places = (*type(owner).__mro__, owner)
-        for part in [part for place in places for part in getattr(place, "__dict__", {}).values()]:
+        for part in _list_attributes(owner):
             if isinstance(part, _ENVIRONMENTS):
                 found.append(part.unwrapped)
             elif callable(getattr(part, "step", None)) and id(part) not in map(id, owners):
@@ -162,20 +165,38 @@ def environments_of(adapter: Adapter) -> list[object]:
     return found
 
 
+def _count(found: Any) -> str:
+    """What a step returned, in a message."""
+    return f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+
+
+def _list_attributes(owner: object) -> list[Any]:
+    """The attributes of an object and of its class; not what containers among them hold."""
+    kinds = type(owner).__mro__
+    found = [part for place in (*kinds, owner) for part in getattr(place, "__dict__", {}).values()]
+    slots = filter(inspect.ismemberdescriptor, found)  # which no `__dict__` of an object has
+    return [*found, *(getattr(owner, slot.__name__, None) for slot in slots)]
+
+
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
-    An episode succeeds when its return reaches `success_return`; where that is None, what its
-    authors ask for (`reward_threshold`); where they ask for nothing, when it terminates with a
-    positive reward.
+    An episode succeeds when its return reaches `success_return`. If that is None, the return is
+    the environment's `reward_threshold`. If there is none either, an episode succeeds when it
+    terminates with a positive reward.
     """
 
     def __init__(self, env: gym.Env, success_return: float | None = None) -> None:
-        if not isinstance(env.action_space, gym.spaces.Discrete):
-            raise ValueError(f"a Discrete action space is needed, got {env.action_space}")
+        actions = getattr(env, "action_space", None)
+        if actions is None:
+            raise UserError(
+                f"expected a Gymnasium environment, such as gymnasium.make returns, got {env!r}"
+            )
+        if not isinstance(actions, gym.spaces.Discrete):
+            raise ValueError(f"a Discrete action space is needed, got {actions}")
         self.env = env
-        self.num_actions = int(env.action_space.n) + 1
-        self._first_action = int(env.action_space.start)
+        self.num_actions = int(actions.n) + 1
+        self._first_action = int(actions.start)
         self.criterion = find_criterion(env, success_return)
         self._return = 0.0
 
@@ -192,8 +213,17 @@ class GymnasiumAdapter:
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
-        observation, reward, terminated, truncated, _ = self.env.step(self._first_action + action)
-        reward = float(reward)
+        found = self.env.step(self._first_action + action)
+        if not (isinstance(found, tuple) and len(found) == 5):
+            raise UserError(
+                f"step of {self.env} returned {_count(found)}, not (observation, reward, "
+                "terminated, truncated, info): wrap it for Gymnasium"
+            )
+        observation, reward, terminated, truncated, _ = found
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            raise UserError(f"step of {self.env} gave a reward of {reward!r}, no number") from None
         self._return += reward
         success = judge_episode(self.criterion, self._return, reward, terminated, truncated)
         return Transition(to_plain_dicts(observation), reward, terminated, truncated, success)

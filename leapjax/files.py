@@ -13,9 +13,12 @@ from leapjax.errors import UserError, first_line
 
 SPARE = 2**23  # bytes that are left free on every disk
 LARGEST_TEXT = 2**26  # bytes of a file of text: more is not ours, and parsing takes many times that
+CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")  # the limit of a container, on Linux
 
 try:
     import fcntl
+    import grp
+    import pwd
 except ImportError:  # not on Windows: there, nothing keeps two processes apart
     fcntl = None  # type: ignore[assignment]
 
@@ -163,10 +166,25 @@ def _check_private(folder: Path, sticky: bool) -> None:
     if status.st_uid not in (user, 0):
         raise UserError(f"{folder} belongs to another user (uid {status.st_uid}): name another")
     mode = status.st_mode
-    # By convention, the group with a user's own number has no other members.
-    others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid != user)
+    others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _is_own_group(status.st_gid))
     if others and not (sticky and mode & stat.S_ISVTX):
         raise UserError(f"others can write to {folder}: name another, or run chmod go-w on it")
+
+
+def _is_own_group(group: int) -> bool:
+    """Whether a group is this user's own, as systems make one for each user.
+
+    By convention it has the number or the name of the user. The numbers differ where a group was
+    made for something else before.
+    """
+    user = os.getuid()
+    if group == user:
+        return True
+    try:
+        found, name = grp.getgrgid(group), pwd.getpwuid(user).pw_name
+    except KeyError:
+        return False
+    return found.gr_name == name and set(found.gr_mem) <= {name}
 
 
 def flush(path: Path) -> None:
@@ -199,7 +217,7 @@ def check_room(folder: Path, needed: int) -> None:
 
 
 def check_memory(needed: int, what: str) -> None:
-    """Refuses what is larger than the memory of this machine, where the system says how much it is.
+    """Refuses what is larger than the memory of this machine, or of the container that we are in.
 
     Args:
         needed: bytes, at least.
@@ -211,6 +229,8 @@ def check_memory(needed: int, what: str) -> None:
     if not hasattr(os, "sysconf"):  # Windows does not say
         return
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with contextlib.suppress(OSError, ValueError):  # no container, or "max"
+        memory = min(memory, int(CONTAINER_MEMORY.read_text()))
     if needed > memory:
         raise UserError(
             f"{what}: at least {needed >> 30} GiB of memory would be needed, and this machine has "
@@ -248,7 +268,7 @@ def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
         # Not a link: what it leads to would be emptied.
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         file = os.fdopen(os.open(folder / ".lock", flags, 0o666), "ab+", buffering=0)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a null byte
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
     with file:
         if fcntl is not None:

@@ -12,7 +12,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from leapjax.checks import check_at_least, check_number, check_types
+from leapjax.checks import check_at_least, check_kind, check_number, check_types
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number
@@ -511,7 +511,8 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
     """`(params, key, context) -> Plan`: the planner that a configuration belongs to.
 
     Raises:
-        TypeError: it belongs to none.
+        UserError: the energy is no `Energy`.
+        TypeError: the configuration belongs to no planner.
     """
     planners: dict[type, Callable[..., Plan]] = {
         GibbsConfig: gibbs,
@@ -519,8 +520,10 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
         CrossEntropyConfig: cross_entropy_method,
         BeamConfig: beam_search,
     }
+    check_kind(energy, Energy)
     if type(config) not in planners:
-        raise TypeError(f"no planner takes a {type(config).__name__}")
+        known = ", ".join(kind.__name__ for kind in planners)
+        raise TypeError(f"no planner takes a {type(config).__name__}: expected one of {known}")
     planner = planners[type(config)]
 
     def plan(params: Params, key: jax.Array, context: PyTree) -> Plan:

@@ -255,7 +255,7 @@ def _trace_parameters(
         )
     try:
         return jax.eval_shape(agent.init, jax.random.key(0)).params
-    except (ArithmeticError, TypeError, ValueError) as error:
+    except (ArithmeticError, MemoryError, TypeError, ValueError) as error:
         raise UserError(f"{folder}: its network cannot be built: {first_line(error)}") from error
 
 
@@ -284,6 +284,10 @@ def load(
         UserError: no such run, one that cannot be read or has not come to its end, another
             horizon, a level that needs another network, or a return that it cannot be asked for.
     """
+    if planner is not None and not isinstance(planner, PlannerConfig):
+        raise UserError(f"planner must be a configuration such as GibbsConfig, got {planner!r}")
+    if not isinstance(level, str | None):
+        raise UserError(f"level must be a text, got {level!r}")
     folder = find(path)
     specification, saved = _read_sealed(folder)
     whose = identity(specification)

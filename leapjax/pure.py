@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.batching import check_fit, plan_key, planner_key
-from leapjax.checks import check_integer, check_seeds
+from leapjax.checks import check_integer, check_kind, check_seeds
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.planners import PlannerConfig, bind
@@ -83,7 +83,8 @@ def compile_rollout(
     """
     context, max_steps = check_integer("context", context), check_integer("max_steps", max_steps, 1)
     executed, _ = check_limits(executed, max_steps)
-    check_actions("energy", energy.num_actions, environment.num_actions)
+    check_kind(environment, PureEnvironment)
+    check_actions("energy", check_kind(energy, Energy).num_actions, environment.num_actions)
     _check_environment(environment)
     plan = bind(energy, config)
     end = energy.num_actions - 1

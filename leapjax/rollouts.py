@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
-from leapjax.checks import check_integer, check_seed, check_seeds
-from leapjax.environments import Adapter, Eager, close, environments_of
+from leapjax.checks import check_flag, check_integer, check_seed, check_seeds
+from leapjax.environments import Adapter, Eager, Transition, close, environments_of
 from leapjax.errors import UserError
 from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token, to_plain_dicts
 
@@ -34,7 +34,7 @@ class Episodes(NamedTuple):
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:
-    """Episodes that were played side by side: counts add up, the slowest has the say."""
+    """Joins episodes that were played at the same time: plans add up, the longest time counts."""
     return Episodes(
         np.concatenate([part.seeds for part in parts]),
         np.concatenate([part.successes for part in parts]),
@@ -113,8 +113,9 @@ class History:
             self._rewards = [*self._rewards, reward][-self._length :]
         self._encoded = encoded
         self.current = self._checked(observation)
+        number = _read_number("reward", reward, self.where)
         self.return_so_far += reward
-        for name, value in (("reward", reward), ("return", self.return_so_far)):
+        for name, value in (("reward", number), ("return", float(self.return_so_far))):
             if not -LARGEST <= value <= LARGEST:
                 raise UserError(
                     f"the environment gave a {name} of {value} at {self.where}: expected a finite "
@@ -179,12 +180,60 @@ def check_limits(executed: int | None, max_steps: int | None) -> tuple[int | Non
     return checked[0], checked[1]
 
 
-def check_actions(of: str, planned: int, possible: int) -> None:
-    """Refuses what plans with other actions than its environment has.
+def check_adapter(adapter: Adapter) -> None:
+    """Refuses what is not an `Adapter`.
 
     Raises:
-        ValueError: says how many there are.
+        UserError: says what it is, and what to do with an environment of Gymnasium.
     """
+    # Not `isinstance`, which does not see what `__getattr__` of a wrapper finds.
+    parts = ("num_actions", "reset", "step")
+    if isinstance(adapter, type) or not all(hasattr(adapter, part) for part in parts):
+        raise UserError(
+            f"make_adapter returned {_name_kind(adapter)}, expected an Adapter, which has "
+            "num_actions, reset(seed) and step(action): "
+            "leapjax.environments.GymnasiumAdapter(env) makes one of a Gymnasium environment"
+        )
+
+
+def _name_kind(value: Any) -> str:
+    """What a value is, in a message."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
+def _read_number(name: str, value: Any, where: str) -> float:
+    """Returns a reward or a score as a float of Python, which may be NaN or infinite.
+
+    Args:
+        name: of the number, for the message.
+        value: one real number of any type.
+        where: the episode and the step.
+
+    Raises:
+        UserError: not one real number.
+    """
+    try:
+        if isinstance(value, str | bytes) or np.ndim(value):
+            raise TypeError
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(
+            f"the environment gave a {name} of {str(value)[:60]} at {where}: expected a number"
+        ) from None
+
+
+def check_actions(of: str, planned: int, possible: int) -> None:
+    """Refuses a planner, or an energy, with other actions than its environment.
+
+    Args:
+        of: what plans, for the message.
+        planned: A of the plans.
+        possible: A of the environment.
+
+    Raises:
+        ValueError: says how many each has.
+    """
+    possible = check_integer("num_actions of the environment", possible, 1)
     if possible != planned:
         raise ValueError(
             f"the {of} has {planned} actions and the environment {possible}, the end action "
@@ -195,7 +244,7 @@ def check_actions(of: str, planned: int, possible: int) -> None:
 def kept(plans: Plan, executed: int | None) -> Array | None:
     """What is known of past states when the next plans are made, `[B, K, D]`.
 
-    Of those that were seen while a plan of several actions was executed nothing is.
+    None if more than one action was executed: the states in between were not encoded.
     """
     single = executed == 1 or plans.actions.shape[1] == 1
     return plans.encoded[:, 1:] if single and plans.encoded is not None else None
@@ -265,10 +314,16 @@ def evaluate(
 
     Raises:
         UserError: no seeds, or a seed or a count that is not an integer of its range; environments
-            that are one and the same, that have other actions than the planner, or that give
-            values which `History` refuses, or a score that is not finite.
+            that are not adapters, that are one and the same, that have other actions than the
+            planner, or that give values which `History` refuses, a score that is not finite, or
+            ends and successes that are not booleans.
         NotANumber: see `CompiledPlanner`.
     """
+    if not callable(make_adapter):
+        raise UserError(
+            f"make_adapter is {_name_kind(make_adapter)}: expected a function that makes a new "
+            "adapter for each episode"
+        )
     level_seeds = check_seeds(seeds, "level seed")
     seed, context = check_seed(seed), check_integer("context", context)
     executed, max_steps = check_limits(executed, max_steps)
@@ -289,6 +344,7 @@ def evaluate(
     def begin(place: int) -> _Episode:
         level_seed = int(level_seeds[place])
         adapter = opened[place] = make_adapter()
+        check_adapter(adapter)
         check_actions("planner", plan.num_actions, adapter.num_actions)
         history = History(adapter.reset(level_seed), context, end + 1, level_seed)
         episode = _Episode(place, level_seed, adapter, history)
@@ -327,18 +383,26 @@ def evaluate(
             if action >= end:  # or MASK, of a plan that is executed before it is complete
                 return bool(actions[0] >= end)
             found = episode.adapter.step(int(action))
+            if not isinstance(found, Transition):
+                raise UserError(
+                    f"step of {type(episode.adapter).__name__} returned {type(found).__name__}: "
+                    "expected a leapjax.environments.Transition"
+                )
             history.advance(
                 found.executed(int(action)), found.observation, found.reward, encoded
             )  # fmt: skip
-            if not math.isfinite(found.counted):
-                raise UserError(
-                    f"the environment gave a score of {found.counted} at {history.where}"
-                )
-            scores[place] += found.counted
+            score = _read_number("score", found.counted, history.where)
+            if not math.isfinite(score):
+                raise UserError(f"the environment gave a score of {score} at {history.where}")
+            scores[place] += score
             lengths[place] = history.step
             too_long = max_steps is not None and history.step >= max_steps
-            if found.terminated or found.truncated or too_long:
-                successes[place] = found.success
+            terminated, truncated, success = (
+                check_flag(f"{name} at {history.where}", getattr(found, name))
+                for name in ("terminated", "truncated", "success")
+            )
+            if terminated or truncated or too_long:
+                successes[place] = success
                 return True
         return False
 

@@ -42,6 +42,8 @@ def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int
     """
     batch, fsdp = check_integer("batch", batch, 1), check_integer("fsdp", fsdp, 1)
     devices = jax.local_devices() if devices is None else devices
+    if not isinstance(devices, Sequence) or not all(isinstance(d, jax.Device) for d in devices):
+        raise ValueError(f"devices must be a sequence such as jax.devices(), got {devices!r}")
     if not devices:
         raise ValueError("a mesh needs at least one device, got none")
     groups: dict[int, list[jax.Device]] = {}

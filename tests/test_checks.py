@@ -145,3 +145,28 @@ def test_counts_of_any_sequence_are_the_same_array(values):
     found = checks.check_counts("counts", values)
     assert found.dtype == np.int64
     assert found.tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 1, 1.0, np.array([1]), jnp.array(True)])
+def test_a_flag_is_a_boolean_of_any_type(value):
+    assert checks.check_flag("over", value) is True
+
+
+@pytest.mark.parametrize("value", ["no", None, math.nan, 2, [True, False], [], {}])
+def test_what_is_no_flag_is_refused(value):
+    with pytest.raises(UserError, match="over must be true or false"):
+        checks.check_flag("over", value)
+
+
+@pytest.mark.parametrize(
+    "values", [[[1, 2], [3]], np.array(["a"]), np.array([1, None]), np.array([1.5]), {"a": 1}]
+)
+def test_what_is_no_sequence_of_seeds_is_refused(values):
+    with pytest.raises(UserError, match="seed"):
+        checks.check_seeds(values)
+
+
+def test_a_mapping_is_no_sequence():
+    for check in (checks.check_counts, checks.check_numbers):
+        with pytest.raises(UserError, match="weights must be a sequence"):
+            check("weights", {1: 2})

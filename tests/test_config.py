@@ -243,7 +243,7 @@ def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path
     config.check(dataclasses.replace(chosen, checkpoint=tmp_path))
 
 
-def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch):
+def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch, tmp_path):
     pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
     monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
 
@@ -269,6 +269,10 @@ def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkey
         memory.check_program(Compiled())
     Compiled.memory_analysis = lambda self: None  # a backend that does not say
     memory.check_program(Compiled())
+    (tmp_path / "memory.max").write_text("2147483648\n")  # a container of 2 GiB
+    monkeypatch.setattr(files, "CONTAINER_MEMORY", tmp_path / "memory.max")
+    with pytest.raises(UserError, match="this machine has 2"):
+        memory.check_state(state(200))
     monkeypatch.delattr(files.os, "sysconf")  # Windows does not say
     memory.check_state(state(2**40))
 

@@ -17,6 +17,7 @@ from leapjax.energy import (
     single_action,
     view,
 )
+from leapjax.errors import UserError
 from leapjax.planners import BeamConfig, GibbsConfig, bind, gibbs
 from leapjax.types import Energy, mask_token, no_violation, pad_token
 from tests.enumerable import (
@@ -393,7 +394,7 @@ def test_compose_refuses_different_action_sets():
     "weight", [-1.0, float("inf"), float("nan"), 1e39, True, "1", None, np.ones(1), 1j]
 )
 def test_compose_refuses_impossible_weights(weight):
-    with pytest.raises(ValueError, match="a weight must be"):
+    with pytest.raises(ValueError, match="weights must be"):
         compose([ENUMERABLE, ENUMERABLE], [1.0, weight])
 
 
@@ -711,7 +712,7 @@ def test_one_action_at_a_time_has_no_other_horizon():
 
 def test_scores_are_one_for_each_action_but_the_end():
     wrong = single_action(lambda params, context: (), lambda p, m: jnp.zeros(3), 3)
-    with pytest.raises(AssertionError):
+    with pytest.raises(UserError, match=r"scores must be of shape \(2,\), got shape \(3,\)"):
         wrong.total(None, (), jnp.zeros(1, jnp.int32))
 
 
@@ -838,7 +839,7 @@ def test_scores_without_a_distribution_are_refused(row):
     assert np.isfinite(energy.conditional(None, None, actions, jnp.array([0, 2]))).all()
     with pytest.raises(ValueError, match=r"energies at positions \[1\] are NaN"):
         energy.conditional(None, None, actions, jnp.array([2, 1]))
-    with pytest.raises(AssertionError):
+    with pytest.raises(UserError, match=r"logits must be of shape \(1, 3\)"):
         wrong = pseudo_likelihood(lambda p, c: None, lambda *_: jnp.zeros((1, 2)), ACTIONS)
         jax.jit(wrong.conditional)(None, None, actions, jnp.array([0]))
 
@@ -854,3 +855,59 @@ def test_totals_and_penalties_that_are_nan_are_refused():
         penalised.conditional(None, (None, None), nothing, jnp.array([0]))
     with pytest.raises(ValueError, match="energy of the plan is NaN"):
         penalised.total(None, (None, None), nothing)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint32, np.int32, bool, jnp.bfloat16])
+def test_scores_of_any_real_type_are_the_numbers_that_they_say(kind):
+    scores = jnp.array([1, 0], kind)  # an unsigned -1 would be 2^32 - 1
+    energy = single_action(lambda params, context: (), lambda p, m: scores, 3)
+    energies = energy.conditional(None, (), jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32))
+    np.testing.assert_array_equal(energies, [[-1, 0, np.inf]])
+    logits = jnp.array([0, 1, 0], kind)
+    model = pseudo_likelihood(lambda *_: None, lambda p, m, t, q: logits[None], 3)
+    assert jnp.argmin(model.conditional(None, None, jnp.zeros(1, int), jnp.zeros(1, int))) == 1
+
+
+@pytest.mark.parametrize("penalty", [np.ones(HORIZON), np.ones(1), None, 1j])
+def test_a_penalty_is_one_real_number(penalty):
+    energy = constrain(scoring(np.zeros((HORIZON, ACTIONS), np.float32)), lambda c, a: penalty)
+    actions = jnp.zeros(HORIZON, jnp.int32)
+    for judge in (energy.total, energy.violation):
+        with pytest.raises(UserError, match="a penalty must be"):
+            judge(None, (None, None), actions)
+    with pytest.raises(UserError, match="a penalty must be"):
+        energy.conditional(None, (None, None), actions, jnp.array([0]))
+
+
+@pytest.mark.parametrize("penalty", [0, 10**12, True, np.float64(1), np.uint8(2)])
+def test_a_penalty_may_be_a_number_of_any_real_type(penalty):
+    energy = constrain(scoring(np.zeros((HORIZON, ACTIONS), np.float32)), lambda c, a: penalty)
+    assert energy.violation(None, (None, None), jnp.zeros(HORIZON, jnp.int32)) == float(penalty)
+
+
+def test_what_is_no_energy_is_refused():
+    energy = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
+    with pytest.raises(UserError, match="a sequence of energies, got one energy"):
+        compose(energy)
+    for make in (
+        lambda: compose([energy, None]),
+        lambda: constrain(energy.total, lambda c, a: 0),
+        lambda: view(3, lambda context: context),
+        lambda: neutral(None, [0]),
+        lambda: compile_planner(None, GibbsConfig()),
+    ):
+        with pytest.raises(UserError, match="expected Energy, got"):
+            make()
+
+
+@pytest.mark.parametrize("params", [(None,), (None,) * 3, {"a": 1, "b": 2}, None, "ab c"])
+def test_composed_energies_need_as_many_parameters(params):
+    energy = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
+    with pytest.raises(UserError, match="params of 2 composed energies must be a tuple"):
+        compose([energy, energy]).encode(params, None)
+
+
+@pytest.mark.parametrize("actions", [[[0]], 0, "abc", None])
+def test_a_plan_is_a_sequence_of_actions(actions):
+    with pytest.raises(UserError, match="must be a sequence of integers"):
+        scoring(np.zeros((HORIZON, ACTIONS), np.float32)).total(None, None, actions)

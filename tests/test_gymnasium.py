@@ -18,6 +18,8 @@ from gymnasium.wrappers import (
     RecordEpisodeStatistics,
     RescaleObservation,
     StickyAction,
+    TransformAction,
+    TransformObservation,
     TransformReward,
 )
 from minari import DataCollector
@@ -401,7 +403,7 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(
     assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [
         ["choices", 64, 0]
     ]
-    for wrong in ("[]", "{", "8x8"):
+    for wrong in ("[]", "{", "8x8", "[" * 100_000):
         with pytest.raises(ValueError, match="arguments must be a JSON object like"):
             Settings(arguments=wrong)
 
@@ -428,20 +430,36 @@ def loaded(name, level, **options):
         (lambda env: StickyAction(env, 0.25), "StickyAction"),  # its spaces are the same
         (lambda env: ClipReward(env, 0.0, 0.5), "ClipReward"),
         (lambda env: RecordEpisodeStatistics(FrameStackObservation(env, 2)), "FrameStackObserv"),
-        (lambda env: TransformReward(env, abs), None),  # a function: Minari keeps nothing then
     ],
 )
 def test_data_recorded_through_wrappers_are_refused_by_name(wrap, says):
     name = recorded("my/wrapped-v0", "MountainCar-v0", lambda seen: 1, 1, wrap)
-    if says is None:
-        assert len(loaded(name, "MountainCar-v0")) == 1
-        return
     with pytest.raises(
         UserError, match=f"'{name}' was recorded with the wrappers {says}"
     ) as raised:
         loaded(name, "MountainCar-v0")
     assert "MountainCar-v0 is played with no wrappers" in str(raised.value)
     assert "MODULE:MountainCar-v0" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "says"),
+    [
+        (lambda env: TransformReward(env, abs), "reward at step 0"),
+        (lambda env: TransformObservation(env, lambda x: x[::-1], None), "first observation"),
+        (lambda env: TransformAction(env, lambda a: 2 - a, None), "observation after step 0"),
+        (lambda env: TransformReward(env, lambda r: r), None),  # changes nothing
+    ],
+)
+def test_wrappers_that_data_cannot_name_are_found_by_playing_again(wrap, says):
+    """Minari keeps nothing of an environment if a wrapper was given a function."""
+    name = recorded("my/wrapped-v0", "MountainCar-v0", lambda seen: 0, 1, wrap)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        assert len(loaded(name, "MountainCar-v0")) == 1
+    told = [str(each.message) for each in warned if "may not have been recorded" in str(each)]
+    assert len(told) == (says is not None)
+    assert says is None or f"with its seed 0 has another {says}; look for wrappers" in told[0]
 
 
 def test_wrappers_that_only_watch_are_nothing_to_refuse():
@@ -613,7 +631,7 @@ def test_dicts_of_any_kind_are_one_structure_in_data(minari_folder):
 
     blank = {"b": np.zeros((), np.int64), "a": np.zeros(2, np.float32)}
     seen = {"b": np.arange(3), "a": np.ones((3, 2), np.float32)}
-    rest = np.zeros(2, np.int32), np.zeros(2, np.float32), True, False, 0
+    rest = np.zeros(2, np.int32), np.zeros(2, np.float32), True, False, storage.UNKNOWN_SEED
     kinds = (dict, OrderedDict, FrozenDict)
     domains = [Domain("Own", nothing, None, ("go", "end"), 9, kind(blank), {}) for kind in kinds]
     collection = Collection([Demonstration(kind(seen), *rest) for kind in kinds], {})

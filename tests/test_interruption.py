@@ -140,7 +140,12 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
 def test_a_library_has_no_handlers():
     """`experiments` changes nothing unless it is the program."""
     assert not startup.is_program()
-    check = "import signal, experiments; assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL"
+    check = (
+        "import signal, sys, experiments, leapjax.checkpoints\n"
+        "leapjax.checkpoints.hush_orbax()\n"
+        "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL\n"
+        "assert sys.unraisablehook is sys.__unraisablehook__"
+    )
     assert subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=False).returncode == 0
 
 

@@ -1129,6 +1129,27 @@ def test_contexts_of_words_are_refused():
         batched(CONFIGS["gibbs"])(TABLE, keys, {**contexts, "mission": np.array(["go", "stay"])})
 
 
+@pytest.mark.parametrize("kind", [jnp.bfloat16, np.float16, np.uint64, bool])
+def test_contexts_of_every_type_that_jax_has_are_taken(kind):
+    keys, contexts = batch_of(2)
+    plan = batched(CONFIGS["gibbs"])
+    expected = plan(TABLE, keys, contexts)
+    found = plan(TABLE, keys, {**contexts, "more": np.zeros(2, kind)})
+    np.testing.assert_array_equal(found.actions, expected.actions)
+
+
+@pytest.mark.parametrize("keys", [5, None, "keys", []])
+def test_keys_that_are_no_array_are_refused(keys):
+    with pytest.raises(ValueError, match="keys must be an array|no contexts"):
+        batched(CONFIGS["gibbs"])(TABLE, keys, batch_of(2)[1])
+
+
+@pytest.mark.parametrize("devices", ["cpu", 2, ["cpu"]])
+def test_devices_are_devices(devices):
+    with pytest.raises(ValueError, match="devices must be a sequence"):
+        compile_planner(TILTED, CONFIGS["gibbs"], (1,), devices)
+
+
 def test_keys_may_be_a_list():
     keys, contexts = batch_of(2)
     plan = batched(CONFIGS["gibbs"])

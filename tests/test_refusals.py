@@ -1,9 +1,12 @@
 """What a careless or hostile user does: refused in one line, before any work, and nothing lost."""
 
+import contextlib
 import dataclasses
 import gc
+import grp
 import json
 import os
+import pwd
 import resource
 import shutil
 import subprocess
@@ -31,7 +34,7 @@ from experiments import (
     qualitative,
     report,
 )
-from experiments.common import config, experiment, plots, program, results, run, runtime
+from experiments.common import config, experiment, plots, program, results, run, runtime, startup
 from experiments.common.config import configuration_hash, parse
 from leapjax import checkpoints, files, pretrained
 from leapjax.babyai import demonstrations, levels
@@ -300,6 +303,16 @@ def test_a_specification_of_a_network_that_nothing_can_build(workplace, monkeypa
         leap.load(folder)
 
 
+def test_a_context_that_no_machine_can_hold(workplace):
+    folder = untrained_run(workplace / "run")
+    values = json.loads((folder / "specification.json").read_text())
+    values["context"] = 2**31 - 1
+    (folder / "specification.json").write_text(json.dumps(values))
+    seal(folder)
+    with pytest.raises(UserError, match="cannot be built"):
+        leap.load(folder)
+
+
 # Paths and files.
 
 
@@ -379,6 +392,26 @@ def test_a_folder_that_nobody_else_can_write_to(workplace):
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+def test_a_folder_to_which_the_group_of_its_user_can_write(workplace, monkeypatch):
+    """As umask 002 makes them: the group has the user's name, not always the number."""
+    made = workplace / "made"
+    made.mkdir()
+    os.chown(made, 0, 4321)
+    made.chmod(0o775)
+    mine = pwd.getpwuid(0).pw_name
+    for name, members, private in (
+        (mine, [], True), (mine, [mine], True), (mine, ["other"], False), ("users", [], False),
+    ):  # fmt: skip
+        group = SimpleNamespace(gr_name=name, gr_mem=members)
+        monkeypatch.setattr(grp, "getgrgid", lambda number, group=group: group)
+        with contextlib.nullcontext() if private else pytest.raises(UserError, match="others can"):
+            files.make_private(made)
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="others can write"):  # a group that has no name
+        files.make_private(made)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
 def test_a_folder_of_another_user(workplace):
     made = workplace / "a" / "b"
     files.make_private(made)
@@ -445,6 +478,27 @@ def test_a_level_that_fails_does_not_end_the_others(workplace, capsys, monkeypat
     said = capsys.readouterr()
     assert said.err == "error: something is wrong with it\n"
     assert "GoToLocalS8N7, seed 1, failed" in said.out and "GoToSeqS5R2" in said.out
+
+
+@pytest.mark.parametrize("main", [properties.main, qualitative.main])
+def test_an_analysis_trains_nothing_where_it_cannot_write(workplace, capsys, monkeypatch, main):
+    monkeypatch.setattr(run, "collect", lambda *given: pytest.fail("work was done"))
+    (workplace / "file").write_text("")
+    assert main(["--runs", "file/runs"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: cannot") and said.count("\n") == 1
+
+
+def test_data_in_a_folder_that_no_system_has(workplace, capsys):
+    given = ["collect", "--game", "Breakout", "--folder", "a\0b", "--transitions", "10"]
+    assert atari.main(given) == 2
+    assert capsys.readouterr().err.startswith("error: cannot write to")
+
+
+@pytest.mark.parametrize("main", [babyai.main, properties.main])
+def test_a_seed_that_is_named_twice(capsys, main):
+    assert main(["--seeds", "1", "0", "1"]) == 2
+    assert capsys.readouterr().err == "error: --seeds names 1 twice: both would be one run\n"
 
 
 @pytest.mark.parametrize("record", [True, False])
@@ -654,8 +708,9 @@ def test_a_disk_without_room_is_refused_before_anything_is_written(workplace, mo
 
 
 @only_long
-def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplog):
+def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplog, monkeypatch):
     """One line says so; the threads of Orbax, asyncio and TensorStore say nothing."""
+    monkeypatch.setattr(sys, "unraisablehook", startup.print_unraisable)
     saved = Checkpoints(workplace / "a")
     saved.save(small(1.0))
     arrays = {str(i): jax.random.normal(jax.random.key(i), (200, 200)) for i in range(8)}
@@ -731,3 +786,11 @@ def test_a_bot_that_never_decides_is_a_failed_demonstration():
 def test_a_level_that_the_bot_never_solves_is_refused():
     with pytest.raises(UserError, match="101 of 101 demonstrations .* were dropped"):
         demonstrations.collect(levels.find_level("BabyAI-KeyInBox-v0"), 1000, seed=0)
+
+
+def test_a_working_folder_that_was_removed_is_one_line(capsys):
+    def work():
+        raise FileNotFoundError(2, "No such file or directory")  # as `Path.cwd` does there
+
+    assert program.guarded("experiments.babyai", [], work) == 2
+    assert capsys.readouterr().err == "error: No such file or directory: the working folder\n"

@@ -1,5 +1,6 @@
 import functools
 import math
+import types
 from typing import ClassVar
 
 import gymnasium as gym
@@ -10,7 +11,7 @@ import pytest
 
 import leapjax as leap
 from leapjax import rollouts
-from leapjax.environments import GymnasiumAdapter, Transition, closing
+from leapjax.environments import GymnasiumAdapter, Transition, closing, environments_of
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History, join, stack_contexts
@@ -827,3 +828,72 @@ def stayer() -> leap.CompiledPlanner:
         lambda params, context: (), lambda p, m, actions: actions.sum().astype(jnp.float32), 4
     )
     return compiled(energy)
+
+
+class Odd(Corridor):
+    """A corridor whose steps return something else."""
+
+    def __init__(self, **changed) -> None:
+        super().__init__()
+        self.changed = changed
+
+    def step(self, action: int):
+        found = super().step(action)
+        return self.changed["step"] if "step" in self.changed else found._replace(**self.changed)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: gym.make("CartPole-v1"), "returned TimeLimit, expected an Adapter.*Gymnasium"),
+        (lambda: None, "returned NoneType, expected an Adapter"),
+        (lambda: Corridor, "returned the class Corridor"),
+        (Corridor(), "make_adapter is Corridor: expected a function"),
+        (lambda: Odd(step=(0, 1.0, True, False, {})), "step of Odd returned tuple"),
+        (lambda: Odd(reward="1"), "reward of 1 at step 1 of level seed 3: expected a number"),
+        (lambda: Odd(reward=None), "reward of None"),
+        (lambda: Odd(reward=np.ones(1)), r"reward of \[1\.\]"),
+        (lambda: Odd(score=np.zeros(2)), "score of "),
+        (lambda: Odd(success="no"), "success at step 1 of level seed 3 must be true or false"),
+        (lambda: Odd(terminated=None), "terminated at step 1"),
+        (lambda: Odd(truncated=math.nan), "truncated at step 1"),
+    ],
+)
+def test_an_environment_of_another_kind_is_named(make, says):
+    with pytest.raises(UserError, match=says):
+        rollouts.evaluate(make, [3], walker(), np.int32(4), context=0)
+
+
+def test_numbers_and_marks_of_any_type_are_taken():
+    plain = rollouts.evaluate(Corridor, [3], walker(), np.int32(4), context=0)
+    for one in (np.float16, np.array, jnp.float32, np.uint8):
+        found = rollouts.evaluate(
+            lambda one=one: Odd(reward=one(1), score=one(1), truncated=one(0)),
+            [3], walker(), np.int32(4), context=0,
+        )  # fmt: skip
+        assert found.successes == plain.successes and found.returns == found.lengths
+
+
+def test_an_environment_in_slots_is_found_and_a_list_of_them_is_not_searched():
+    shared = gym.make("CartPole-v1")
+
+    class Slotted:
+        __slots__ = ("empty", "inner")
+
+    slotted = Slotted()
+    slotted.inner = GymnasiumAdapter(shared)
+    assert environments_of(slotted) == [shared.unwrapped]
+    listed = Corridor()
+    listed.pool = [slotted.inner]
+    assert environments_of(listed) == []
+
+
+def test_gymnasium_adapters_name_what_is_no_environment():
+    with pytest.raises(UserError, match="expected a Gymnasium environment"):
+        GymnasiumAdapter("CartPole-v1")
+    env = gym.make("CartPole-v1")
+    for found, says in [((0, 1.0, True, {}), "4 values"), ((0, None, 1, 0, {}), "of None")]:
+        adapter = GymnasiumAdapter(env)
+        adapter.env = types.SimpleNamespace(step=lambda action, found=found: found)
+        with pytest.raises(UserError, match=says):
+            adapter.step(0)

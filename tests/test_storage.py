@@ -25,7 +25,7 @@ from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.observations import Observation
 from leapjax.babyai.settings import Settings
 from leapjax.data import storage
-from leapjax.domain import Collection, Domain
+from leapjax.domain import Collection, Described, Domain
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
@@ -143,7 +143,8 @@ def own_demonstration(blank) -> Demonstration:
     rng = np.random.default_rng(0)
     states = jax.tree.map(lambda x: (100 * rng.random((4, *x.shape))).astype(x.dtype), blank)
     rewards = rng.normal(size=3).astype(np.float32)
-    return Demonstration(states, np.array([0, 1, 1], np.int32), rewards, True, False, seed=3)
+    actions, unknown = np.array([0, 1, 1], np.int32), storage.UNKNOWN_SEED
+    return Demonstration(states, actions, rewards, True, False, unknown)
 
 
 @pytest.mark.parametrize("blank", [ARRAY, FIELDS, NESTED], ids=["array", "fields", "nested"])
@@ -346,6 +347,14 @@ def test_a_file_of_garbage(saved, minari_folder):
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\x00", "[" * 100_000])
 def test_damaged_metadata(saved, minari_folder, text):
     (minari_folder / NAME / "data" / "metadata.json").write_text(text)
+    assert "cannot be read" in refused()
+
+
+def test_metadata_that_have_no_end(saved, minari_folder):
+    path = minari_folder / NAME / "data" / "metadata.json"
+    path.unlink()
+    os.mkfifo(path)
+    assert storage.described(NAME) == Described()
     assert "cannot be read" in refused()
 
 

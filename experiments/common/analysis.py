@@ -24,7 +24,7 @@ from experiments.common.config import AnyConfig, check_counts, configuration_has
 from experiments.common.experiment import Experiment
 from experiments.common.interruption import Interruption
 from experiments.common.results import Row
-from leapjax import checkpoints, pretrained, rollouts
+from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.checkpoints import differences
 from leapjax.data import seeds, windows
@@ -163,7 +163,9 @@ def run_all(analysis: Analysis, options: Options, interruption: Interruption) ->
     wanted = check(analysis, options)
     runtime.start()
     versions = results.versions()
-    work = Work(analysis, options, versions, Console(), interruption)
+    work = Work(analysis, options, versions, Console(markup=False), interruption)
+    for where in (work.rows.parent, options.runs):  # not after hours of work
+        files.check_writable(where)
     rows: list[Row] = []
     for case in wanted:
         for method in methods_of(case):
@@ -180,8 +182,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
     """
     check_counts(options, "episodes")
     len(options.played)  # raises where their seeds leave their range
-    if not options.seeds:
-        raise UserError("--seeds needs at least one seed")
+    configs.check_seeds(options.seeds)
     known = [case.name for case in analysis.cases]
     for name in options.only:
         if name not in known:
@@ -352,7 +353,7 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
         with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
             return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES, finished=True)
-    work.console.print(f"training {folder}", highlight=False, markup=False)
+    work.console.print(f"training {folder}", highlight=False)
     this = experiment.make_run(training, config, seed, work.console, work.interruption)
     with contextlib.ExitStack() as stack:
         return experiment.train(this, work.options.played, stack, plays=False)[0]

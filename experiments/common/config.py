@@ -27,6 +27,7 @@ from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
+from leapjax.rollouts import MOST_OPEN
 
 M = TypeVar("M")
 D = TypeVar("D")
@@ -235,10 +236,7 @@ def check(config: AnyConfig) -> None:
             f"--demos must be at least 1, got {config.demos}: --steps {config.training.steps} "
             "needs demonstrations to train on, and a method that learns nothing has none by default"
         )
-    if not config.seeds:
-        raise UserError("--seeds needs at least one seed")
-    for seed in config.seeds:
-        seeds.training_seeds(seed)
+    check_seeds(config.seeds)
     episode_seeds(config)
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
@@ -276,8 +274,8 @@ def check(config: AnyConfig) -> None:
             f"--context {config.context} is longer than any episode of {config.level}: at most "
             f"{domain.max_steps} steps come before a state"
         )
-    # An agent costs nothing to make, and says what its method cannot do.
     check_memory(config, domain)
+    # An agent costs nothing to make, and says what its method cannot do.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
     fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
@@ -285,6 +283,20 @@ def check(config: AnyConfig) -> None:
             f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
             "begin at once (--fill together)"
         )
+
+
+def check_seeds(training: Sequence[int]) -> None:
+    """Refuses training seeds that are out of range, or one seed twice.
+
+    Raises:
+        UserError: says which.
+    """
+    if not training:
+        raise UserError("--seeds needs at least one seed")
+    for seed in training:
+        seeds.training_seeds(seed)
+        if training.count(seed) > 1:
+            raise UserError(f"--seeds names {seed} twice: both would be one run")
 
 
 def check_target_return(config: AnyConfig) -> None:
@@ -326,7 +338,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         "--width, --layers, --max-steps": 4 * 4 * (
             12 * model.layers * model.width**2 + model.width * embeddings
         ),
-        "--episodes, --context": config.episodes * (context + SMALLEST_ENVIRONMENT),
+        "--episodes, --context": (context + SMALLEST_ENVIRONMENT)
+        * min(config.episodes, MOST_OPEN),
     }  # fmt: skip
     if training.steps and config.checkpoint is None:
         masking = getattr(config.method_settings, "masking", "one")
@@ -353,7 +366,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
 
 def layer_bytes(model: ModelConfig, tokens: int) -> int:
     """Bytes that a layer makes of so many tokens, at least."""
-    # Queries, keys, values and so on; and who attends to whom.
+    # Queries, keys, values and so on; and the weights of attention.
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 

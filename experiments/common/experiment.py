@@ -58,7 +58,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     configs = parse(experiment.domain, arguments)
     runtime.start(configs[0].cluster)
     versions = results.versions()  # of the code that runs, whatever is committed meanwhile
-    console = Console(quiet=not processes.is_first())
+    console = Console(quiet=not processes.is_first(), markup=False)
     runs = [(config, seed) for config in configs for seed in config.seeds]
     rows, failure = [], None
     for config, seed in runs:
@@ -68,7 +68,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
                 rows.append(run_one(experiment, again, seed, versions, console, interruption))
         except program.FAILURES as error:
             if len(runs) > 1:  # the others can still be run
-                console.print(f"{config.level}, seed {seed}, failed: {error}", markup=False)
+                console.print(f"{config.level}, seed {seed}, failed: {error}")
             failure = failure or error
     if rows:
         console.print(results.success_table(rows), results.time_table(rows))
@@ -149,7 +149,7 @@ def run_one(
     folder = this.folder
     console.print(
         f"{config.level}, {config.method}, preset {config.preset}, seed {seed}: "
-        f"{config.checkpoint or folder}", markup=False,
+        f"{config.checkpoint or folder}",
     )  # fmt: skip
     # What can be refused is refused before the run has a folder.
     if config.episodes < jax.process_count():
@@ -189,7 +189,7 @@ def run_one(
                 run.draw(planner, this, played if experiment.iterations else None, metrics)
                 if experiment.animate is not None:
                     experiment.animate(planner, this, played[:3], folder / "plan.gif")
-                console.print(f"pictures: {folder}", highlight=False, markup=False)
+                console.print(f"pictures: {folder}", highlight=False)
 
         processes.first_does(write)
     console.print(results.summarize(row))

@@ -53,8 +53,9 @@ def renamed(arguments: Sequence[str], names: Mapping[str, str]) -> list[str]:
     return [f"{names.get(name, name)}{equals}{value}" for name, equals, value in parts]
 
 
-# A path that is too long, leads through a file, or into a folder that may not be looked into.
-NAMED_WRONGLY = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR}
+# A path that is too long, leads through a file, into a folder that may not be looked into, or into
+# one that was removed, such as the working folder.
+NAMED_WRONGLY = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT}
 
 
 def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
@@ -93,7 +94,8 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
     except OSError as error:
         if error.errno not in NAMED_WRONGLY:
             raise
-        return _end(f"error: {error.strerror}: {error.filename}", 2)
+        place = error.filename or "the working folder"
+        return _end(f"error: {error.strerror}: {place}", 2)
     return 0
 
 

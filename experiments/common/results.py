@@ -232,7 +232,7 @@ def summarize(row: Row) -> str:
     if "criterion" not in row:
         return ", ".join(parts)
     total = f"mean return {format_return(row)}"
-    parts.insert(1 if row["criterion_given"] else 0, total)
+    parts.insert(1 if row.get("criterion_given") else 0, total)
     return f"{', '.join(parts)}; success: {row['criterion']}"
 
 

@@ -36,6 +36,9 @@ def prepare() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    sys.unraisablehook = print_unraisable
+    # Figures go to files. Matplotlib refuses an unknown backend with a traceback.
+    os.environ["MPLBACKEND"] = "agg"
     try:
         import jax  # noqa: F401, PLC0415
     except Exception as error:  # noqa: BLE001  (each setting raises its own)
@@ -55,6 +58,15 @@ def end(number: int, _: FrameType | None = None) -> None:
     with contextlib.suppress(OSError):  # nobody reads it any more
         os.write(2, f"stopped by {stopped}\n".encode())
     os._exit(stopped.exit_code)
+
+
+def print_unraisable(failure: "sys.UnraisableHookArgs") -> None:
+    """The hook for exceptions that nothing can catch: prints all but those of closed event loops.
+
+    If the disk is full, TensorStore reports to event loops that Orbax has closed already.
+    """
+    if failure.object is not None or str(failure.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(failure)
 
 
 def settings_of_jax() -> str:

@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import tempfile
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -32,11 +33,13 @@ from PIL import Image
 from leapjax import files
 from leapjax.checks import MOST, check_fits, check_integer
 from leapjax.domain import Collection, Described, Domain, Recording, Source
+from leapjax.environments import Adapter, closing
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
 DEEPEST = 16  # groups in groups
+COMPARED = 100  # steps of an episode that is played again
 SLAB = 2**28  # bytes that are read at once where sizes are not known yet
 SPACES = ("observation_space", "action_space")  # in the metadata
 STEPWISE = ("actions", "rewards", "terminations", "truncations")  # arrays of an episode
@@ -279,11 +282,59 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
             dropped[result] += 1
         else:
             found.append(result)
+    _compare_with_play(name, domain, found)
     collection = Collection(found, dropped)
     if not found:
         only = f" that can be used, only {reasons(collection)}" if dropped else ""
         raise UserError(f"the Minari data set {name!r} has no episodes{only}")
     return collection
+
+
+def _compare_with_play(name: str, domain: Domain, found: Sequence[Demonstration]) -> None:
+    """Warns if the environment answers the seed and the actions of an episode in another way.
+
+    A data set need not say how its environment was made: Minari leaves that out if a wrapper was
+    given a function. The first episode with a known seed is played again, for some steps.
+    """
+    if _version(name) is not None or domain.replay is not None:  # made here, or all played again
+        return
+    known = next((each for each in found if each.seed != UNKNOWN_SEED), None)
+    problem = None
+    if known is not None:
+        with closing(domain.make_adapter()) as adapter:
+            problem = _find_difference(adapter, known)
+    elif found and described(name).level is None:
+        problem = "the data name neither their environment nor the seeds of its resets"
+    if problem is not None:
+        warnings.warn(
+            f"{name} may not have been recorded in {domain.level} as it is played: {problem}; look "
+            "for wrappers, other arguments or another version",
+            stacklevel=3,
+        )
+
+
+def _find_difference(adapter: Adapter, recorded: Demonstration) -> str | None:
+    """Says where an episode that is played again first differs from its recording."""
+
+    def differs(played: Any, stored: Any) -> bool:
+        pairs = zip(jax.tree.leaves(played), jax.tree.leaves(stored), strict=True)
+        return not all(np.allclose(one, other, rtol=1e-4, atol=1e-5) for one, other in pairs)
+
+    def state(step: int) -> PyTree:
+        return jax.tree.map(lambda leaf: leaf[step], recorded.observations)
+
+    again = f"an episode that is played again with its seed {recorded.seed} has another"
+    if differs(adapter.reset(recorded.seed), state(0)):
+        return f"{again} first observation"
+    for step, action in enumerate(recorded.actions[:COMPARED]):
+        found = adapter.step(int(action))
+        if differs(found.reward, recorded.rewards[step]):
+            return f"{again} reward at step {step}"
+        if differs(found.observation, state(step + 1)):
+            return f"{again} observation after step {step}"
+        if found.terminated or found.truncated:
+            break
+    return None
 
 
 def _name_episode(episode: int, name: str) -> str:
@@ -402,7 +453,7 @@ def described(name: str) -> Described:
     """What a data set says of itself, as far as it does."""
     path = datasets_folder() / name / "data" / "metadata.json"
     try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
+        metadata = json.loads(files.read_text(path))
         count = metadata.get("total_episodes")
     except (OSError, ValueError, AttributeError, RecursionError):
         return Described()
@@ -473,7 +524,11 @@ def _inspect(folder: Path) -> list[PyTree]:
 
 
 def _read_metadata(folder: Path) -> dict[str, Any]:
-    metadata = json.loads((folder / "metadata.json").read_text(encoding="utf-8"))
+    try:
+        text = files.read_text(folder / "metadata.json")
+    except UserError as error:  # whoever inspects says what to do
+        raise ValueError(str(error)) from None
+    metadata = json.loads(text)
     if not isinstance(metadata, dict):
         raise ValueError("metadata.json is not a JSON object")
     return metadata

@@ -48,11 +48,13 @@ class Settings:
             check_at_least(self, 1, "max_steps")
         try:
             wrong = not isinstance(json.loads(self.arguments), dict)
-        except ValueError:
+        except (ValueError, RecursionError):
             wrong = True
         if wrong:
             like = '{"size": 8}'
-            raise ValueError(f"arguments must be a JSON object like {like}, got {self.arguments}")
+            raise ValueError(
+                f"arguments must be a JSON object like {like}, got {self.arguments[:100]}"
+            )
 
 
 class CheckedAdapter(GymnasiumAdapter):

@@ -127,7 +127,7 @@ def _choices(start: int, end: int) -> Part:
 
 
 def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
-    """Refuses choices that there are not: a network would see none instead.
+    """Refuses choices outside of their space: their one-hot code would be all zeros.
 
     Args:
         space: of one observation.
@@ -272,7 +272,7 @@ class StateTokens(nn.Module):
 
     parts: tuple[Part, ...]
     width: int
-    num_actions: int  # A; 0: what was done is not for this module to say, nor when
+    num_actions: int  # A; 0: tokens hold neither past actions nor their order
     dtype: Dtype = jnp.float32
     statistics: Statistics = ()  # of the training data, as `measure_parts` finds them
 
