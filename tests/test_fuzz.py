@@ -34,7 +34,7 @@ from leapjax.data import storage
 from leapjax.domain import Collection
 from leapjax.errors import UserError
 from leapjax.types import TrainState
-from tests import numbers
+from tests import extreme_options
 from tests.programs import LONG, ROOT, only_long
 from tests.test_storage import LEVEL, NAME, SIDE, assert_same
 
@@ -444,11 +444,11 @@ def test_any_command_line(arguments):
 
 
 @only_long
-@pytest.mark.parametrize("domain", numbers.LEVELS)
+@pytest.mark.parametrize("domain", extreme_options.LEVELS)
 def test_any_number_that_an_option_takes(domain):
     """An accepted one has passed every check before work, the arithmetic of memory included."""
     accepted = 0
-    for arguments in numbers.command_lines(domain):
+    for arguments in extreme_options.command_lines(domain):
         try:
             with (
                 contextlib.redirect_stdout(io.StringIO()),
@@ -472,7 +472,7 @@ class Begun(Exception):
 
 
 @only_long
-@pytest.mark.parametrize("name", numbers.PROGRAMS)
+@pytest.mark.parametrize("name", extreme_options.PROGRAMS)
 def test_any_number_that_a_program_takes(toy_run, tmp_path, monkeypatch, capsys, name):
     monkeypatch.chdir(tmp_path)
 
@@ -481,9 +481,9 @@ def test_any_number_that_a_program_takes(toy_run, tmp_path, monkeypatch, capsys,
 
     for module, name_of in ((runtime, "start"), (collect, "collect")):
         monkeypatch.setattr(module, name_of, begin)
-    main, kind, before = numbers.PROGRAMS[name]
+    main, kind, before = extreme_options.PROGRAMS[name]
     given = [str(toy_run) if each == "RUN" else each for each in before]
-    for field, option in numbers.numeric(kind):
+    for field, option in extreme_options.numeric(kind):
         with bounded():
             try:
                 assert main([*given, *option]) == 2, (field, option)

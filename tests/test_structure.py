@@ -250,3 +250,9 @@ def test_the_episodes_that_are_kept_are_those_of_the_rows():
             len(played) == rows[path]["episodes"] and played[:, 1].sum() == rows[path]["successes"]
         )
         assert played[:, 3].mean() == pytest.approx(rows[path]["mean_length"])
+
+
+def test_no_file_of_the_tests_hides_a_module_of_python():
+    """A script in that folder would import it in the place of Python's own."""
+    names = {path.stem for path in (ROOT / "tests").glob("*.py")}
+    assert len(names) > 50 and not names & sys.stdlib_module_names
