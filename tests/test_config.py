@@ -224,7 +224,9 @@ def test_every_field_of_every_configuration_is_checked(kind, name, type_of):
      "--test-seed 9223372036854775808", "--checkpoint-seconds nan", "--rules inf",
      "--fsdp 9223372036854775808", "--temperature nan", "--clip nan"],
 )  # fmt: skip
-def test_a_number_that_no_machine_can_serve_is_refused(option):
+def test_a_number_that_no_machine_can_serve_is_refused(option, monkeypatch):
+    pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 16 << 18}
+    monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
     name, value = option.split()
     with pytest.raises(UserError, match=name.strip("-s").replace("-", "[ _-]")):
         parse("--level", LEVEL, name, value)

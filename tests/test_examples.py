@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tests.programs import ROOT, only_long
+from tests.programs import LONG, ROOT
 
 
 @pytest.mark.parametrize(
@@ -14,16 +14,15 @@ from tests.programs import ROOT, only_long
     [
         ("plan_with_my_energy", [], r"(9\d|100)% of 256 plans keep to the constraint"),
         ("train_on_my_data", ["2", "1"], r"mean return \d+, success \d+%"),
-        pytest.param(
-            *("add_a_constraint", ["4"], r"without left turns: success \d+%, 0 left turns"),
-            marks=only_long,
-        ),
+        ("add_a_constraint", ["4"], r"without left turns: success \d+%, 0 left turns"),
         ("pure_environment", ["20"], r"20 mazes: success (9\d|100)%"),
     ],
 )
 def test_an_example_runs(name, arguments, says, monkeypatch, capsys):
     if name == "pure_environment":
         pytest.importorskip("jumanji")  # an extra
+    if name == "add_a_constraint" and not LONG:
+        pytest.skip("make test-long runs it")
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     assert re.search(says, capsys.readouterr().out)

@@ -98,7 +98,7 @@ AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
 # Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
 # faster, and the last episodes of an evaluation would rather have smaller ones.
 PLANS_TOGETHER = 32
-SMALLEST_ENVIRONMENT = 1024  # bytes
+OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
 
 # What a result does not depend on, or what its row holds on its own.
@@ -338,8 +338,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         "--width, --layers, --max-steps": 4 * 4 * (
             12 * model.layers * model.width**2 + model.width * embeddings
         ),
-        "--episodes, --context": (context + SMALLEST_ENVIRONMENT)
-        * min(config.episodes, MOST_OPEN),
+        "--episodes, --context": config.episodes * OUTCOME
+        + min(config.episodes, MOST_OPEN) * context,
     }  # fmt: skip
     if training.steps and config.checkpoint is None:
         masking = getattr(config.method_settings, "masking", "one")
