@@ -105,7 +105,7 @@ def problem(value: Any, schema: Schema, name: str = "") -> str | None:
         if wrong := _wrong_type(value, kind, name):
             return wrong
         if len(value) < schema.least:
-            return f"{name or 'the value'} is empty".strip()
+            return f"{name or 'the value'} is empty"
         parts = enumerate(value) if isinstance(schema, Each) else value.items()
         found = (problem(part, schema.schema, f"{name}[{key!r}]") for key, part in parts)
         return next((each for each in found if each), None)

@@ -262,15 +262,16 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         )
     folder = get_dataset_path(name) / "data"
     with _reading(name):
-        outlines = _inspect(folder)
-    _check_arguments(name, domain)
+        metadata = _read_metadata(folder)
+        outlines = _inspect(folder, metadata)
+        recorded = described(name)._replace(spaces=_read_spaces(metadata, domain))
+    _check_arguments(name, recorded, domain)
     with _reading(name):
-        recorded = described(name)._replace(spaces=_read_spaces(folder, domain))
         domain.check_recorded(recorded, f"the Minari data set {name!r}")
     for index, outline in enumerate(outlines):
         _check_outline(outline, domain, _name_episode(index, name))
     with _reading(name):
-        _check_total(folder, outlines)
+        _check_total(metadata, outlines)
     _check_memory(name, outlines[:most], domain)
     found: list[Demonstration] = []
     dropped: Counter[str] = Counter()
@@ -282,7 +283,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
             dropped[result] += 1
         else:
             found.append(result)
-    _compare_with_play(name, domain, found)
+    _compare_with_play(name, recorded, domain, found)
     collection = Collection(found, dropped)
     if not found:
         only = f" that can be used, only {reasons(collection)}" if dropped else ""
@@ -290,7 +291,9 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     return collection
 
 
-def _compare_with_play(name: str, domain: Domain, found: Sequence[Demonstration]) -> None:
+def _compare_with_play(
+    name: str, recorded: Described, domain: Domain, found: Sequence[Demonstration]
+) -> None:
     """Warns if the environment answers the seed and the actions of an episode in another way.
 
     A data set need not say how its environment was made: Minari leaves that out if a wrapper was
@@ -303,7 +306,7 @@ def _compare_with_play(name: str, domain: Domain, found: Sequence[Demonstration]
     if known is not None:
         with closing(domain.make_adapter()) as adapter:
             problem = _find_difference(adapter, known)
-    elif found and described(name).level is None:
+    elif found and recorded.level is None:
         problem = "the data name neither their environment nor the seeds of its resets"
     if problem is not None:
         warnings.warn(
@@ -347,19 +350,18 @@ def _version(name: str) -> int | None:
     return int(found[1]) if found else None
 
 
-def _check_arguments(name: str, domain: Domain) -> None:
+def _check_arguments(name: str, recorded: Described, domain: Domain) -> None:
     """Refuses data of an environment that was made with other arguments than it is played with.
 
     Raises:
         UserError: says which, and how to have them.
     """
-    recorded = described(name).arguments
-    if domain.arguments is None or recorded is None:
+    if domain.arguments is None or recorded.arguments is None:
         return
     # How an environment is looked at changes nothing.
     wanted, played = (
         {key: value for key, value in arguments.items() if key != "render_mode"}
-        for arguments in (recorded, domain.arguments)
+        for arguments in (recorded.arguments, domain.arguments)
     )
     if wanted != played:
         raise UserError(
@@ -473,16 +475,15 @@ def described(name: str) -> Described:
     )
 
 
-def _read_spaces(folder: Path, domain: Domain) -> dict[str, gym.Space]:
+def _read_spaces(metadata: dict[str, Any], domain: Domain) -> dict[str, gym.Space]:
     """The spaces of inspected data, but for one that `save` has made of shapes and types."""
-    metadata = _read_metadata(folder)
     found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
     if found["observation"] == observation_space(domain.blank):
         del found["observation"]
     return found
 
 
-def _inspect(folder: Path) -> list[PyTree]:
+def _inspect(folder: Path, metadata: dict[str, Any]) -> list[PyTree]:
     """Refuses what must not even be opened by Minari and HDF5; reads no array.
 
     Without its spaces Minari makes the environment that the data names, which runs code of
@@ -495,7 +496,6 @@ def _inspect(folder: Path) -> list[PyTree]:
     Raises:
         ValueError: says what.
     """
-    metadata = _read_metadata(folder)
     if metadata.get("data_format") != "hdf5":
         raise ValueError(f"its format is {metadata.get('data_format')!r}, expected 'hdf5'")
     for name in SPACES:
@@ -669,14 +669,14 @@ def _holds_fields(blank: PyTree, stored: Any) -> bool:
     return dictionaries and set(_fields(blank)) <= set(stored)
 
 
-def _check_total(folder: Path, outlines: Sequence[PyTree]) -> None:
+def _check_total(metadata: dict[str, Any], outlines: Sequence[PyTree]) -> None:
     """Refuses data whose episodes are not as long together as they say.
 
     Raises:
         ValueError: says how long they are.
     """
     steps = sum(len(outline["actions"]) for outline in outlines)
-    announced = _read_metadata(folder).get("total_steps")
+    announced = metadata.get("total_steps")
     if announced != steps:
         raise ValueError(f"{announced} steps are announced, {steps} are there")
 
