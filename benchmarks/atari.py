@@ -26,14 +26,16 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
+from experiments.common.config import make_domain, specify
 from experiments.tables.atari import encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.domain import Domain
 from leapjax.environments import Eager, closing
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
 from leapjax.rollouts import kept
+from leapjax.running.config import AnyConfig, change
 
 GAMES_PLAYED = (1, 16, 64)  # together
 DECISIONS = 50  # of each game, to measure
@@ -83,13 +85,13 @@ def run(options: Options) -> None:
     runtime.start(cache=False)  # compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [
-        with_options(preset("atari", game, "leap", name), {"max_steps": 1000})
+        change(find_preset("atari", game, "leap", name), domain_settings={"max_steps": 1000})
         for game in options.games
         for name in options.presets
     ]
     papers = [config for config in configs if config.model.architecture == "paper"]
     try:
-        in_runs = [with_options(config, {"run": options.run}) for config in papers]
+        in_runs = [change(config, training={"run": options.run}) for config in papers]
     except ValueError as error:
         raise UserError(f"--run {options.run}: {error}") from None
     console = Console()

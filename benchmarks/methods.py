@@ -19,10 +19,11 @@ from rich.table import Table
 from benchmarks.planning import random_contexts, untrained
 from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import check_counts, preset
+from experiments.common.config import check_counts
 from experiments.tables.babyai import COMPARED
 from leapjax.babyai import levels
 from leapjax.batching import compile_planner
+from leapjax.presets import find_preset
 
 METHODS = tuple(name for name in COMPARED if name != "random")
 
@@ -81,7 +82,7 @@ def run(options: Options) -> None:
 
 def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
     """A compiled call that makes plans for as many contexts as `batch` says."""
-    config = preset("babyai", level, method, "leapjax")
+    config = find_preset("babyai", level, method, "leapjax")
     energy, params, domain = untrained(config)
     planner = compile_planner(energy, config.planner)
     contexts = jax.device_put(random_contexts(domain, config.context, batch))

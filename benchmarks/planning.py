@@ -25,7 +25,7 @@ from rich.table import Table
 from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import plots, program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
+from experiments.common.config import make_domain, specify
 from leapjax import pretrained
 from leapjax.babyai import levels
 from leapjax.babyai.levels import Level
@@ -33,6 +33,8 @@ from leapjax.batching import CHUNK_SIZES, compile_planner, plan_keys, split_batc
 from leapjax.domain import Domain, blank_context
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig, bind
+from leapjax.presets import find_preset
+from leapjax.running.config import AnyConfig, change
 from leapjax.types import Energy, Params
 
 matplotlib.use("Agg")
@@ -112,7 +114,7 @@ def measure(
     chunks: Sequence[int],
 ) -> list[Row]:
     """One preset and level at every batch size."""
-    model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon
+    model, horizon = find_preset("babyai", level.name, "leap", name).model, level.horizon
     search = GibbsConfig(horizon, level.iterations)
     energy, params, domain = make_energy(name, level)
     planner = compile_planner(energy, search, chunks)
@@ -165,8 +167,8 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
 
 def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
     """A preset's energy with random parameters, with the horizon of the appendix."""
-    default = preset("babyai", level.name, "leap", name)
-    return untrained(with_options(default, {"horizon": level.horizon}))
+    default = find_preset("babyai", level.name, "leap", name)
+    return untrained(change(default, planner={"horizon": level.horizon}))
 
 
 def untrained(config: AnyConfig) -> tuple[Energy, Params, Domain]:

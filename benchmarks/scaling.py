@@ -25,10 +25,10 @@ from rich.table import Table
 from benchmarks.timing import Row, check_writable, fastest, write_rows
 from benchmarks.training import Stepper
 from experiments.common import program, runtime
-from experiments.common.config import preset
 from experiments.common.runtime import Cluster
 from leapjax import processes, sharding
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
 
 # (processes, devices of each, devices that share parameters)
 SETTINGS = ((1, 1, 1), (1, 2, 1), (2, 1, 1), (1, 2, 2), (1, 4, 1), (1, 8, 1), (1, 8, 8))
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Options, arguments: list[str]) -> None:
     """Measures every setting, or the one of this process."""
-    preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
+    find_preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
     check_writable(options.json)
     if options.worker:
         runtime.start(options.cluster, cache=False)
@@ -108,7 +108,7 @@ def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
 
 def measure(options: Options) -> Row:
     """One setting, on all devices of all processes."""
-    config = preset("babyai", options.level, "leap", "leapjax")
+    config = find_preset("babyai", options.level, "leap", "leapjax")
     batch = options.per_device * jax.device_count()
     chosen = dataclasses.replace(config.training, batch=batch)
     mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)

@@ -26,12 +26,14 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from experiments.common import program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
+from experiments.common.config import make_domain, specify
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
+from leapjax.running.config import AnyConfig, change
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
@@ -71,14 +73,14 @@ def run(options: Options) -> None:
     check_writable(options.json)
     runtime.start(cache=False)  # compile times are real
     configs = [
-        preset("babyai", level, "leap", name)
+        find_preset("babyai", level, "leap", name)
         for level in options.levels
         for name in options.presets
     ]
     if options.microbatch is not None:
         changed = {"microbatch": options.microbatch}
         try:
-            configs = [with_options(config, changed) for config in configs]
+            configs = [change(config, training=changed) for config in configs]
         except ValueError as error:
             raise UserError(f"--microbatch {options.microbatch}: {error}") from None
     rows = [measure(config, options.seconds) for config in configs]

@@ -20,9 +20,10 @@ from experiments.common import experiment, memory, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
-from leapjax.atari.domain import FOLDER, LONGEST, Settings, data_name, make, preset
+from leapjax.atari.domain import FOLDER, LONGEST, Settings, make
 from leapjax.atari.games import find_game
 from leapjax.errors import UserError
+from leapjax.presets import atari as presets
 
 RECORDED = Path("results/atari-data.json")
 EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
@@ -79,7 +80,7 @@ def run(options: Collect) -> None:
     from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console(markup=False)
-    transitions = options.transitions or preset(options.game, "leapjax")["transitions"]
+    transitions = options.transitions or presets.transitions(options.game)
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
             options.folder, find_game(options.game), transitions, options.replay_run,
@@ -89,6 +90,17 @@ def run(options: Collect) -> None:
     console.print(scores_table(games))
     if options.record:
         results.add(RECORDED, data_name(options.game, transitions), games)
+
+
+def data_name(game: str, transitions: int) -> str:
+    """Returns what data of a game are recorded as: its name, where there are as many as usual."""
+    usual = transitions == presets.transitions(game)
+    return game if usual else f"{game}, {transitions:,} transitions"
+
+
+def game_of(name: str) -> str:
+    """Returns the game of data that `data_name` calls so."""
+    return name.partition(",")[0]
 
 
 def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:

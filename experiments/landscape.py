@@ -32,7 +32,9 @@ from leapjax.batching import compile_planner
 from leapjax.data import seeds, windows
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
+from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
+from leapjax.running.config import change
 from leapjax.types import Context, Energy, Params, Window
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
@@ -83,9 +85,9 @@ def report(options: Options, interruption: Interruption) -> None:
     console = Console(markup=False)
     wanted = []
     for preset in options.presets:
-        config = configs.preset("babyai", options.level, "leap", preset)
+        config = find_preset("babyai", options.level, "leap", preset)
         if options.steps is not None:
-            config = configs.with_options(config, {"steps": options.steps})
+            config = change(config, training={"steps": options.steps})
         # What is watched is part of a run: one of another count is another run.
         runs = options.runs / f"landscape-{options.trajectories}"
         config = dataclasses.replace(config, seeds=(options.seed,), runs=runs)

@@ -160,10 +160,6 @@ class DomainType(NamedTuple):
     make: Callable[[str, Any], Domain]
     # (level, settings) -> domain; UserError for an unknown level
     levels: tuple[str, ...]  # the paper's
-    preset: Callable[[str, str], Mapping[str, Any]]
-    # (level, preset) -> options by name, whatever the method; the method's own come after
-    tuned: Callable[[str, str, str], Mapping[str, Any]] = lambda level, method, preset: {}
-    # (level, method, preset) -> options that a level changes of the method's own
 
 
 def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:

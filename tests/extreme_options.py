@@ -18,8 +18,9 @@ from experiments import (
     suboptimal,
 )
 from experiments.common import analysis
-from experiments.common.config import blank
 from leapjax.methods import METHODS
+from leapjax.presets import PRESETS
+from leapjax.running.config import blank
 
 LEVELS = {
     "babyai": "GoToLocalS7N5", "stars": "Star3x5", "sudoku": "Sudoku4x6",
@@ -68,7 +69,7 @@ def command_lines(domain: str) -> Iterator[list[str]]:
         parts = [chosen.method_settings, chosen.planner]
         if method == "leap":
             parts += [chosen, chosen.model, chosen.training, chosen.cluster, chosen.domain_settings]
-        for name in METHODS[method].presets:
+        for name in PRESETS["babyai"]:
             for part in parts:
                 for _, given in numeric(type(part)):
                     yield [*base, "--method", method, "--preset", name, *given]

@@ -1,5 +1,6 @@
 """The real program at toy size: what it leaves behind; processes of its own, watched, compared."""
 
+import dataclasses
 import os
 import shutil
 import subprocess
@@ -17,8 +18,10 @@ from experiments.common.experiment import Experiment
 from leapjax import checkpoints, domains, pretrained
 from leapjax.checkpoints import Checkpoints
 from leapjax.files import only_process_in
+from leapjax.presets import PRESETS
+from leapjax.running.config import change
 from leapjax.types import TrainState
-from tests.frozen_lake import FROZEN_LAKE
+from tests import frozen_lake
 from tests.parameters import random_parameters
 
 ROOT = Path(__file__).parent.parent
@@ -44,8 +47,22 @@ STEPS = 200
 
 def main():
     """An experiment in FrozenLake: `python -m tests.programs`."""
-    domains.DOMAINS[LAKE.domain] = FROZEN_LAKE
+    domains.DOMAINS[LAKE.domain] = frozen_lake.FROZEN_LAKE
+    PRESETS[LAKE.domain] = {"leapjax": frozen_lake.preset}
     return experiment.main(LAKE)
+
+
+def with_options(config, options):
+    """A configuration with options of the command line, whichever part of it they are of."""
+    parts = {name: dataclasses.asdict(getattr(config, name)) for name in pretrained.GROUPS}
+    changes = {}
+    for option, value in options.items():
+        part = next((name for name, fields in parts.items() if option in fields), None)
+        if part is None:
+            changes[option] = value
+        else:
+            changes.setdefault(part, {})[option] = value
+    return change(config, **changes)
 
 
 def untrained_run(folder, *options):

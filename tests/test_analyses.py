@@ -1,5 +1,6 @@
 """The programs of the paper's analyses, end to end at toy size, and what they refuse."""
 
+import functools
 import json
 
 import jax
@@ -16,7 +17,8 @@ from leapjax import pretrained
 from leapjax.babyai import constraints
 from leapjax.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
-from tests.programs import only_long
+from leapjax.presets import find_preset
+from tests.programs import only_long, with_options
 
 TOY = {  # nothing is learned: gradients take long to compile
     "demos": 6, "steps": 0, "batch": 4, "width": 16, "heads": 2, "layers": 1, "channels": 4,
@@ -38,11 +40,19 @@ def rows(place, name, folder="runs"):
     return results.read(place / folder / f"{name}.jsonl")
 
 
+def toy(config, **options):
+    """A configuration at toy size."""
+    return with_options(config, {**TOY, **options})
+
+
+one_action = functools.partial(toy, horizon=1)
+
+
 def small(case, *ways):
     """An analysis of one case, at toy size, with some of its ways."""
     kept = [way for way in case.ways if way.name in ways]
     assert len(kept) == len(ways)
-    return Analysis("properties", [case._replace(ways=kept)], changes=TOY)
+    return Analysis("properties", [case._replace(ways=kept)], change=toy)
 
 
 def case_of(name):
@@ -73,7 +83,7 @@ def test_constraints_remember_what_models_do_not_see(place):
     case = case_of("constraints-errand")
     way = case.ways[-1]._replace(minimise=properties.unseen(watched))
     of = small(case._replace(ways=[way]), way.name)
-    assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
+    assert analysis.main(of._replace(change=one_action), SHORT) == 0
     (row,) = rows(place, "properties")
     assert set(lengths) == {64}  # as many as an episode in that room has steps
     assert row["violations"] >= 0
@@ -81,7 +91,7 @@ def test_constraints_remember_what_models_do_not_see(place):
 
 def test_two_models_are_composed(place):
     of = small(case_of("composition-medium"), "dt")
-    assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
+    assert analysis.main(of._replace(change=one_action), SHORT) == 0
     (row,) = rows(place, "properties")
     assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
     assert row["train_seconds"] == 0  # for no step
@@ -95,8 +105,8 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
     case = of.cases[0]
     for method in analysis.methods_of(case):
         plans = {} if method in ("leap", "classifier") else {"horizon": 1}
-        toy = of._replace(cases=[case], changes={**TOY, **plans})
-        monkeypatch.setattr(program, "ANALYSIS", toy)
+        small_one = of._replace(cases=[case], change=functools.partial(toy, **plans))
+        monkeypatch.setattr(program, "ANALYSIS", small_one)
         assert program.main(["--methods", method, *SHORT]) == 0
     assert {row["way"] for row in rows(place, of.name)} == {way.name for way in case.ways}
 
@@ -284,12 +294,10 @@ def test_plans_stand_beside_single_actions():
 def toy_landscape(place, monkeypatch):
     """Learns the landscape of a toy; what was measured, and the arguments."""
 
-    def toy(domain, level, method, name):
-        config = analysis.configs.with_options(preset(domain, level, method, name), TOY)
-        return analysis.configs.with_options(config, {"steps": 40})
+    def toy_preset(domain, level, method, name):
+        return with_options(find_preset(domain, level, method, name), {**TOY, "steps": 40})
 
-    preset = landscape.configs.preset
-    monkeypatch.setattr(landscape.configs, "preset", toy)
+    monkeypatch.setattr(landscape, "find_preset", toy_preset)
     arguments = ["--presets", "leapjax", "--trajectories", "8"]
     assert landscape.main(arguments) == 0
     (found,) = json.loads((place / "runs" / "landscape.json").read_text())

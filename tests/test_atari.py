@@ -18,7 +18,6 @@ import pytest
 
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
-from experiments.common.config import configuration_hash, preset, with_options
 from experiments.tables.atari import ENCODED, data, encoding, played, uses
 from leapjax.atari import augmentation, collect, domain, encoders, replay
 from leapjax.atari.adapter import AtariAdapter
@@ -28,10 +27,12 @@ from leapjax.data import windows
 from leapjax.environments import Eager
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
+from leapjax.presets import find_preset
 from leapjax.pretrained import Origin
+from leapjax.running.config import configuration_hash
 from leapjax.types import Demonstration, Energy
 from tests.parameters import random_like
-from tests.programs import ROOT, only_long
+from tests.programs import ROOT, only_long, with_options
 
 PONG, BREAKOUT = GAMES["Pong"], GAMES["Breakout"]
 MODEL = ModelConfig(width=16, layers=1, heads=1, dropout=0.0)
@@ -292,16 +293,16 @@ def test_the_mirror_of_breakout_is_in_its_middle():
 
 
 def test_presets_are_the_papers_and_ours():
-    settings = {name: domain.preset(name, "paper") for name in GAMES}
-    assert [s["batch"] for s in settings.values()] == [64, 64, 256, 128]
-    assert [(s["horizon"], s["iterations"]) for s in settings.values()] == [
-        (5, 10), (5, 10), (5, 10), (10, 30)
-    ]  # fmt: skip
-    assert all(s["attention"] == "causal" and s["executed"] == 1 for s in settings.values())
-    assert not domain.tuned("Pong", "leap", "leapjax")["end"]
-    assert domain.preset("Seaquest", "leapjax")["transitions"] == 200_000
+    found = [find_preset("atari", name, "leap", "paper") for name in GAMES]
+    assert [each.training.batch for each in found] == [64, 64, 256, 128]
+    searches = [(each.planner.horizon, each.planner.iterations) for each in found]
+    assert searches == [(5, 10), (5, 10), (5, 10), (10, 30)]
+    assert all(each.model.attention == "causal" and each.executed == 1 for each in found)
+    assert not find_preset("atari", "Pong", "leap", "leapjax").method_settings.end
+    ours = find_preset("atari", "Seaquest", "leap", "leapjax")
+    assert ours.domain_settings.transitions == 200_000
     for method, past in {"bc": 0, "cql": encoders.STACK - 1}.items():
-        assert preset("atari", "Seaquest", method, "leapjax").context == past
+        assert find_preset("atari", "Seaquest", method, "leapjax").context == past
 
 
 @pytest.mark.parametrize(
@@ -623,10 +624,12 @@ def test_the_table_has_normalised_scores():
         "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
         "configuration": {"planner": {"temperature": 0.1}},
     }  # fmt: skip
-    name = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 0)
+    name = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
     # Its checkpoint played again is no other seed.
-    again = dataclasses.replace(preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path())
+    again = dataclasses.replace(
+        find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
+    )
     rows += [{**rows[0], "train_steps": 0, "hash": configuration_hash(again, 0)}]
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
@@ -635,13 +638,13 @@ def test_the_table_has_normalised_scores():
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
     # Seeds that happen to agree say no more than their games do.
-    second = configuration_hash(preset("atari", "Breakout", "bc", "leapjax"), 1)
+    second = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second})
     assert "| Breakout | score | - | - | 30.5 ± 2.0 |" in played(rows, {})
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
     assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows[:2] + rows[3:], {})
     # Who always takes the best action plays four games, however often.
-    name = configuration_hash(preset("atari", "Breakout", "cql", "leapjax"), 0)
+    name = configuration_hash(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
     table = played([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
@@ -650,7 +653,7 @@ def test_the_table_has_normalised_scores():
 def test_the_table_has_the_papers_scale_beside_ours():
     def row_of(mean, **options):
         again = {"checkpoint": Path()} if "temperature" in options else {}
-        config = with_options(preset("atari", "Breakout", "leap", "paper"), options)
+        config = with_options(find_preset("atari", "Breakout", "leap", "paper"), options)
         return {
             "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": 0,
             "method": "leap", "preset": "paper", "mean_return": mean, "return_error": 2.88,

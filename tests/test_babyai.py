@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks import quality
 from experiments import babyai
 from experiments.common import results, run
-from experiments.common.config import parse, preset
+from experiments.common.config import parse
 from leapjax import UserError, files, load, plan_keys, pretrained, rollouts
 from leapjax.agents import leap
 from leapjax.babyai.adapter import BabyAIAdapter
@@ -21,6 +21,7 @@ from leapjax.babyai.levels import LEVELS
 from leapjax.babyai.settings import Settings
 from leapjax.data import seeds, storage
 from leapjax.planners import GibbsConfig
+from leapjax.presets import find_preset
 from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
@@ -418,7 +419,7 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 def test_every_search_setting_can_be_made():
     for level in LEVELS.values():
         for name in leap.PRESETS:
-            config = preset("babyai", level.name, "leap", name)
+            config = find_preset("babyai", level.name, "leap", name)
             variants = quality.variants(config.planner, level.iterations)
             assert len(variants) > 10
             assert max(config.iterations for config in variants.values()) == level.iterations

@@ -10,12 +10,13 @@ import pytest
 
 from benchmarks import atari, methods, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
-from experiments.common.config import make_domain, preset, specify, with_options
+from experiments.common.config import make_domain, specify
 from experiments.common.runtime import Cluster
 from leapjax import pretrained, sharding
 from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
-from tests.programs import only_long, untrained_run
+from leapjax.presets import find_preset
+from tests.programs import only_long, untrained_run, with_options
 
 HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
@@ -25,12 +26,12 @@ def tiny_preset(*names):
     """The settings of a preset, with a network and batches that take no time."""
     small = {"width": 16, "heads": 2, "layers": 1, "batch": 4}
     simple = {"channels": 4, "rounds": 1, "fields": 0, "augment": False, "clutter": 0.0}
-    return with_options(preset(*names), {**small, **simple})
+    return with_options(find_preset(*names), {**small, **simple})
 
 
 @pytest.mark.parametrize("name", ["paper", "leapjax"])
 def test_flops_are_what_xla_counts(name):
-    config = preset("babyai", "GoToLocalS7N5", "leap", name)
+    config = find_preset("babyai", "GoToLocalS7N5", "leap", name)
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     energy = agent.energy
@@ -59,7 +60,7 @@ def test_flops_of_what_is_repeated_and_what_is_convolved():
 
 
 def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(planning, "preset", tiny_preset)
+    monkeypatch.setattr(planning, "find_preset", tiny_preset)
     monkeypatch.setattr(planning, "COMPARED", ("leapjax",))
     monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
     monkeypatch.setattr(planning, "make_energy", functools.cache(planning.make_energy))
@@ -99,14 +100,14 @@ def test_methods_take_turns_and_an_action_costs_its_share_of_a_plan(tmp_path, mo
 
 @only_long
 def test_a_plan_of_a_method_is_measured_as_the_method_plans(monkeypatch):
-    monkeypatch.setattr(methods, "preset", tiny_preset)
+    monkeypatch.setattr(methods, "find_preset", tiny_preset)
     plan = methods.make_call("GoToLocalS7N5", "bc", 2)()
     assert plan.actions.shape == (2, 1)  # of one action
 
 
 @only_long
 def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, quick_begin):
-    monkeypatch.setattr(training, "preset", tiny_preset)
+    monkeypatch.setattr(training, "find_preset", tiny_preset)
     monkeypatch.setattr(training, "matmul_peak", lambda *rest: 100.0)  # measured for planning
     rows = tmp_path / "rows.json"
     arguments = ["--levels", "GoToLocalS7N5", "--presets", "leapjax", "--seconds", "0.01"]
@@ -128,7 +129,9 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, qui
 
 @only_long
 def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkeypatch):
-    monkeypatch.setattr(atari, "preset", lambda *names: with_options(preset(*names), SMALL))
+    monkeypatch.setattr(
+        atari, "find_preset", lambda *names: with_options(find_preset(*names), SMALL)
+    )
     rows = tmp_path / "rows.json"
     arguments = ["--presets", "leapjax", "--batches", "2", "--no-training", "--seconds", "0.01"]
     assert atari.main([*arguments, "--json", str(rows)]) == 0

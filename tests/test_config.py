@@ -12,9 +12,9 @@ import pytest
 
 import experiments.__main__ as programs
 from experiments.common import config, memory
-from experiments.common.config import GROUPS, configuration_hash, preset, resolved
+from experiments.common.config import GROUPS
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, files, pretrained
+from leapjax import checkpoints, domains, files, presets, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
@@ -23,6 +23,8 @@ from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
+from leapjax.presets import find_preset
+from leapjax.running.config import configuration_hash, resolved
 from leapjax.types import TrainState
 from tests.programs import only_long
 
@@ -55,7 +57,7 @@ def test_options_of_training_are_not_for_methods_that_learn_nothing():
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {
-        configuration_hash(preset("babyai", level, method, name), seed)
+        configuration_hash(find_preset("babyai", level, method, name), seed)
         for level, method, name, seed in cases
     }
     assert len(hashes) == len(cases) > 80
@@ -88,6 +90,7 @@ def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
     methods = [method for method in METHODS if METHODS[method].everywhere]
     before = [names("--method", method) for method in methods]
     monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=Later))
+    monkeypatch.setattr(presets.babyai, "Settings", Later)
     assert isinstance(parse().domain_settings, Later)
     assert [names("--method", method) for method in methods] == before
     assert names("--mood", "calm") == before[0]
@@ -117,23 +120,23 @@ def test_options_have_the_names_and_defaults_of_their_group():
 
 
 def test_a_level_may_change_the_preset_of_a_method():
-    temperatures = {level: preset("babyai", level, "leap", "leapjax").planner.temperature
+    temperatures = {level: find_preset("babyai", level, "leap", "leapjax").planner.temperature
                     for level in (LEVEL, "GoToSeqS5R2")}  # fmt: skip
     assert temperatures == {LEVEL: 0.5, "GoToSeqS5R2": 1.0}
-    assert preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
+    assert find_preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
 
 
 def test_preset_paper_masks_and_ends_as_the_authors_code_does():
-    learned = {level: preset("babyai", level, "leap", "paper").method_settings
+    learned = {level: find_preset("babyai", level, "leap", "paper").method_settings
                for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
     assert [each.masking for each in learned.values()] == ["each", "each", "all"]
     assert not any(each.end or each.repeat_state for each in learned.values())
     for level in ("GoToObjMazeS7", "GoToObjMazeS7Slip", "GoToObjMazeS7Mistakes"):
-        search = preset("babyai", level, "leap", "paper").planner
+        search = find_preset("babyai", level, "leap", "paper").planner
         assert (search.horizon, search.iterations) == (10, 30)
-    assert preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
+    assert find_preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
     # In star graphs there is no pose to leave out, and a plan may end.
-    stars = preset("stars", "Star3x5", "leap", "paper").method_settings
+    stars = find_preset("stars", "Star3x5", "leap", "paper").method_settings
     assert stars.repeat_state and stars.end
 
 
@@ -162,7 +165,7 @@ def test_every_method_can_search_stars_and_boards():
         (found,) = config.parse(domain, ["--method", "classifier"])
         ways = searches(found)
         assert found.planner.fill == "together" and len(ways) > 5
-        assert {way["fill"] for way in ways} == {"together"}
+        assert {way.planner.fill for way in ways} == {"together"}
         (found,) = config.parse(domain, ["--method", "leap"])
         assert found.planner.fill == "confident"
         assert len(searches(found)) > len(ways)

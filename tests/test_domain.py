@@ -11,6 +11,7 @@ from leapjax import domains, methods, rollouts
 from leapjax.data import storage
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
+from leapjax.presets import PRESETS
 from tests import frozen_lake
 from tests.programs import LONG, only_long
 
@@ -27,6 +28,7 @@ TOY = [*EVERY, "--temperature", "0", "--fill", "confident"]
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(domains.DOMAINS, "frozen_lake", frozen_lake.FROZEN_LAKE)
+    monkeypatch.setitem(PRESETS, "frozen_lake", {"leapjax": frozen_lake.preset})
     return tmp_path
 
 

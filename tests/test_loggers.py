@@ -12,6 +12,7 @@ from rich.console import Console
 from experiments.common import config, experiment, loggers, progress, results
 from leapjax import domains, scores
 from leapjax.errors import UserError
+from leapjax.running.config import configuration_hash
 from tests.frozen_lake import FROZEN_LAKE
 from tests.programs import LAKE, SMALL, only_long
 
@@ -83,7 +84,7 @@ def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch
     )
     # The logger is no part of a result's name.
     plain, logged = (config.parse("frozen_lake", more) for more in (TRAINED, arguments[:-1]))
-    assert config.configuration_hash(plain[0], 0) == config.configuration_hash(logged[0], 0)
+    assert configuration_hash(plain[0], 0) == configuration_hash(logged[0], 0)
 
     played = list(
         csv.DictReader(

@@ -5,9 +5,11 @@ from pathlib import Path
 
 from experiments import report
 from experiments.common import plots
-from experiments.common.config import configuration_hash, preset, with_options
 from experiments.tables import analyses, babyai, puzzles
 from leapjax.babyai.levels import LEVELS
+from leapjax.presets import find_preset
+from leapjax.running.config import configuration_hash
+from tests.programs import with_options
 
 
 def row(
@@ -15,7 +17,7 @@ def row(
     mean_length=6.0, **options,
 ):  # fmt: skip
     """The row of a run, or of its checkpoint played again, with the parts that tables read."""
-    config = with_options(preset("babyai", level, method, name), options)
+    config = with_options(find_preset("babyai", level, method, name), options)
     config = dataclasses.replace(config, checkpoint=Path("runs/name") if played else None)
     return {
         "domain": "babyai", "level": level, "method": method, "preset": name, "seed": seed,
@@ -144,7 +146,7 @@ def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path
 def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
     """A row of a level whose plans are executed whole."""
     domain = "stars" if level.startswith("Star") else "sudoku"
-    config = with_options(preset(domain, level, method, "leapjax"), options)
+    config = with_options(find_preset(domain, level, method, "leapjax"), options)
     return {
         "domain": domain, "level": level, "method": method, "preset": "leapjax", "seed": seed,
         "first_episode_seed": config.test_seed, "episodes": 100, "successes": round(100 * rate),

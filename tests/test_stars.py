@@ -10,7 +10,6 @@ from PIL import Image
 
 from experiments import star_animation, stars
 from experiments.common import results, searches
-from experiments.common.config import preset, with_options
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
@@ -18,12 +17,13 @@ from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
+from leapjax.presets import find_preset
 from leapjax.stars import graphs
 from leapjax.stars.domain import Settings, make
 from leapjax.stars.graphs import Star, StarAdapter
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
-from tests.programs import only_long
+from tests.programs import only_long, with_options
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -158,7 +158,7 @@ def test_edges_that_are_learned_from_are_in_no_order():
 
 def agent_and_domain(method="leap", **settings):
     domain = make("Star3x4", Settings(**settings))
-    config = preset("stars", "Star3x4", method, "leapjax")
+    config = find_preset("stars", "Star3x4", method, "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
     setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
     return find_method(method).make_agent(setup, None), domain
@@ -226,7 +226,7 @@ def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path)
     """And plans that are shorter or longer than the way are, too."""
     star = Star(2, 3)
     other = {"horizon": horizon, "iterations": 2}
-    config = with_options(preset("stars", "Star2x3", "classifier", "leapjax"), other)
+    config = with_options(find_preset("stars", "Star2x3", "classifier", "leapjax"), other)
     num_actions = StarAdapter(star).num_actions
     energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
     run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)

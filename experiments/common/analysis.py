@@ -10,7 +10,7 @@ import functools
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from rich.table import Table
 
 from experiments.common import config as configs
 from experiments.common import experiment, program, results, run, runtime
-from experiments.common.config import AnyConfig, check_counts, configuration_hash, with_options
+from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.interruption import Interruption
 from experiments.common.results import Row
@@ -30,21 +30,35 @@ from leapjax.checkpoints import differences
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
+from leapjax.domains import find_domain
 from leapjax.energy import view
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, did_you_mean
 from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, ShootingConfig
+from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
+from leapjax.running.config import AnyConfig, configuration_hash
 from leapjax.types import Energy
+
+Change = Callable[[AnyConfig], AnyConfig]
+
+
+def unchanged(config: AnyConfig) -> AnyConfig:
+    """Returns a configuration as it is."""
+    return config
 
 
 class Model(NamedTuple):
-    """What is trained: a method on a level. Options change preset `leapjax` alone."""
+    """A model that a case needs.
+
+    Attributes:
+        level: that it is trained on.
+        change: of its method's configuration, where the preset is `leapjax`.
+    """
 
     level: str
-    options: Mapping[str, Any] = {}
-    more: Mapping[str, Mapping[str, Any]] = {}  # of them, by method
+    change: Change = unchanged
 
 
 def alone(energies: Sequence[Energy]) -> Energy:
@@ -94,7 +108,7 @@ class Analysis(NamedTuple):
     cases: Sequence[Case]
     domain: str = "babyai"
     timed: bool = False  # what a plan costs is part of the comparison: take it on an idle machine
-    changes: Mapping[str, Any] = {}  # of every model's options, for tests
+    change: Change = unchanged  # of every model's configuration, for tests
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,12 +246,11 @@ def training_config(
     analysis: Analysis, model: Model, method: str, seed: int, options: Options
 ) -> AnyConfig:
     """The configuration of a run of `experiments.babyai` that trains a model."""
-    default = configs.preset(analysis.domain, model.level, method, options.preset)
-    ours: dict[str, Any] = {}
+    config = find_preset(analysis.domain, model.level, method, options.preset)
     if options.preset == "leapjax":
-        ours = {**model.options, **model.more.get(method, {})}
-    changed = with_options(default, {**ours, **analysis.changes})
-    return dataclasses.replace(changed, seeds=(seed,), runs=options.runs, pictures=False)
+        config = model.change(config)
+    config = analysis.change(config)
+    return dataclasses.replace(config, seeds=(seed,), runs=options.runs, pictures=False)
 
 
 def configurations(
@@ -362,7 +375,7 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
 def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
     """A level that models are asked to plan on."""
     specification = models[0].specification
-    return configs.find_domain(specification.domain).make(level, specification.domain_settings)
+    return find_domain(specification.domain).make(level, specification.domain_settings)
 
 
 def asked(

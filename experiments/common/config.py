@@ -2,153 +2,35 @@
 
 import argparse
 import dataclasses
-import hashlib
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any
 
 import jax
 import tyro
 
 from experiments.common import loggers, memory, program
-from experiments.common.runtime import Cluster
 from leapjax import checkpoints, pretrained
-from leapjax.agents.learning import TrainingConfig
 from leapjax.checks import check_integer, check_number
 from leapjax.data import seeds, storage
-from leapjax.data.seeds import UNSEEN
 from leapjax.data.storage import Described
 from leapjax.domain import Domain
 from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
-from leapjax.methods import METHODS, find_method
+from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
+from leapjax.presets import find_preset
 from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.rollouts import MOST_OPEN
-
-M = TypeVar("M")
-D = TypeVar("D")
-P = TypeVar("P")
-
-
-@dataclasses.dataclass(frozen=True)
-class Config(Generic[M, D, P]):
-    """Train a method on demonstrations of a level, then measure its success."""
-
-    method_settings: Annotated[M, tyro.conf.arg(name="")]
-    domain_settings: Annotated[D, tyro.conf.arg(name="")]
-    planner: Annotated[P, tyro.conf.arg(name="")]
-    domain: Annotated[str, tyro.conf.Suppress]
-    level: str
-    """A level of the domain by its name or id, or "all" for those of the paper. --game means the
-    same to experiments.atari, and --env to experiments.gymnasium."""
-    method: str = "leap"
-    """How to learn and to act: a line of the table in leapjax/methods.py, or "all" of them."""
-    preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's. Sets the defaults of all the rest."""
-    seeds: tuple[int, ...] = (0,)
-    """Training seeds; each draws its own demonstrations."""
-    demos: int = 500
-    """Demonstrations to train on; of a data set that is given, all that it has if it has fewer."""
-    demonstrations: str | None = None
-    """Id of a Minari data set to train on instead of those that the domain makes; --level follows
-    from it where it says of what it is."""
-    episodes: int = 200
-    """Held-out episodes to measure success on."""
-    test_seed: int = UNSEEN
-    """Level seed of the first of them."""
-    validation: bool = False
-    """Measure on validation levels instead: for choosing settings."""
-    context: int = 0
-    """K, past steps that the planner sees."""
-    executed: int | None = None
-    """Actions to execute before replanning; None: the whole plan, as in the paper."""
-    rules: float = 0.0
-    """Weight of the domain's rules, which are added to what was learned while planning."""
-    checkpoint: Path | None = None
-    """Folder of an earlier run to evaluate instead of training; brings its settings along, but
-    --executed and --rules."""
-    play: str | None = None
-    """Another level to play with a checkpoint than the one that it was trained on."""
-    pretrained: bool = False
-    """Evaluate the planner that comes with the library for each level; trains nothing."""
-    record: bool = False
-    """Append the row to results/, which is committed, and skip what is recorded already."""
-    force: bool = False
-    """With --record: run again what is recorded, and replace its row."""
-    runs: Path = Path("runs")
-    """Where checkpoints, metrics, plots and unrecorded rows go."""
-    pictures: bool = True
-    """Draw the plots and the animation."""
-    loggers: tuple[str, ...] = ()
-    """Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says more)."""
-    checkpoint_seconds: float = 30.0
-    """Save the training state this often: what a killed run can lose at most (of several
-    processes: and up to 20 steps more)."""
-    model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
-    training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
-    cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
-
-
-AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
+from leapjax.running.config import AnyConfig, Config, change
 
 # Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
 # faster, and the last episodes of an evaluation would rather have smaller ones.
 PLANS_TOGETHER = 32
 OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
-
-# What a result does not depend on, or what its row holds on its own.
-_NOT_HASHED = (
-    "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
-    "checkpoint_seconds", "cluster", "loggers",
-)  # fmt: skip
-
-
-def blank(domain: str, level: str, method: str) -> AnyConfig:
-    """The defaults of every option, before any preset.
-
-    Raises:
-        UserError: an unknown domain or method.
-    """
-    chosen = find_method(method)
-    settings = chosen.settings(), find_domain(domain).settings(), chosen.planner()
-    return Config(*settings, domain, level, method)
-
-
-def preset(domain: str, level: str, method: str, name: str) -> AnyConfig:
-    """The defaults of a preset: the level's, then the method's, then the level's for the method.
-
-    Raises:
-        UserError: an unknown domain, level, method or preset.
-    """
-    config = dataclasses.replace(blank(domain, level, method), preset=name)
-    kind, presets = find_domain(domain), find_method(method).presets
-    if name not in presets:
-        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
-    options = {**kind.preset(level, name), **presets[name], **kind.tuned(level, method, name)}
-    # A level says how Gibbs sampling searches; other planners know less.
-    others = _names(GibbsConfig()) - _names(config.planner)
-    return with_options(config, {k: v for k, v in options.items() if k not in others})
-
-
-def _names(settings: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(settings)}
-
-
-def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
-    """A configuration with some options changed, by the names that the command line has."""
-    changed: dict[str, Any] = {}
-    for group in GROUPS:
-        part = getattr(config, group)
-        names = _names(part)
-        mine = {name: value for name, value in options.items() if name in names}
-        changed[group] = dataclasses.replace(part, **mine)
-        options = {name: value for name, value in options.items() if name not in names}
-    return dataclasses.replace(config, **changed, **options)
 
 
 def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
@@ -185,7 +67,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
         name = chosen.preset or (trained.origin.preset if trained else Config.preset)
         every = [other for other in METHODS if METHODS[other].everywhere]
         for one in every if method == "all" else [method]:
-            default = preset(domain, each, one, name)
+            default = find_preset(domain, each, one, name)
             if data.episodes is not None and chosen.demos is None:  # as many as there are
                 default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
             if trained and (trained.domain, trained.method) == (domain, one):
@@ -193,7 +75,7 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
             given = _parse(arguments, default)
             if method == "all" and not default.training.steps:
                 # --steps is for those that learn.
-                given = with_options(given, {"steps": 0})
+                given = change(given, training={"steps": 0})
             config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
             check(config)
             configs.append(config)
@@ -308,7 +190,7 @@ def check_target_return(config: AnyConfig) -> None:
     settings = config.method_settings
     if getattr(settings, "returns", True):
         return
-    default = preset(config.domain, config.level, config.method, config.preset).method_settings
+    default = find_preset(config.domain, config.level, config.method, config.preset).method_settings
     if settings.target_return != default.target_return:
         raise UserError(
             f"--target-return {settings.target_return}: --method {config.method} is told of "
@@ -413,26 +295,3 @@ def episode_seeds(config: AnyConfig) -> range:
     """
     first = seeds.validation_seeds if config.validation else seeds.test_seeds
     return first(config.test_seed, config.episodes)
-
-
-def resolved(config: AnyConfig, seed: int) -> dict[str, Any]:
-    """All settings that one seed's result depends on, as JSON values."""
-    values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
-    return json.loads(json.dumps({**values, "seed": seed}))
-
-
-def configuration_hash(config: AnyConfig, seed: int) -> str:
-    """Twelve hexadecimal digits that name a configuration.
-
-    They are those of domain, level, method and what differs from the defaults alone, so that a
-    setting that is added later, with what was done before as its default, changes no name. To
-    train and to play a checkpoint again are two things.
-    """
-    names = {"domain": config.domain, "level": config.level, "method": config.method}
-    defaults = resolved(blank(**names), seed=-1)
-    values = resolved(config, seed)
-    values["training"] = pretrained.without_unnamed(values["training"])
-    settings = checkpoints.differences(values, defaults)
-    again = {"evaluation": True} if config.checkpoint is not None else {}
-    text = json.dumps({**names, **settings, **again}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

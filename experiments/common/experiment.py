@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,16 +12,7 @@ import jax
 from rich.console import Console
 
 from experiments.common import program, results, run, runtime
-from experiments.common.config import (
-    AnyConfig,
-    configuration_hash,
-    episode_seeds,
-    make_domain,
-    parse,
-    resolved,
-    specify,
-    with_options,
-)
+from experiments.common.config import episode_seeds, make_domain, parse, specify
 from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files, processes, scores
@@ -29,6 +20,7 @@ from leapjax.data import seeds
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
+from leapjax.running.config import AnyConfig, configuration_hash, resolved
 
 
 class Experiment(NamedTuple):
@@ -36,8 +28,8 @@ class Experiment(NamedTuple):
 
     name: str  # of its module, and of its file of rows
     domain: str
-    searches: Callable[[AnyConfig], Sequence[Mapping[str, Any]]] = lambda config: ()
-    # how else to plan with what was trained: options of the planner, a row for each
+    searches: Callable[[AnyConfig], Sequence[AnyConfig]] = lambda config: ()
+    # how else to plan with what was trained, a row for each
     animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
     # (planner, run, level seeds, path): draws plans being refined and executed
     iterations: bool = True  # draw success against the number of iterations
@@ -85,7 +77,7 @@ def searching(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyC
     if config.checkpoint is not None:
         return []
     folder = run_folder(experiment, config, seed)
-    others = [with_options(config, options) for options in experiment.searches(config)]
+    others = experiment.searches(config)
     found = [dataclasses.replace(o, checkpoint=folder, pictures=False) for o in others]
 
     def out_of_reach() -> int:

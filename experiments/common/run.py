@@ -22,7 +22,7 @@ from jax.sharding import Mesh
 from rich.console import Console
 
 from experiments.common import loggers, memory, plots
-from experiments.common.config import PLANS_TOGETHER, AnyConfig, resolved
+from experiments.common.config import PLANS_TOGETHER
 from experiments.common.interruption import Interruption
 from experiments.common.loggers import About, Log
 from experiments.common.progress import Meter
@@ -39,6 +39,7 @@ from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
+from leapjax.running.config import AnyConfig, resolved
 from leapjax.training import TrainStep
 from leapjax.types import Agent, Demonstration, Energy, Params, TrainState
 

@@ -1,7 +1,6 @@
 """How JAX is set up for a program of ours: its devices, its compilation cache."""
 
 import contextlib
-import dataclasses
 import enum
 import os
 import platform
@@ -16,13 +15,12 @@ import jax
 
 from experiments.common import startup
 from leapjax import files
-from leapjax.checks import check_at_least, check_types
 from leapjax.errors import UserError, first_line
+from leapjax.running.cluster import Cluster
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
 CONNECT_SECONDS = 120
-LAST_PORT = 2**16 - 1
 # How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
 # starts one process has too.)
 LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
@@ -67,41 +65,10 @@ PROMISES = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
-class Cluster:
-    """The processes and devices that share a run."""
-
-    coordinator: str | None = None
-    """host:port of process 0, for several processes; SLURM and Open MPI say it themselves."""
-    num_processes: int | None = None
-    """With a coordinator: how many processes there are."""
-    process_id: int | None = None
-    """With a coordinator: which of them this is, from 0."""
-    fsdp: int = 1
-    """Split parameters and optimizer over groups of so many devices; 1: whole on each."""
-
-    def __post_init__(self) -> None:
-        given = [self.coordinator, self.num_processes, self.process_id]
-        check_types(self)
-        check_at_least(self, 1, "fsdp")
-        if given == [None, None, None]:
-            return
-        if self.coordinator is None or self.num_processes is None or self.process_id is None:
-            raise ValueError("coordinator, num-processes and process-id are given together")
-        if not 0 <= self.process_id < self.num_processes:
-            raise ValueError(
-                f"process-id is {self.process_id}, of {self.num_processes} processes: expected 0 "
-                f"to {self.num_processes - 1}"
-            )
-        host, _, port = self.coordinator.rpartition(":")
-        if not host or not port.isdecimal() or len(port) > 5 or int(port) > LAST_PORT:
-            raise ValueError(
-                f"coordinator is {self.coordinator!r}: expected host:port, a port of at most "
-                f"{LAST_PORT}"
-            )
+ALONE = Cluster()  # one process
 
 
-def start(cluster: Cluster = Cluster(), cache: bool = True) -> None:
+def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
     """Every program's first step, before JAX has touched a device.
 
     Args:

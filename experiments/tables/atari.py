@@ -6,17 +6,21 @@ from typing import Any
 
 import numpy as np
 
+from experiments.atari import data_name, game_of
 from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
-from leapjax.atari.domain import LONGEST, data_name, game_of, preset
+from leapjax.atari.domain import LONGEST
 from leapjax.atari.encoders import STACK
 from leapjax.atari.games import GAMES, Game
+from leapjax.presets.atari import PAPER_TRANSITIONS
 
 COLUMNS = {
     "LEAP": Setting("LEAP", "leapjax"),
-    "LEAP without return": Setting("LEAP", "leapjax", options={"returns": False}),
+    "LEAP without return": Setting(
+        "LEAP", "leapjax", changes={"method_settings": {"returns": False}}
+    ),
     "BC": Setting("BC", "leapjax", "bc"),
     "DT": Setting("DT", "leapjax", "dt"),
     "CQL": Setting("CQL", "leapjax", "cql"),
@@ -25,13 +29,17 @@ COLUMNS = {
     "random": Setting("random", "leapjax", "random"),
 }
 # At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
-RUNS = {"run": 16, "max_steps": LONGEST}
+RUNS = {"training": {"run": 16}, "domain_settings": {"max_steps": LONGEST}}
 LARGE = {
-    "LEAP": Setting("LEAP", "paper", options=RUNS),
-    "LEAP without return": Setting("LEAP", "paper", options={**RUNS, "returns": False}),
+    "LEAP": Setting("LEAP", "paper", changes=RUNS),
+    "LEAP without return": Setting(
+        "LEAP", "paper", changes={**RUNS, "method_settings": {"returns": False}}
+    ),
 }
 COLD = {
-    title: dataclasses.replace(setting, options={**setting.options, "temperature": 0.1})
+    title: dataclasses.replace(
+        setting, changes={**setting.changes, "planner": {"temperature": 0.1}}
+    )
     for title, setting in LARGE.items()
 }
 
@@ -54,11 +62,11 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         theirs = {"LEAP without return": game.paper_without_return} | {
             title: game.paper[setting.method]
             for title, setting in COLUMNS.items()
-            if setting.method in game.paper and not setting.options
+            if setting.method in game.paper and not setting.changes
         }
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         few = data.get(name, ())
-        many = data.get(data_name(name, preset(name, "paper")["transitions"]), ())
+        many = data.get(data_name(name, PAPER_TRANSITIONS), ())
         found = {"paper": papers}
         found["ours"], found["score"] = _scores(ours, game, COLUMNS, few)
         found["ours, preset `paper`"], found["its score"] = _scores(ours, game, LARGE, many)

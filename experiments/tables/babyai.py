@@ -18,23 +18,25 @@ SETTINGS = (
     PAPER,
     OURS,
     # Chosen on validation levels: docs/tried.md.
-    Setting("`leapjax`, `--executed 3`", "leapjax", options={"executed": 3}),
+    Setting("`leapjax`, `--executed 3`", "leapjax", changes={"executed": 3}),
 )
 TITLES = " | ".join(setting.title for setting in SETTINGS)
-WITHOUT_DISTANCES = Setting("`leapjax`, `--fields 0`", "leapjax", options={"fields": 0})
+WITHOUT_DISTANCES = Setting(
+    "`leapjax`, `--fields 0`", "leapjax", changes={"domain_settings": {"fields": 0}}
+)
 # The methods of the paper's table, beside the floor, with both presets.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
 # How methods of preset `paper` act, drawn: chosen on validation levels (docs/tried.md). LEAP gains
 # nothing by noise.
 NOISE: Mapping[str, Mapping[str, Any]] = {
-    **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
-    "plate": {"beams": 1, "temperature": 4.0},
+    **{method: {"planner": {"temperature": 4.0}} for method in ("bc", "iql", "dt", "mopo")},
+    "plate": {"planner": {"beams": 1, "temperature": 4.0}},
 }
 BY_METHOD = {
     "preset paper": {method: Setting(method, "paper", method) for method in COMPARED},
     "preset paper, noise": {
-        method: Setting(method, "paper", method, options) for method, options in NOISE.items()
+        method: Setting(method, "paper", method, noise) for method, noise in NOISE.items()
     },
     "preset leapjax": {method: Setting(method, "leapjax", method) for method in COMPARED},
 }

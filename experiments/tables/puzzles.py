@@ -3,17 +3,17 @@
 import dataclasses
 from collections.abc import Sequence
 
-from experiments.common.config import preset
 from experiments.common.results import Row
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from experiments.tables.cells import rate, table
 from experiments.tables.settings import Setting, of_setting
+from leapjax.presets import find_preset
 
 LEARNED = ", learned"
 MINIMISED = {
     LEARNED: Setting("learned", "leapjax"),
     ", rules": Setting("rules", "leapjax", "rules"),
-    ", learned and rules": Setting("both", "leapjax", options={"rules": 1.0}),
+    ", learned and rules": Setting("both", "leapjax", changes={"rules": 1.0}),
 }
 ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
@@ -43,12 +43,11 @@ def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[R
     found = {}
     for domain, level in {(row["domain"], row["level"]): None for row in rows}:
         mine = [row for row in rows if (row["domain"], row["level"]) == (domain, level)]
-        horizon = preset(domain, level, "leap", "leapjax").planner.horizon
+        horizon = find_preset(domain, level, "leap", "leapjax").planner.horizon
         for suffix, setting in MINIMISED.items():
             ways: list[tuple[str, str, list[Row]]] = []
             for search in (*SEARCHES, BEST_OF_MANY):
-                options = {**setting.options, **search.of(horizon)}
-                of = of_setting(mine, dataclasses.replace(setting, options=options))
+                of = of_setting(mine, setting, **search.of(horizon))
                 ways.append((search.name, search.cost, of))
             for one in ONE_ACTION:
                 of = of_setting(mine, one) if suffix == LEARNED else []
@@ -86,14 +85,13 @@ def arms(rows: Sequence[Row]) -> str:
 def rows_by_arms(rows: Sequence[Row]) -> list[tuple[str, int, list[Row]]]:
     """Of what has learned graphs of three arms: the search, arms that it was played on, rows."""
     trained = [row for row in rows if row["level"] == ARMS_LEVEL]
-    horizon = preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
+    horizon = find_preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
     found = []
     for search in SEARCHES:
         for count in ARMS:
             level = f"Star{count}x{horizon}"
             play = {} if level == ARMS_LEVEL else {"play": level}
-            setting = dataclasses.replace(
-                MINIMISED[LEARNED], options={**search.of(horizon), **play}
-            )
-            found.append((f"{search.name}, {search.cost}", count, of_setting(trained, setting)))
+            setting = dataclasses.replace(MINIMISED[LEARNED], changes=play)
+            of = of_setting(trained, setting, **search.of(horizon))
+            found.append((f"{search.name}, {search.cost}", count, of))
     return found

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import look_around, seen_around
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.models.policy import Said
@@ -87,4 +87,4 @@ def likely_values(said: Said, threshold: float) -> jax.Array:
     return jnp.where(likely, said["q"], -jnp.inf)
 
 
-BCQ = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+BCQ = Method(Settings, make_agent, rewards=True)

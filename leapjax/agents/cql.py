@@ -12,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import LARGEST, check_within
 from leapjax.types import Agent
@@ -54,4 +54,4 @@ def conservative(q: jax.Array, taken: jax.Array) -> jax.Array:
     return jax.nn.logsumexp(q, axis=1) - losses.of_action(q, taken)
 
 
-CQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+CQL = Method(Settings, make_agent, rewards=True)

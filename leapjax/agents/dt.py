@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import returns
 from leapjax.agents.imitation import make_imitator
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.types import Agent
 
@@ -30,4 +30,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return make_imitator(setup, mesh, returns.wanted(setup))
 
 
-DT = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+DT = Method(Settings, make_agent, rewards=True)

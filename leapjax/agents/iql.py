@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
@@ -162,4 +162,4 @@ def _critic(params: Params) -> Params:
     return {"params": params["params"]["critic"]}
 
 
-IQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+IQL = Method(Settings, make_agent, rewards=True)

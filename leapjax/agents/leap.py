@@ -10,28 +10,13 @@ from jax.sharding import Mesh
 from leapjax import schedules
 from leapjax.agents import learning, returns
 from leapjax.agents.batches import run_batches, window_batches
-from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.models import trajectory
 from leapjax.models.trajectory import Model, Seen
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
-
-PRESETS: Presets = {
-    # The appendix, and the authors' code where that made the numbers: every action of a window is
-    # masked in turn. The copies of a few windows at a time stay in a core's cache.
-    "paper": {
-        "architecture": "paper", "dropout": 0.1, "masking": "each", "windows": "episode",
-        "microbatch": 4,
-    },
-    # Ours, chosen on validation levels (docs/tried.md). A little noise leads out of plans
-    # that lead nowhere.
-    "leapjax": {
-        "architecture": "leapjax", "dropout": 0.0, "masking": "random", "windows": "step",
-        "learning_rate": 3e-3, "temperature": 0.5,
-    },
-}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,4 +151,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return Agent(init, batch, update, energy)
 
 
-LEAP = Method(Settings, make_agent, PRESETS)
+LEAP = Method(Settings, make_agent)

@@ -1,7 +1,7 @@
 """What agents share: the setup they are made from, optimisation, one gradient step."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -31,19 +31,6 @@ from leapjax.types import (
     TrainState,
 )
 
-Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
-SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
-# Of methods that have no reason for others.
-NETWORK_PRESETS: Presets = {
-    # A few windows at a time stay in a core's cache.
-    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode", "microbatch": 8},
-    "leapjax": {
-        "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
-    },
-}  # fmt: skip
-SINGLE_ACTION_PRESETS: Presets = {
-    name: {**SINGLE_ACTION, **options} for name, options in NETWORK_PRESETS.items()
-}
 UNDECAYED = ("bias", "scale", "embedding")
 # Settings of training that change how a step is computed, and not what comes of it: no name of a
 # run or a checkpoint is made from them.
@@ -183,7 +170,6 @@ class Method(NamedTuple):
     settings: type  # a frozen dataclass: the options that only this method has
     make_agent: Callable[[Setup, Mesh | None], Agent]
     # mesh: of devices to train on (see leapjax.sharding); None for one device
-    presets: Presets  # whatever the level; what that asks for is in its domain's presets
     rewards: bool = False  # it learns from them: data without any are refused
     planner: type = GibbsConfig  # the settings of how it searches
     everywhere: bool = True  # every domain can have it, so it is one of `--method all`

@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import iql, learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import LARGEST, check_at_least, check_within
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -247,4 +247,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return Agent(init, transition_batches(setup), update, energy)
 
 
-MOPO = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+MOPO = Method(Settings, make_agent, rewards=True)

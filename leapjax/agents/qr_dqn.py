@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import check_at_least
 from leapjax.types import Agent
@@ -49,4 +49,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return q_learning.make_agent(setup, mesh, choices * count, loss, values)
 
 
-QR_DQN = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+QR_DQN = Method(Settings, make_agent, rewards=True)

@@ -12,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import check_at_least
 from leapjax.types import Agent
@@ -57,4 +57,4 @@ def mixture(key: jax.Array, count: int) -> jax.Array:
     return drawn / drawn.sum()
 
 
-REM = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+REM = Method(Settings, make_agent, rewards=True)

@@ -3,16 +3,15 @@
 import dataclasses
 import functools
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import flax.linen as nn
 import numpy as np
 
 from leapjax.atari import replay
 from leapjax.atari.augmentation import mirrored, shifted
-from leapjax.atari.encoders import STACK, CurrentTokens, StateTokens
+from leapjax.atari.encoders import CurrentTokens, StateTokens
 from leapjax.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.checks import check_at_least, check_types, check_within
 from leapjax.data.seeds import MAX_TRAINING_SEED
@@ -25,7 +24,6 @@ LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those tha
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
 MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
 TOKENS = 4  # of a state, of our encoder
-TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,74 +119,4 @@ def source(game: Game, settings: Settings) -> Source:
     return Source(FOLDER, exists, write, load, count, "transitions")
 
 
-# By game: T, N and the batch (paper, tables 6 and 8).
-PAPER = {
-    "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
-}  # fmt: skip
-EPOCHS = 10
-TRANSITIONS = {"Seaquest": 200_000}  # to learn from with preset `leapjax`, where not as elsewhere
-IMITATORS = ("leap", "bc", "dt")  # they sample what to do; to ask for a ball can be improbable
-
-
-def preset(name: str, preset: str) -> Mapping[str, Any]:
-    """What a preset sets for a game.
-
-    Raises:
-        UserError: an unknown game.
-    """
-    find_game(name)
-    shared = {
-        "executed": 1, "episodes": 20, "test_seed": TEST_SEED, "demos": 100_000,  # all there are
-    }  # fmt: skip
-    if preset == "paper":
-        horizon, iterations, batch = PAPER[name]
-        transitions = 500_000
-        return {
-            **shared, "transitions": transitions, "steps": EPOCHS * transitions // batch,
-            "context": 25, "horizon": horizon, "iterations": iterations, "batch": batch,
-            "layers": 6, "heads": 8, "attention": "causal",
-        }  # fmt: skip
-    return {
-        **shared, "context": STACK - 1, "horizon": 5, "iterations": 5, "steps": 10_000,
-        "layers": 2, "width": 64, "features": 16, "mirror": True, "max_steps": LONGEST,
-        "transitions": TRANSITIONS.get(name, Settings.transitions),
-    }  # fmt: skip
-
-
-def data_name(game: str, transitions: int) -> str:
-    """What data of a game are recorded as: its name, where there are as many as usual."""
-    usual = preset(game, "leapjax")["transitions"]
-    return game if transitions == usual else f"{game}, {transitions:,} transitions"
-
-
-def game_of(name: str) -> str:
-    """The game of data that `data_name` calls so."""
-    return name.partition(",")[0]
-
-
-def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
-    """What a game changes of a method's own options."""
-    game = find_game(name)
-    options: dict[str, Any] = {"windows": "step"}
-    if method in ("leap", "dt"):
-        options["target_return"] = game.target
-    if method == "leap":
-        options |= {"end": False, "returns": True}
-        if preset == "paper":
-            options |= {"masking": "one", "microbatch": 0}
-        else:  # to read frames costs more than to look at a plan in T ways
-            options["masking"] = "stratified"
-    if preset == "leapjax":
-        options["learning_rate"] = 1e-3
-    if method in IMITATORS:
-        options["temperature"] = 0.1 if preset == "leapjax" else 1.0
-        if preset == "leapjax" and name == "Seaquest":
-            # What moves there looks where it goes. Who imitates and sees the past learns to go on
-            # as before (docs/tried.md).
-            options["context"] = 0
-    if method == "cql" and preset == "leapjax":
-        options["alpha"] = 1.0  # with less it learns nothing in so few steps (docs/tried.md)
-    return options
-
-
-ATARI = DomainType(Settings, make, tuple(GAMES), preset, tuned)
+ATARI = DomainType(Settings, make, tuple(GAMES))

@@ -13,7 +13,6 @@ from leapjax.babyai import (
     levels,
     observations,
     replay,
-    settings,
     vocabulary,
 )
 from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
@@ -98,4 +97,4 @@ def check(states: Observation, where: str, level: Level) -> None:
             )
 
 
-BABYAI = DomainType(Settings, make, tuple(levels.LEVELS), settings.preset, settings.tuned)
+BABYAI = DomainType(Settings, make, tuple(levels.LEVELS))

@@ -226,10 +226,4 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
     return domain
 
 
-def preset(name: str, preset: str) -> Mapping[str, Any]:
-    """What a preset sets for an environment: act, and look again."""
-    del name, preset
-    return {"horizon": 5, "iterations": 5, "executed": 1, "steps": 2000, "episodes": 100}
-
-
-GYMNASIUM = DomainType(Settings, make, EXAMPLES, preset)
+GYMNASIUM = DomainType(Settings, make, EXAMPLES)

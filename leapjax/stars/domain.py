@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -105,29 +103,4 @@ def check(states: Graph, where: str, labels: int) -> None:
             )
 
 
-def preset(name: str, preset: str) -> Mapping[str, Any]:
-    """What a preset sets for a level: a plan is the whole way.
-
-    Raises:
-        UserError: an unknown level.
-    """
-    del preset
-    star = graphs.find_level(name)
-    return {
-        "horizon": star.length, "iterations": star.length, "fill": "confident",
-        "steps": 4000, "batch": 128, "episodes": 500,
-        "demos": 100,  # augmentation makes any graph of any other
-    }  # fmt: skip
-
-
-def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
-    """What a level changes of a method's own options."""
-    options: dict[str, Any] = {"learning_rate": 1e-3}
-    if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
-        options |= {"temperature": 0.0, "windows": "start"}
-        if graphs.find_level(name).nodes > LARGE and preset != "paper":
-            options |= {"neighbours": True, "fewer_arms": True, "batch": 64}
-    return options
-
-
-STARS = DomainType(Settings, make, graphs.LEVELS, preset, tuned)
+STARS = DomainType(Settings, make, graphs.LEVELS)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -108,28 +106,4 @@ def check(states: Board, where: str, side: int) -> None:
         raise UserError(f"{where} does not fill the {cells} cells of a board, one after the other")
 
 
-def preset(name: str, preset: str) -> Mapping[str, Any]:
-    """What a preset sets for a level: a plan is the whole board.
-
-    Raises:
-        UserError: an unknown level.
-    """
-    del preset
-    size = boards.find_level(name)
-    small = size.side == 4
-    return {
-        "horizon": size.cells, "iterations": size.cells, "fill": "confident",
-        "demos": 500 if small else 2000, "episodes": 500,
-        "steps": 2000 if small else 1500, "batch": 64 if small else 32, "learning_rate": 1e-3,
-    }  # fmt: skip
-
-
-def tuned(name: str, method: str, preset: str) -> Mapping[str, Any]:
-    """What a level changes of a method's own options."""
-    del name, preset
-    if method == "leap":  # the whole plan is executed, so only its beginning is ever asked for
-        return {"learning_rate": 1e-3, "temperature": 0.0, "windows": "start"}
-    return {"learning_rate": 1e-3}
-
-
-SUDOKU = DomainType(Settings, make, boards.LEVELS, preset, tuned)
+SUDOKU = DomainType(Settings, make, boards.LEVELS)
