@@ -54,7 +54,7 @@ def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/schedules.py", "checks")
     may_import("leapjax/energy.py", "types", "checks", "errors")
     may_import("leapjax/sharding.py", "types", "checks")
-    may_import("leapjax/planners.py", "types", "checks")
+    may_import("leapjax/planners.py", "types", "checks", "errors")
     may_import("leapjax/batching.py", "types", "checks", "errors", "planners", "sharding")
     may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
