@@ -127,6 +127,17 @@ def test_the_public_names_are_sorted_and_exist():
     assert all(hasattr(leapjax, name) for name in leapjax.__all__)
 
 
+def test_only_one_module_needs_what_jax_may_change_with_every_release():
+    names = re.compile(r"\bjax(\.| import .*\b)(_src|extend|interpreters)\b")
+    paths = [
+        path
+        for folder in ("leapjax", "experiments", "benchmarks", "tests", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+        if names.search(path.read_text())
+    ]
+    assert paths == [ROOT / "leapjax/models/linear.py"]  # which says why
+
+
 def test_the_public_names_are_documented():
     listed = re.findall(r"^::: leapjax\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
     assert sorted(listed) == leapjax.__all__
