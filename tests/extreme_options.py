@@ -19,7 +19,7 @@ from experiments import (
 )
 from experiments.common import analysis
 from leapjax.methods import METHODS
-from leapjax.presets import PRESETS
+from leapjax.presets import find_presets
 from leapjax.running.config import blank
 
 LEVELS = {
@@ -69,7 +69,7 @@ def command_lines(domain: str) -> Iterator[list[str]]:
         parts = [chosen.method_settings, chosen.planner]
         if method == "leap":
             parts += [chosen, chosen.model, chosen.training, chosen.cluster, chosen.domain_settings]
-        for name in PRESETS["babyai"]:
+        for name in find_presets(domain):
             for part in parts:
                 for _, given in numeric(type(part)):
                     yield [*base, "--method", method, "--preset", name, *given]

@@ -14,16 +14,16 @@ import experiments.__main__ as programs
 from experiments.common import config, memory
 from experiments.common.config import GROUPS
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, files, presets, pretrained
+from leapjax import checkpoints, domains, files, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
-from leapjax.domains import DOMAINS
+from leapjax.domains import DOMAINS, find_domain
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
-from leapjax.presets import find_preset
+from leapjax.presets import babyai, find_preset
 from leapjax.running.config import configuration_hash, resolved
 from leapjax.types import TrainState
 from tests.programs import only_long
@@ -90,7 +90,7 @@ def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
     methods = [method for method in METHODS if METHODS[method].everywhere]
     before = [names("--method", method) for method in methods]
     monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=Later))
-    monkeypatch.setattr(presets.babyai, "Settings", Later)
+    monkeypatch.setattr(babyai, "Settings", Later)
     assert isinstance(parse().domain_settings, Later)
     assert [names("--method", method) for method in methods] == before
     assert names("--mood", "calm") == before[0]
@@ -184,7 +184,7 @@ def test_every_program_is_known_by_name(capsys):
 
 KINDS = [
     *dict.fromkeys(method.settings for method in METHODS.values()),
-    *(domain.settings for domain in DOMAINS.values()),
+    *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
 FIELDS = [

@@ -5,38 +5,48 @@ place, with its reason; what a preset does not set is the default of the datacla
 """
 
 import functools
+import importlib
 from collections.abc import Callable, Mapping
 
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
 from leapjax.methods import find_method
-from leapjax.presets import atari, babyai, environments, stars, sudoku
+from leapjax.presets import environments
 from leapjax.running.config import AnyConfig
 
 Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
-PRESETS: dict[str, Mapping[str, Preset]] = {
-    "babyai": {"leapjax": babyai.leapjax, "paper": babyai.paper},
-    "atari": {"leapjax": atari.leapjax, "paper": atari.paper},
-    "stars": {"leapjax": stars.leapjax, "paper": stars.paper},
-    "sudoku": {"leapjax": sudoku.leapjax, "paper": sudoku.paper},
-}
+# A module of presets is imported when it is first used: it imports its domain.
+MODULES = {name: f"leapjax.presets.{name}" for name in ("babyai", "atari", "stars", "sudoku")}
+PRESETS: dict[str, Mapping[str, Preset]] = {}  # by domain, those of a user's own
+
+
+def find_presets(domain: str) -> Mapping[str, Preset]:
+    """Returns the presets of a domain by name; one without its own has those of any environment.
+
+    Raises:
+        UserError: there is no such domain, or it needs an extra that is not installed.
+    """
+    find_domain(domain)
+    if domain in PRESETS:
+        return PRESETS[domain]
+    if domain in MODULES:
+        module = importlib.import_module(MODULES[domain])
+        return {"leapjax": module.leapjax, "paper": module.paper}
+    return {
+        "leapjax": functools.partial(environments.leapjax, domain),
+        "paper": functools.partial(environments.paper, domain),
+    }
 
 
 def find_preset(domain: str, level: str, method: str, name: str) -> AnyConfig:
     """Returns the configuration that a preset gives a level and a method.
 
-    A domain that is not in `PRESETS` has those of any environment.
-
     Raises:
         UserError: there is no such domain, level, method or preset.
     """
-    find_domain(domain)
+    presets = find_presets(domain)
     find_method(method)
-    presets = PRESETS.get(domain) or {
-        "leapjax": functools.partial(environments.leapjax, domain),
-        "paper": functools.partial(environments.paper, domain),
-    }
     if name not in presets:
-        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(sorted(presets))}")
+        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
     return presets[name](level, method)
