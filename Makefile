@@ -30,6 +30,7 @@ lint: .venv/develop
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 # Wheel and sdist in dist/, checked; the wheel, unpacked on its own, must do what the README says.
 package: .venv/develop

@@ -30,12 +30,12 @@ from experiments.common.config import make_domain, specify
 from experiments.tables.atari import encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
+from leapjax.configuration import AnyConfig, change
 from leapjax.domain import Domain
 from leapjax.environments import Eager, closing
 from leapjax.errors import UserError
 from leapjax.presets import find_preset
 from leapjax.rollouts import kept
-from leapjax.running.config import AnyConfig, change
 
 GAMES_PLAYED = (1, 16, 64)  # together
 DECISIONS = 50  # of each game, to measure

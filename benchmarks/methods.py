@@ -21,8 +21,8 @@ from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import program, runtime
 from experiments.common.config import check_counts
 from experiments.tables.babyai import COMPARED
-from leapjax.babyai import levels
 from leapjax.batching import compile_planner
+from leapjax.domains.babyai import levels
 from leapjax.presets import find_preset
 
 METHODS = tuple(name for name in COMPARED if name != "random")

@@ -27,14 +27,14 @@ from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_r
 from experiments.common import plots, program, runtime
 from experiments.common.config import make_domain, specify
 from leapjax import pretrained
-from leapjax.babyai import levels
-from leapjax.babyai.levels import Level
 from leapjax.batching import CHUNK_SIZES, compile_planner, plan_keys, split_batch
+from leapjax.configuration import AnyConfig, change
 from leapjax.domain import Domain, blank_context
+from leapjax.domains.babyai import levels
+from leapjax.domains.babyai.levels import Level
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig, bind
 from leapjax.presets import find_preset
-from leapjax.running.config import AnyConfig, change
 from leapjax.types import Energy, Params
 
 matplotlib.use("Agg")

@@ -21,9 +21,9 @@ from rich.table import Table
 from benchmarks.timing import Row, check_writable, fastest, write_rows
 from experiments.common import plots, program, runtime
 from leapjax import pretrained, rollouts
-from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
+from leapjax.domains.babyai import levels
 from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import FILLS, GibbsConfig

@@ -29,11 +29,11 @@ from experiments.common import program, runtime
 from experiments.common.config import make_domain, specify
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
+from leapjax.configuration import AnyConfig, change
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.presets import find_preset
-from leapjax.running.config import AnyConfig, change
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")

@@ -16,7 +16,7 @@ from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import storage, windows
 from leapjax.domain import apply_statistics
 from leapjax.domains import find_domain
-from leapjax.gymnasium.domain import Settings
+from leapjax.domains.gymnasium.domain import Settings
 from leapjax.models.trajectory import ModelConfig
 from leapjax.training import make_train_step, train
 

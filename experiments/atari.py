@@ -20,8 +20,8 @@ from experiments.common import experiment, memory, program, results
 from experiments.common.config import check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
-from leapjax.atari.domain import FOLDER, LONGEST, Settings, make
-from leapjax.atari.games import find_game
+from leapjax.domains.atari.domain import FOLDER, LONGEST, Settings, make
+from leapjax.domains.atari.games import find_game
 from leapjax.errors import UserError
 from leapjax.presets import atari as presets
 
@@ -77,7 +77,7 @@ def run(options: Collect) -> None:
             f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
         )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
-    from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
+    from leapjax.domains.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console(markup=False)
     transitions = options.transitions or presets.transitions(options.game)

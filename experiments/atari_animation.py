@@ -21,7 +21,7 @@ WHITE, BLACK, GREY, BLUE = (255, 255, 255), (0, 0, 0), (150, 150, 150), (40, 110
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws the beginning of one game, every second decision of it."""
-    from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
+    from leapjax.domains.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
 
     actions, title = run.domain.actions, run.domain.level
     frames: list[Frame] = []

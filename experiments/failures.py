@@ -24,12 +24,12 @@ from experiments.common import program, runtime
 from experiments.common.config import check_counts, check_executed
 from experiments.common.pictures import check_picture, save_sheet
 from leapjax import pretrained, rollouts
-from leapjax.babyai import levels, observations
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.levels import Level
-from leapjax.babyai.observations import Cell, Observation
 from leapjax.checks import check_integer
 from leapjax.data import seeds
+from leapjax.domains.babyai import levels, observations
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.levels import Level
+from leapjax.domains.babyai.observations import Cell, Observation
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 

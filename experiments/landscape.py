@@ -29,12 +29,12 @@ from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files
 from leapjax.batching import compile_planner
+from leapjax.configuration import change
 from leapjax.data import seeds, windows
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
-from leapjax.running.config import change
 from leapjax.types import Context, Energy, Params, Window
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random

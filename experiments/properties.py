@@ -16,8 +16,9 @@ from minigrid.core.world_object import WorldObj
 
 from experiments.common import analysis
 from experiments.common.analysis import Analysis, Case, Model, Way, alone, drawn_at
-from leapjax.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import (
+from leapjax.configuration import AnyConfig, change
+from leapjax.domains.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
+from leapjax.domains.babyai.constraints import (
     goal_before_visit,
     half_of_obstacles,
     immediate_lava,
@@ -31,13 +32,12 @@ from leapjax.babyai.constraints import (
     without_marks,
     without_open_doors,
 )
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import LEFT
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.symmetries import LEFT
 from leapjax.energy import compose, constrain, neutral, view
 from leapjax.environments import Transition
 from leapjax.planners import BeamConfig, GibbsConfig
-from leapjax.running.config import AnyConfig, change
 from leapjax.types import Context, Energy
 
 Penalty = Callable[[Context, jax.Array], jax.Array]

@@ -26,11 +26,11 @@ from experiments.common.episodes import watched
 from experiments.common.interruption import Interruption
 from experiments.common.pictures import save_sheet
 from leapjax import files, pretrained
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.constraints import in_half
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.observations import Cell, agent_cell
 from leapjax.data import seeds
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.constraints import in_half
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.observations import Cell, agent_cell
 from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig

@@ -14,8 +14,8 @@ from experiments.common.run import Run
 from experiments.common.searches import SEARCHES, searches
 from leapjax import rollouts
 from leapjax.batching import compile_planner, plan_keys
+from leapjax.domains.puzzles.stars.graphs import Graph, Star, StarAdapter, find_level
 from leapjax.pretrained import Pretrained
-from leapjax.stars.graphs import Graph, Star, StarAdapter, find_level
 
 SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels, as are the next two
 SPACING, MOST = 28, 1000  # from node to node; of a side

@@ -18,9 +18,9 @@ from experiments import (
     suboptimal,
 )
 from experiments.common import analysis
+from leapjax.configuration import blank
 from leapjax.methods import METHODS
 from leapjax.presets import find_presets
-from leapjax.running.config import blank
 
 LEVELS = {
     "babyai": "GoToLocalS7N5", "stars": "Star3x5", "sudoku": "Sudoku4x6",

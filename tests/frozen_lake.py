@@ -8,11 +8,11 @@ import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.configuration import AnyConfig, change
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
 from leapjax.presets import common, environments
-from leapjax.running.config import AnyConfig, change
 
 LEVEL = "FrozenLake-v1"
 CELLS, GOAL = 16, 15

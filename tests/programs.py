@@ -17,9 +17,9 @@ from experiments.common import config, experiment, results
 from experiments.common.experiment import Experiment
 from leapjax import checkpoints, domains, pretrained
 from leapjax.checkpoints import Checkpoints
+from leapjax.configuration import change
 from leapjax.files import only_process_in
 from leapjax.presets import PRESETS
-from leapjax.running.config import change
 from leapjax.types import TrainState
 from tests import frozen_lake
 from tests.parameters import random_parameters

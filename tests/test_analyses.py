@@ -14,8 +14,8 @@ from experiments.common.analysis import Analysis, Options, Way
 from experiments.common.run import write_metrics
 from experiments.tables import analyses
 from leapjax import pretrained
-from leapjax.babyai import constraints
-from leapjax.babyai.levels import find_level
+from leapjax.domains.babyai import constraints
+from leapjax.domains.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from tests.programs import only_long, with_options

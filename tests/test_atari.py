@@ -19,17 +19,17 @@ import pytest
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
 from experiments.tables.atari import ENCODED, data, encoding, played, uses
-from leapjax.atari import augmentation, collect, domain, encoders, replay
-from leapjax.atari.adapter import AtariAdapter
-from leapjax.atari.emulator import Emulator
-from leapjax.atari.games import GAMES, find_game
+from leapjax.configuration import configuration_hash
 from leapjax.data import windows
+from leapjax.domains.atari import augmentation, collect, domain, encoders, replay
+from leapjax.domains.atari.adapter import AtariAdapter
+from leapjax.domains.atari.emulator import Emulator
+from leapjax.domains.atari.games import GAMES, find_game
 from leapjax.environments import Eager
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Origin
-from leapjax.running.config import configuration_hash
 from leapjax.types import Demonstration, Energy
 from tests.parameters import random_like
 from tests.programs import ROOT, only_long, with_options
@@ -440,7 +440,7 @@ def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
 def test_processes_end_when_the_first_is_killed():
     program = (
         "import os, time\n"
-        "from leapjax.atari.collect import _processes\n"
+        "from leapjax.domains.atari.collect import _processes\n"
         "if __name__ == '__main__':\n"
         "    with _processes(1) as pool:\n"
         "        print(pool.submit(os.getpid).result(), flush=True)\n"

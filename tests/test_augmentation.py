@@ -9,12 +9,12 @@ import pytest
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.core.grid import Grid
 
-from leapjax.babyai import augmentation, demonstrations, levels, vocabulary
-from leapjax.babyai.adapter import END
-from leapjax.babyai.dynamics import FORWARD, LAVA, roll
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.settings import Settings
 from leapjax.data import windows
+from leapjax.domains.babyai import augmentation, demonstrations, levels, vocabulary
+from leapjax.domains.babyai.adapter import END
+from leapjax.domains.babyai.dynamics import FORWARD, LAVA, roll
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
 from tests.dynamics import FRONT, stepped
 from tests.oracles import slow_path_lengths
 from tests.programs import only_long

@@ -15,11 +15,11 @@ from experiments.common import results, run
 from experiments.common.config import parse
 from leapjax import UserError, files, load, plan_keys, pretrained, rollouts
 from leapjax.agents import leap
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.levels import LEVELS
-from leapjax.babyai.settings import Settings
 from leapjax.data import seeds, storage
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.levels import LEVELS
+from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run

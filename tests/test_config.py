@@ -16,15 +16,15 @@ from experiments.common.config import GROUPS
 from experiments.common.searches import searches
 from leapjax import checkpoints, domains, files, pretrained
 from leapjax.agents.learning import TrainingConfig
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
+from leapjax.configuration import configuration_hash, resolved
 from leapjax.domains import DOMAINS, find_domain
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 from leapjax.presets import babyai, find_preset
-from leapjax.running.config import configuration_hash, resolved
 from leapjax.types import TrainState
 from tests.programs import only_long
 

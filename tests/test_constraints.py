@@ -13,8 +13,9 @@ from experiments.properties import (
     WatchedTurns,
     exploring,
 )
-from leapjax.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
-from leapjax.babyai.constraints import (
+from leapjax.batching import compile_planner
+from leapjax.domains.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
+from leapjax.domains.babyai.constraints import (
     goal_before_visit,
     immediate_lava,
     lava,
@@ -24,10 +25,9 @@ from leapjax.babyai.constraints import (
     told_to_go,
     turns_over,
 )
-from leapjax.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.vocabulary import decode
-from leapjax.batching import compile_planner
+from leapjax.domains.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.vocabulary import decode
 from leapjax.energy import constrain, from_total, pseudo_likelihood
 from leapjax.planners import BeamConfig, GibbsConfig, bind
 from leapjax.rollouts import History

@@ -7,12 +7,12 @@ import pytest
 from minigrid.core.world_object import Door
 from minigrid.utils.baby_ai_bot import BabyAIBot
 
-from leapjax.babyai import demonstrations, levels, observations
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
-from leapjax.babyai.observations import Observation
 from leapjax.data import seeds
 from leapjax.domain import Collection
+from leapjax.domains.babyai import demonstrations, levels, observations
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
+from leapjax.domains.babyai.observations import Observation
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 from tests.oracles import assert_same_observation, slow_path_lengths

@@ -8,10 +8,10 @@ pytest.importorskip("ale_py")  # an extra
 
 from ale_py.vector_env import AtariVectorEnv
 
-from leapjax.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
-from leapjax.atari.domain import LONGEST
-from leapjax.atari.emulator import Emulator
-from leapjax.atari.games import GAMES
+from leapjax.domains.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
+from leapjax.domains.atari.domain import LONGEST
+from leapjax.domains.atari.emulator import Emulator
+from leapjax.domains.atari.games import GAMES
 from tests.programs import ROOT
 
 games = pytest.mark.parametrize("name", GAMES)

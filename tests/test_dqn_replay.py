@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from leapjax.atari import replay
-from leapjax.atari.games import GAMES
-from leapjax.atari.replay import CUT_AFTER, CUT_BEFORE, Episode
 from leapjax.data.storage import UNKNOWN_SEED
+from leapjax.domains.atari import replay
+from leapjax.domains.atari.games import GAMES
+from leapjax.domains.atari.replay import CUT_AFTER, CUT_BEFORE, Episode
 from leapjax.errors import UserError
 
 PONG = GAMES["Pong"]

@@ -27,11 +27,11 @@ from experiments import report
 from experiments.common import analysis, config, results, run, runtime
 from experiments.tables import measured
 from leapjax import checkpoints, pretrained, weights
-from leapjax.atari import collect
-from leapjax.babyai import levels
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import storage
 from leapjax.domain import Collection
+from leapjax.domains.atari import collect
+from leapjax.domains.babyai import levels
 from leapjax.errors import UserError
 from leapjax.types import TrainState
 from tests import extreme_options

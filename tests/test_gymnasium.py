@@ -29,10 +29,16 @@ from experiments.common import config, results, run
 from leapjax import domains
 from leapjax.data import storage, windows
 from leapjax.domain import Collection, Domain, blank_context
+from leapjax.domains.gymnasium.domain import GYMNASIUM, Settings, make
+from leapjax.domains.gymnasium.observations import (
+    Part,
+    StateTokens,
+    blank_of,
+    check_choices,
+    parts_of,
+)
 from leapjax.environments import Criterion, GymnasiumAdapter, Transition
 from leapjax.errors import UserError
-from leapjax.gymnasium.domain import GYMNASIUM, Settings, make
-from leapjax.gymnasium.observations import Part, StateTokens, blank_of, check_choices, parts_of
 from leapjax.rollouts import evaluate
 from leapjax.types import Demonstration, Plan
 from tests.parameters import random_like

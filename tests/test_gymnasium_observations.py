@@ -16,9 +16,8 @@ from experiments.common import config, results
 from leapjax import pretrained
 from leapjax.data import storage
 from leapjax.domain import apply_statistics, blank_context
-from leapjax.errors import UserError
-from leapjax.gymnasium.domain import Settings, make
-from leapjax.gymnasium.observations import (
+from leapjax.domains.gymnasium.domain import Settings, make
+from leapjax.domains.gymnasium.observations import (
     MOST_INPUTS,
     Part,
     StateTokens,
@@ -28,7 +27,14 @@ from leapjax.gymnasium.observations import (
     measure_parts,
     parts_of,
 )
-from leapjax.gymnasium.scaling import BINS, UNMEASURED, count_bins, find_knots, scale_numbers
+from leapjax.domains.gymnasium.scaling import (
+    BINS,
+    UNMEASURED,
+    count_bins,
+    find_knots,
+    scale_numbers,
+)
+from leapjax.errors import UserError
 from leapjax.types import Demonstration
 from tests.parameters import random_like
 from tests.programs import SMALL, only_long

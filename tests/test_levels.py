@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
-from leapjax.babyai import levels
-from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai import levels
+from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.errors import UserError
 
 # The paper's appendix: side, rooms, objects, doors (table "BabyAI environment setting"), then

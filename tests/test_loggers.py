@@ -11,8 +11,8 @@ from rich.console import Console
 
 from experiments.common import config, experiment, loggers, progress, results
 from leapjax import domains, scores
+from leapjax.configuration import configuration_hash
 from leapjax.errors import UserError
-from leapjax.running.config import configuration_hash
 from tests.frozen_lake import FROZEN_LAKE
 from tests.programs import LAKE, SMALL, only_long
 

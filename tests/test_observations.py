@@ -7,8 +7,8 @@ from minigrid.core.grid import Grid
 from minigrid.core.world_object import Ball, Door, Floor, Key, Wall
 from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc
 
-from leapjax.babyai import demonstrations, levels, observations, vocabulary
-from leapjax.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai import demonstrations, levels, observations, vocabulary
+from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.errors import UserError
 from tests.oracles import slow_path_lengths
 

@@ -11,7 +11,7 @@ import pytest
 
 from leapjax.agents import learning
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.babyai import encoders
+from leapjax.domains.babyai import encoders
 from leapjax.methods import find_method
 from leapjax.models import once
 from leapjax.models.trajectory import ModelConfig

@@ -37,11 +37,11 @@ from experiments import (
 from experiments.common import config, experiment, plots, program, results, run, runtime, startup
 from experiments.common.config import parse
 from leapjax import checkpoints, files, pretrained
-from leapjax.babyai import demonstrations, levels
 from leapjax.checkpoints import Checkpoints
+from leapjax.configuration import configuration_hash
 from leapjax.data import storage
+from leapjax.domains.babyai import demonstrations, levels
 from leapjax.errors import UserError
-from leapjax.running.config import configuration_hash
 from leapjax.types import TrainState
 from tests.programs import LONG, ROOT, TOY_RUN, only_long, seal, untrained_run
 

@@ -13,10 +13,10 @@ from minigrid.wrappers import FullyObsWrapper
 
 from experiments import babyai
 from experiments.common import config
-from leapjax.babyai import demonstrations, levels, replay
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
 from leapjax.data import storage
+from leapjax.domains.babyai import demonstrations, levels, replay
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from tests.programs import TOY, only_long
 from tests.test_storage import file_of

@@ -6,9 +6,9 @@ from pathlib import Path
 from experiments import report
 from experiments.common import plots
 from experiments.tables import analyses, babyai, puzzles
-from leapjax.babyai.levels import LEVELS
+from leapjax.configuration import configuration_hash
+from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
-from leapjax.running.config import configuration_hash
 from tests.programs import with_options
 
 

@@ -13,14 +13,14 @@ from experiments.common import results, searches
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.domains.puzzles.stars import graphs
+from leapjax.domains.puzzles.stars.domain import Settings, make
+from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
 from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets import find_preset
-from leapjax.stars import graphs
-from leapjax.stars.domain import Settings, make
-from leapjax.stars.graphs import Star, StarAdapter
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
 from tests.programs import only_long, with_options

@@ -20,12 +20,12 @@ from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
 
 from leapjax import files
-from leapjax.babyai import levels, observations
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.settings import Settings
 from leapjax.data import storage
 from leapjax.domain import Collection, Described, Domain
+from leapjax.domains.babyai import levels, observations
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 

@@ -13,13 +13,13 @@ from experiments.common import results, searches
 from leapjax.batching import compile_planner
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.domains.puzzles.sudoku import boards
+from leapjax.domains.puzzles.sudoku.boards import Size, SudokuAdapter
+from leapjax.domains.puzzles.sudoku.domain import BoardTokens, Settings, make
+from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
-from leapjax.sudoku import boards
-from leapjax.sudoku.boards import Size, SudokuAdapter
-from leapjax.sudoku.domain import BoardTokens, Settings, make
-from leapjax.sudoku.rules import rules
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long

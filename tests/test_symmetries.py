@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from minigrid.envs.babyai.core.verifier import AfterInstr, BeforeInstr
 
-from leapjax.babyai import demonstrations, levels, symmetries, vocabulary
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import Renaming
+from leapjax.domains.babyai import demonstrations, levels, symmetries, vocabulary
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.symmetries import Renaming
 from tests.dynamics import FRONT, stepped
 from tests.oracles import assert_same_observation
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from leapjax.babyai.augmentation import way
-from leapjax.babyai.observations import Observation
 from leapjax.data import windows
 from leapjax.data.windows import Steps
+from leapjax.domains.babyai.augmentation import way
+from leapjax.domains.babyai.observations import Observation
 from leapjax.types import Context, Demonstration, Window
 from tests.oracles import assert_same_observation
 

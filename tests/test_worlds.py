@@ -9,17 +9,17 @@ import pytest
 from minigrid.core.constants import DIR_TO_VEC
 
 from experiments.properties import AGAIN, CASES, DETOUR_TURNS, FEW_TURNS, WatchedErrand
-from leapjax.babyai import demonstrations, observations
-from leapjax.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import (
+from leapjax.domains.babyai import demonstrations, observations
+from leapjax.domains.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
+from leapjax.domains.babyai.constraints import (
     half_of_obstacles,
     without_lava,
     without_marks,
     without_open_doors,
 )
-from leapjax.babyai.dynamics import FLOOR, LAVA
-from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
-from leapjax.babyai.symmetries import AGENT, EMPTY
+from leapjax.domains.babyai.dynamics import FLOOR, LAVA
+from leapjax.domains.babyai.levels import LEVELS, MODIFIED, find_level
+from leapjax.domains.babyai.symmetries import AGENT, EMPTY
 from leapjax.energy import from_total
 from leapjax.rollouts import History
 

@@ -27,6 +27,7 @@ from experiments.common.results import Row
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.checkpoints import differences
+from leapjax.configuration import AnyConfig, configuration_hash
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -38,7 +39,6 @@ from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, Sho
 from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
-from leapjax.running.config import AnyConfig, configuration_hash
 from leapjax.types import Energy
 
 Change = Callable[[AnyConfig], AnyConfig]

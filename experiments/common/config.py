@@ -13,6 +13,7 @@ import tyro
 from experiments.common import loggers, memory, program
 from leapjax import checkpoints, pretrained
 from leapjax.checks import check_integer, check_number
+from leapjax.configuration import AnyConfig, Config, change
 from leapjax.data import seeds, storage
 from leapjax.data.storage import Described
 from leapjax.domain import Domain
@@ -24,7 +25,6 @@ from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.rollouts import MOST_OPEN
-from leapjax.running.config import AnyConfig, Config, change
 
 # Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
 # faster, and the last episodes of an evaluation would rather have smaller ones.

@@ -16,11 +16,11 @@ from experiments.common.config import episode_seeds, make_domain, parse, specify
 from experiments.common.interruption import Interruption
 from experiments.common.run import Run
 from leapjax import files, processes, scores
+from leapjax.configuration import AnyConfig, configuration_hash, resolved
 from leapjax.data import seeds
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
-from leapjax.running.config import AnyConfig, configuration_hash, resolved
 
 
 class Experiment(NamedTuple):

@@ -30,6 +30,7 @@ from leapjax import files, pretrained, processes, rollouts, sharding, training
 from leapjax.agents import learning
 from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
+from leapjax.configuration import AnyConfig, resolved
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
 from leapjax.domain import Domain, Source, apply_statistics, blank_context
@@ -39,7 +40,6 @@ from leapjax.errors import UserError, first_line
 from leapjax.methods import find_method
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.rollouts import Episodes
-from leapjax.running.config import AnyConfig, resolved
 from leapjax.training import TrainStep
 from leapjax.types import Agent, Demonstration, Energy, Params, TrainState
 

@@ -16,7 +16,7 @@ import jax
 from experiments.common import startup
 from leapjax import files
 from leapjax.errors import UserError, first_line
-from leapjax.running.cluster import Cluster
+from leapjax.processes import Cluster
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000

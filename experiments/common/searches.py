@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from leapjax.configuration import AnyConfig, change
 from leapjax.planners import GibbsConfig
-from leapjax.running.config import AnyConfig, change
 
 
 class Search(NamedTuple):

@@ -11,9 +11,9 @@ from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
-from leapjax.atari.domain import LONGEST
-from leapjax.atari.encoders import STACK
-from leapjax.atari.games import GAMES, Game
+from leapjax.domains.atari.domain import LONGEST
+from leapjax.domains.atari.encoders import STACK
+from leapjax.domains.atari.games import GAMES, Game
 from leapjax.presets.atari import PAPER_TRANSITIONS
 
 COLUMNS = {

@@ -9,7 +9,7 @@ from experiments.common.results import Row
 from experiments.tables.cells import mean_length, mean_rate, rate, table, with_interval
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
-from leapjax.babyai.levels import LEVELS, paper_success
+from leapjax.domains.babyai.levels import LEVELS, paper_success
 
 OURS = Setting("preset `leapjax`", "leapjax")
 PAPER = Setting("preset `paper`", "paper")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.results import Row
+from leapjax.configuration import change, configuration_hash
 from leapjax.presets import find_preset
-from leapjax.running.config import change, configuration_hash
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Setting:
         title: of the column.
         preset: by name.
         method: by name.
-        changes: of the preset's configuration, see `leapjax.running.config.change`.
+        changes: of the preset's configuration, see `leapjax.configuration.change`.
     """
 
     title: str

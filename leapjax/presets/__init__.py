@@ -8,11 +8,11 @@ import functools
 import importlib
 from collections.abc import Callable, Mapping
 
+from leapjax.configuration import AnyConfig
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.presets import environments
-from leapjax.running.config import AnyConfig
 
 Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 

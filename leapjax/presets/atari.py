@@ -3,9 +3,10 @@
 from typing import Any
 
 from leapjax.agents import cql, dt
-from leapjax.atari.domain import LONGEST, Settings
-from leapjax.atari.encoders import STACK
-from leapjax.atari.games import find_game
+from leapjax.configuration import AnyConfig, Config
+from leapjax.domains.atari.domain import LONGEST, Settings
+from leapjax.domains.atari.encoders import STACK
+from leapjax.domains.atari.games import find_game
 from leapjax.planners import PlannerConfig
 from leapjax.presets.common import (
     demonstrations,
@@ -16,7 +17,6 @@ from leapjax.presets.common import (
     search,
     settings,
 )
-from leapjax.running.config import AnyConfig, Config
 
 TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
 EPISODES = 20  # games

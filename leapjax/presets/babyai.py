@@ -2,8 +2,9 @@
 
 from typing import Any
 
-from leapjax.babyai.levels import Level, find_level
-from leapjax.babyai.settings import Settings
+from leapjax.configuration import AnyConfig, Config
+from leapjax.domains.babyai.levels import Level, find_level
+from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import BeamConfig, PlannerConfig
 from leapjax.presets.common import (
     SEQUENCE,
@@ -15,7 +16,6 @@ from leapjax.presets.common import (
     search,
     settings,
 )
-from leapjax.running.config import AnyConfig, Config
 
 DEMONSTRATIONS = 500  # of a level: section 5
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place

@@ -1,5 +1,6 @@
 """Presets of any environment, such as Gymnasium's: plan five actions, execute one."""
 
+from leapjax.configuration import AnyConfig, Config
 from leapjax.domains import find_domain
 from leapjax.presets.common import (
     demonstrations,
@@ -10,7 +11,6 @@ from leapjax.presets.common import (
     search,
     settings,
 )
-from leapjax.running.config import AnyConfig, Config
 
 DEMONSTRATIONS = 500  # as in BabyAI
 EPISODES = 100

@@ -3,6 +3,9 @@
 from typing import Any
 
 from leapjax.agents.learning import TrainingConfig
+from leapjax.configuration import AnyConfig, Config
+from leapjax.domains.puzzles.stars import graphs
+from leapjax.domains.puzzles.stars.domain import LARGE, Settings
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets.common import (
     demonstrations,
@@ -13,9 +16,6 @@ from leapjax.presets.common import (
     search,
     settings,
 )
-from leapjax.running.config import AnyConfig, Config
-from leapjax.stars import graphs
-from leapjax.stars.domain import LARGE, Settings
 
 DEMONSTRATIONS = 100  # augmentation makes any graph of any other
 EPISODES = 500

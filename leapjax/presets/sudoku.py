@@ -3,6 +3,9 @@
 from typing import Any
 
 from leapjax.agents.learning import TrainingConfig
+from leapjax.configuration import AnyConfig, Config
+from leapjax.domains.puzzles.sudoku import boards
+from leapjax.domains.puzzles.sudoku.domain import Settings
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets.common import (
     demonstrations,
@@ -13,9 +16,6 @@ from leapjax.presets.common import (
     search,
     settings,
 )
-from leapjax.running.config import AnyConfig, Config
-from leapjax.sudoku import boards
-from leapjax.sudoku.domain import Settings
 
 EPISODES = 500
 

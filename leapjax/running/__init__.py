@@ -1,1 +1,0 @@
-"""A run of a user's own: its configuration, training, evaluation and record."""
