@@ -6,6 +6,7 @@ energy; `compile_planner` makes it plan for any number of contexts at once.
 
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.domain import Domain
+from leapjax.domains import make_domain
 from leapjax.energy import (
     autoregressive,
     classifier,
@@ -18,6 +19,7 @@ from leapjax.energy import (
     view,
 )
 from leapjax.errors import UserError
+from leapjax.fitting import fit
 from leapjax.planners import (
     BeamConfig,
     CrossEntropyConfig,
@@ -31,7 +33,7 @@ from leapjax.planners import (
 from leapjax.pretrained import Pretrained, load
 from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import interval_over_seeds, wilson_interval
+from leapjax.scores import aggregate, interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
 
 __all__ = [
@@ -51,6 +53,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "aggregate",
     "autoregressive",
     "beam_search",
     "classifier",
@@ -60,10 +63,12 @@ __all__ = [
     "constrain",
     "cross_entropy_method",
     "evaluate",
+    "fit",
     "from_total",
     "gibbs",
     "interval_over_seeds",
     "load",
+    "make_domain",
     "neutral",
     "plan_keys",
     "pseudo_likelihood",

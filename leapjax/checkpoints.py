@@ -338,6 +338,22 @@ def restore_params(
     raise (UserError if step is None else Unfinished)("; ".join(reasons))
 
 
+def save_params(folder: Path, params: PyTree, identity: str, step: int) -> None:
+    """Writes parameters alone, as `restore_params` reads them.
+
+    Args:
+        folder: of checkpoints; others in it are removed.
+        params: to write.
+        identity: of their configuration.
+        step: that they are of.
+
+    Raises:
+        UserError: they cannot be written.
+    """
+    with contextlib.closing(Checkpoints(folder, identity, keep=1)) as saved:
+        saved.save(TrainState(params, (), jnp.int32(step)))
+
+
 def _steps(folder: Path) -> list[int]:
     """The steps of the checkpoints in a folder, the newest first; at least one."""
     steps = newest(folder)

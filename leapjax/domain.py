@@ -146,6 +146,7 @@ class Domain(NamedTuple):
     signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
     return_scale: float = 1.0  # what returns are divided by before a network sees them
     paper_success: Mapping[str, float] = {}  # the paper's results by method, in percent
+    made_from: tuple[str, Any] | None = None
 
     @property
     def num_actions(self) -> int:

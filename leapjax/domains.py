@@ -1,10 +1,13 @@
 """The table of domains: what `leapjax.load` and the experiments find by name."""
 
+import dataclasses
 import sys
+from typing import Any
 
 from leapjax.atari.domain import ATARI
 from leapjax.babyai.domain import BABYAI
-from leapjax.domain import DomainType
+from leapjax.domain import Domain, DomainType
+from leapjax.checks import check_kind
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM
 from leapjax.stars.domain import STARS
@@ -25,6 +28,28 @@ def find_domain(name: str) -> DomainType:
     if name not in DOMAINS:
         raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
     return DOMAINS[name]
+
+
+def make_domain(name: str, level: str, settings: Any = None) -> Domain:
+    """Makes one level of a domain, as `leapjax.fit` and `leapjax.evaluate` need it.
+
+    Args:
+        name: of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
+        level: by name, such as "GoToLocalS7N5"; of Gymnasium, the id of an environment.
+        settings: options of encoder and augmentation, as in the module of the domain; None for
+            those that preset `leapjax` has for LEAP on this level.
+
+    Raises:
+        UserError: an unknown domain or level, settings of another domain, or an environment that
+            cannot be made.
+    """
+    kind = find_domain(name)
+    if settings is None:
+        options = {**kind.preset(level, "leapjax"), **kind.tuned(level, "leap", "leapjax")}
+        names = {field.name for field in dataclasses.fields(kind.settings)}
+        settings = kind.settings(**{k: v for k, v in options.items() if k in names})
+    check_kind(settings, kind.settings)
+    return kind.make(level, settings)._replace(made_from=(name, settings))
 
 
 def check_imported(level: str, named_by: str) -> None:

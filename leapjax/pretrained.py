@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
-from leapjax import checkpoints, weights
+from leapjax import checkpoints, domains, rollouts, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
-from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
-from leapjax.checks import check_at_least, check_types
-from leapjax.domain import Domain, Statistics, apply_statistics
+from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
+from leapjax.checks import check_at_least, check_seed, check_types
+from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
 from leapjax.domains import check_imported, find_domain
+from leapjax.environments import Adapter
 from leapjax.errors import UserError, first_line
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
@@ -67,18 +69,108 @@ class Specification:
         check_at_least(self, 0, "context")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Pretrained:
-    """A ready planner: `pretrained(keys, contexts)` plans for any number of contexts."""
+    """A ready planner: `pretrained(keys, contexts)` plans for any number of contexts.
+
+    Attributes:
+        specification: all that it is rebuilt from, but the parameters.
+        energy: what it minimises.
+        params: of the energy.
+        plan: the compiled planner: `(params, keys, contexts) -> Plan`.
+        domain: the level that it plays; `domain.make_adapter()` is an environment of it.
+    """
 
     specification: Specification
     energy: Energy
     params: Params
     plan: CompiledPlanner
+    domain: Domain
 
     def __call__(self, keys: Array, contexts: Context) -> Plan:
         """Plans for B contexts (see `leapjax.rollouts.stack_contexts`)."""
         return self.plan(self.params, keys, contexts)
+
+    def plan_for(self, adapter: Adapter, seed: int = 0) -> Plan:
+        """Resets an environment and makes one plan for its first state.
+
+        The plan is the first one of `leapjax.evaluate` for the same level seed.
+
+        Args:
+            adapter: an environment, such as `domain.make_adapter()` gives.
+            seed: level seed, in 0 .. 2^32 - 1.
+
+        Returns:
+            A `Plan` of NumPy arrays, without a leading `[B]`: `actions` is `[T]`.
+
+        Raises:
+            UserError: no adapter, other actions than the planner's, or another observation.
+        """
+        seed = check_seed(seed)
+        rollouts.check_adapter(adapter)
+        rollouts.check_actions("planner", self.plan.num_actions, adapter.num_actions)
+        history = rollouts.History(
+            adapter.reset(seed), self.specification.context, adapter.num_actions, seed
+        )
+        keys = plan_keys(0, np.array([seed]), np.array([0]))
+        plans = self(keys, rollouts.stack_contexts([history]))
+        return jax.tree.map(lambda leaf: leaf[0], plans)
+
+    def compile(self, batch: int = 1, executed: int | None = None) -> None:
+        """Compiles what batches of at most `batch` plans need, so that later calls start at once.
+
+        Args:
+            batch: B, the largest number of contexts in a call.
+            executed: actions of each plan in `leapjax.evaluate`; None for all. If it is 1, plans
+                after the first also use what is encoded already.
+
+        Raises:
+            UserError: a number that is not a positive integer.
+        """
+        context = blank_context(self.domain, self.specification.context)
+        executed, _ = rollouts.check_limits(executed, None)
+        self.plan.compile(self.params, context, batch)
+        one = self(plan_keys(0, np.zeros(1), np.zeros(1)), jax.tree.map(lambda x: x[None], context))
+        encoded = rollouts.kept(one, executed)
+        if encoded is not None:  # as it is after the first plan
+            self.plan.compile(self.params, context._replace(encoded=encoded[0]), batch)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Writes a folder that `leapjax.load` reads: a specification, and the parameters.
+
+        Args:
+            folder: to make.
+
+        Raises:
+            UserError: it is there already, or cannot be written; or the domain is not one of `leapjax.domains`, so that
+                nothing on disk says how to make its network.
+        """
+        if self.domain.made_from is None:
+            raise UserError(
+                f"a planner of {self.domain.level} cannot be saved: its domain is not made by "
+                "leap.make_domain; keep planner.params, and fit with the same domain and steps=0"
+            )
+        folder, specification = check_path(folder), self.specification
+        if folder.exists():
+            raise UserError(f"{folder} is there already: name a new folder")
+        checkpoints.save_params(
+            folder / CHECKPOINTS, self.params, identity(specification), specification.training.steps
+        )
+        save_specification(folder, specification)
+
+    def __repr__(self) -> str:
+        known = self.specification
+        model, origin, leaves = known.model, known.origin, jax.tree.leaves(self.params)
+        data = f"{origin.demos} demonstrations" + f" of {origin.demonstrations}" * bool(
+            origin.demonstrations
+        )
+        return "\n".join([
+            f"Pretrained: {known.method} on {known.level}, trained on {data}, preset "
+            f"{origin.preset}, seed {origin.seed}",
+            f"  network: {model.architecture}, {model.layers} layers of width {model.width}, "
+            f"{sum(leaf.size for leaf in leaves):,} parameters",
+            f"  planner: {known.planner}",
+        ])  # fmt: skip
 
 
 def make_domain(specification: Specification, level: str | None = None) -> Domain:
@@ -91,8 +183,7 @@ def make_domain(specification: Specification, level: str | None = None) -> Domai
     if level is None:
         level = specification.level
         check_imported(level, f"the specification of a {specification.method} planner")
-    kind = find_domain(specification.domain)
-    domain = kind.make(level, specification.domain_settings)
+    domain = domains.make_domain(specification.domain, level, specification.domain_settings)
     return apply_statistics(domain, specification.statistics)
 
 
@@ -269,6 +360,9 @@ def load(
 ) -> Pretrained:
     """A trained planner from the folder of its run, or one that comes with the library.
 
+    Compiled programs are kept on disk, as `leapjax.compile_planner` says, so that the first plan
+    of a second process takes little more than its imports.
+
     Args:
         path: the folder that a run printed; or the name of a level, where there is no such
             folder: the published planner, trained on it with seed 0 (README, "Results").
@@ -328,4 +422,4 @@ def load(
         specification, planner=planner or specification.planner, level=level or specification.level
     )
     plan = compile_planner(agent.energy, specification.planner, chunk_sizes)
-    return Pretrained(specification, agent.energy, params, plan)
+    return Pretrained(specification, agent.energy, params, plan, domain)

@@ -380,7 +380,7 @@ def asked(
     # What weighs many plans of a context at once has a full batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
     plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
-    return Pretrained(specification, energy, params, plan)
+    return Pretrained(specification, energy, params, plan, domain)
 
 
 def play(
@@ -406,7 +406,7 @@ def play(
         nonlocal compile_seconds
         planner = asked(domain, way, models, config)
         begun = time.perf_counter()
-        run.warm_up(planner, domain, options.episodes, way.executed)
+        planner.compile(options.episodes, way.executed)
         compile_seconds += time.perf_counter() - begun
         adapters.clear()
         return rollouts.evaluate(

@@ -23,6 +23,7 @@ from leapjax.data.storage import Described
 from leapjax.domain import Domain
 from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
+from leapjax.fitting import names_of, preset_options
 from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -126,17 +127,7 @@ def preset(domain: str, level: str, method: str, name: str) -> AnyConfig:
         UserError: an unknown domain, level, method or preset.
     """
     config = dataclasses.replace(blank(domain, level, method), preset=name)
-    kind, presets = find_domain(domain), find_method(method).presets
-    if name not in presets:
-        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
-    options = {**kind.preset(level, name), **presets[name], **kind.tuned(level, method, name)}
-    # A level says how Gibbs sampling searches; other planners know less.
-    others = _names(GibbsConfig()) - _names(config.planner)
-    return with_options(config, {k: v for k, v in options.items() if k not in others})
-
-
-def _names(settings: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(settings)}
+    return with_options(config, preset_options(domain, level, method, name))
 
 
 def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
@@ -144,7 +135,7 @@ def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
     changed: dict[str, Any] = {}
     for group in GROUPS:
         part = getattr(config, group)
-        names = _names(part)
+        names = names_of(type(part))
         mine = {name: value for name, value in options.items() if name in names}
         changed[group] = dataclasses.replace(part, **mine)
         options = {name: value for name, value in options.items() if name not in names}

@@ -26,7 +26,7 @@ from experiments.common.schema import (
     loads,
     problem,
 )
-from leapjax import scores
+from leapjax import compilation, scores
 from leapjax.checkpoints import read_json
 from leapjax.checks import LARGEST_SEED
 from leapjax.errors import UserError, first_line
@@ -185,7 +185,7 @@ def versions() -> dict[str, str]:
     with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
         found["ale-py"] = metadata.version("ale-py")
     found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
-    machine = f"{runtime.processor()}, cores: {runtime.cores()}"
+    machine = f"{compilation.name_processor()}, cores: {runtime.cores()}"
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         machine += f", {len(devices)} {devices[0].device_kind}"
