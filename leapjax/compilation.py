@@ -12,6 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from leapjax import files
 from leapjax.errors import UserError
 
+CPU = Path("/proc/cpuinfo")  # on Linux
 SHORTEST = 0.5  # seconds: what compiles sooner is not kept
 SHORTEST_OF_JAX = 1.0  # JAX's own default
 
@@ -55,7 +56,7 @@ def name_processor() -> str:
     """Returns a name for this kind of processor, fit for a folder."""
     model = platform.processor() or platform.machine()
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        lines = CPU.read_text(encoding="utf-8").splitlines()
     except OSError:
         lines = []
     fields = dict(line.split(":", 1) for line in lines if ":" in line)

@@ -6,8 +6,8 @@ from typing import Any
 
 from leapjax.atari.domain import ATARI
 from leapjax.babyai.domain import BABYAI
-from leapjax.domain import Domain, DomainType
 from leapjax.checks import check_kind
+from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
 from leapjax.gymnasium.domain import GYMNASIUM
 from leapjax.stars.domain import STARS

@@ -110,8 +110,12 @@ def fit(
     check_kind(domain, Domain)
     chosen, seed = find_method(method), check_seed(seed)
     name, domain_settings = domain.made_from or (None, None)
-    asked = {"steps": steps, "horizon": horizon, "context": context}
-    asked = {key: check_integer(key, each) for key, each in asked.items() if each is not None}
+    kinds = (ModelConfig, TrainingConfig, chosen.planner, chosen.settings)
+    for given, kind in zip((model, training, planner, settings), kinds, strict=True):
+        if given is not None:
+            check_kind(given, kind)
+    given_numbers = {"steps": steps, "horizon": horizon, "context": context}
+    asked = {k: check_integer(k, n) for k, n in given_numbers.items() if n is not None}
     options = preset_options(name, domain.level, method, PRESET) | asked
     try:
         model = model or _choose(ModelConfig, options)
@@ -123,12 +127,6 @@ def fit(
         mesh = sharding.make_mesh(training.batch // training.run, jax.local_devices())
     except ValueError as error:  # the dataclasses refuse values that cannot be
         raise UserError(str(error)) from None
-    for given, kind in zip(
-        (model, training, planner, settings),
-        (ModelConfig, TrainingConfig, chosen.planner, chosen.settings),
-        strict=True,
-    ):
-        check_kind(given, kind)
     data = _read(demonstrations, domain, seed)
     if not data and training.steps:
         raise UserError("no demonstrations: expected at least one to learn from")
@@ -136,13 +134,13 @@ def fit(
         d.rewards.any() for d in data
     ):
         raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
+    name_of_data = demonstrations if isinstance(demonstrations, str) else None
     statistics = domain.measure(data) if data else ()
     domain = apply_statistics(domain, statistics)
     specification = Specification(
         name or "", domain.level, method, options.get("context", 0), model, training, planner,
         settings, domain_settings, dict(domain.signature),
-        Origin(PRESET, seed, len(data), demonstrations if isinstance(demonstrations, str) else None),
-        statistics,
+        Origin(PRESET, seed, len(data), name_of_data), statistics,
     )  # fmt: skip
     compilation.use_disk_cache()
     agent = pretrained.make_agent(specification, domain, mesh)

@@ -36,7 +36,15 @@ GROUPS = ("model", "training", "planner", "method_settings", "domain_settings") 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What a planner was trained on, and by which preset: nothing that rebuilding it needs."""
+    """What a planner was trained on, and by which preset: nothing that rebuilding it needs.
+
+    Attributes:
+        preset: by name.
+        seed: of training.
+        demos: how many demonstrations.
+        demonstrations: the data set that they are of; None: the domain made them, or they were in
+            memory.
+    """
 
     preset: str
     seed: int
@@ -49,20 +57,35 @@ class Origin:
 
 @dataclasses.dataclass(frozen=True)
 class Specification:
-    """All that is needed to rebuild a planner around its parameters."""
+    """All that is needed to rebuild a planner around its parameters.
+
+    Attributes:
+        domain: its name in `leapjax.domains`.
+        level: that it was trained for.
+        method: its name in `leapjax.methods`.
+        context: K, past steps that the network sees.
+        model: the size of the network.
+        training: how it was trained.
+        planner: how it searches; its horizon is the network's too.
+        method_settings: options of the method alone.
+        domain_settings: options of encoder and augmentation.
+        signature: of the domain, when it was trained.
+        origin: what it was trained on.
+        statistics: of what it learned from, as far as its network needs them.
+    """
 
     domain: str
     level: str
     method: str
-    context: int  # K
+    context: int
     model: ModelConfig
     training: TrainingConfig
-    planner: PlannerConfig  # its horizon is the network's too
+    planner: PlannerConfig
     method_settings: Any
     domain_settings: Any
-    signature: dict  # of the domain, when it was trained
+    signature: dict
     origin: Origin
-    statistics: Statistics = ()  # of what it learned from, as far as its network needs them
+    statistics: Statistics = ()
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -142,8 +165,8 @@ class Pretrained:
             folder: to make.
 
         Raises:
-            UserError: it is there already, or cannot be written; or the domain is not one of `leapjax.domains`, so that
-                nothing on disk says how to make its network.
+            UserError: it is there already, or cannot be written; or `leapjax.make_domain` did not
+                make the domain, so that nothing on disk would say how to make its network.
         """
         if self.domain.made_from is None:
             raise UserError(
@@ -161,9 +184,8 @@ class Pretrained:
     def __repr__(self) -> str:
         known = self.specification
         model, origin, leaves = known.model, known.origin, jax.tree.leaves(self.params)
-        data = f"{origin.demos} demonstrations" + f" of {origin.demonstrations}" * bool(
-            origin.demonstrations
-        )
+        data = f"{origin.demos} demonstrations"
+        data += f" of {origin.demonstrations}" if origin.demonstrations else ""
         return "\n".join([
             f"Pretrained: {known.method} on {known.level}, trained on {data}, preset "
             f"{origin.preset}, seed {origin.seed}",

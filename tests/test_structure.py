@@ -15,6 +15,9 @@ import pytest
 import leapjax
 from experiments import report
 from experiments.common import results, runtime
+from leapjax import types
+from leapjax.agents.learning import TrainingConfig
+from leapjax.models.trajectory import ModelConfig
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -55,7 +58,11 @@ def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/energy.py", "types", "checks", "errors")
     may_import("leapjax/sharding.py", "types", "checks")
     may_import("leapjax/planners.py", "types", "checks")
-    may_import("leapjax/batching.py", "types", "checks", "errors", "planners", "sharding")
+    may_import("leapjax/compilation.py", "files", "errors")
+    may_import(
+        "leapjax/batching.py",
+        *("types", "checks", "errors", "compilation", "planners", "sharding"),
+    )
     may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
     may_import("leapjax/environments.py", "types", "checks", "errors")
@@ -80,7 +87,7 @@ def test_models_and_planners_meet_only_in_agents():
             n.startswith("leapjax.planners") for n in names
         )
         where = path.relative_to(ROOT / "leapjax").parts[0]
-        assert not both or where in ("agents", "pretrained.py"), path
+        assert not both or where in ("agents", "pretrained.py", "fitting.py"), path
 
 
 def test_only_babyai_knows_minigrid_and_only_atari_its_emulator():
@@ -133,6 +140,22 @@ def test_the_public_names_are_documented():
     for name in leapjax.__all__:
         said = inspect.getdoc(getattr(leapjax, name)) or ""
         assert len(said) > 20 and not said.startswith(f"{name}("), name
+
+
+def fields_of(kind):
+    """The names of the fields of a named tuple or a dataclass."""
+    return getattr(kind, "_fields", None) or getattr(kind, "__dataclass_fields__", {}).keys()
+
+
+def test_fields_are_documented_in_the_docstring_of_their_class():
+    public = [getattr(leapjax, name) for name in leapjax.__all__]
+    public = [each for each in public if isinstance(each, type)]
+    documented = [*public, types.Window, types.TransitionWindow, ModelConfig, TrainingConfig]
+    assert sum(map(len, map(fields_of, documented))) > 100
+    for kind in documented:
+        said = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
+        for field in fields_of(kind):
+            assert re.search(rf"^    {field}: \S", said, re.MULTILINE), f"{kind.__name__}.{field}"
 
 
 def test_the_readme_snippets_run():
