@@ -302,13 +302,19 @@ def published(name: str) -> Path:
     return PUBLISHED / name
 
 
-def publish(folder: Path, target: Path) -> None:
-    """Makes a published planner of a run: its parameters in half precision.
+def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
+    """Writes a trained planner as two small files, its parameters in half precision.
+
+    `load` reads the folder of both, `specification.json` and `weights.npz`, wherever it is.
+
+    Args:
+        folder: of a run, or of `Pretrained.save`.
+        target: the folder to write to.
 
     Raises:
         UserError: the run cannot be read, has not come to its end, or the target not be written.
     """
-    planner = load(folder, finished=True)
+    planner, target = load(folder, finished=True), check_path(target)
     weights.write(target / WEIGHTS, planner.params, identity(planner.specification))
     save_specification(target, planner.specification)
 

@@ -1,6 +1,7 @@
 """Training in one call."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 import leapjax as leap
 from experiments.common import config
-from leapjax import fitting
+from leapjax import fitting, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.models.trajectory import ModelConfig
 from tests import frozen_lake
@@ -42,6 +43,12 @@ def test_what_is_fitted_is_what_is_saved(star, tmp_path):
     assert again.specification == planner.specification and again.domain.level == "Star2x3"
     plans = [each.plan_for(each.domain.make_adapter(), seed=5) for each in (planner, again)]
     np.testing.assert_array_equal(*(plan.trace for plan in plans))
+    pretrained.publish(str(tmp_path / "mine"), str(tmp_path / "small"))
+    files = {path.name for path in (tmp_path / "small").iterdir()}
+    assert files == {"specification.json", "weights.npz"}
+    small = leap.load(tmp_path / "small")
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-6)
+    jax.tree.map(close, small.params, planner.params)
     with pytest.raises(leap.UserError, match="is there already"):
         planner.save(tmp_path / "mine")
 
