@@ -7,18 +7,21 @@ of each, in a folder of its own, and a line in `leapjax.domains`.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import flax.linen as nn
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
-from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
+
+if TYPE_CHECKING:
+    import flax.linen as nn
+    import gymnasium as gym
+
+    from leapjax.models.trajectory import ModelConfig
 
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # what a network must know of its training data, kept with its checkpoint: by array of an
@@ -73,7 +76,7 @@ class Described(NamedTuple):
     arguments: Mapping[str, Any] | None = None
     wrappers: Sequence[Mapping[str, Any]] | None = None
     max_steps: int | None = None
-    spaces: Mapping[str, gym.Space] = {}
+    spaces: Mapping[str, "gym.Space"] = {}
 
 
 class Source(NamedTuple):
@@ -179,7 +182,7 @@ class Domain(NamedTuple):
     actions: tuple[str, ...]
     max_steps: int
     blank: PyTree
-    encoders: Mapping[str, Callable[[ModelConfig, int], nn.Module]]
+    encoders: Mapping[str, Callable[["ModelConfig", int], "nn.Module"]]
     augmentations: Sequence[Augmentation] = ()
     measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
     with_statistics: Callable[[Statistics], "Domain"] | None = None

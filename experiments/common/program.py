@@ -9,10 +9,11 @@ from typing import NoReturn
 
 import jax
 
-from experiments.common import runtime
+from experiments.common import runtime, startup
 from experiments.common.interruption import Interrupted, Interruption, interruptible
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
+from leapjax.extras import missing_explained
 from leapjax.training import NonFiniteLoss
 
 FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can be said in one line
@@ -67,7 +68,8 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         work: all that it does.
     """
     try:
-        work()
+        with missing_explained(startup.extra_of(module)):
+            work()
     except Interrupted as stopped:
         stop(module, arguments, stopped)
     except UserError as error:
