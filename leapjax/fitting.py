@@ -26,7 +26,7 @@ PRESET = "leapjax"
 S = TypeVar("S")
 
 
-def no_progress(step: int, means: dict[str, float]) -> None:
+def report_nothing(step: int, means: dict[str, float]) -> None:
     """Reports nothing."""
     del step, means
 
@@ -79,7 +79,7 @@ def fit(
     training: TrainingConfig | None = None,
     planner: PlannerConfig | None = None,
     settings: Any = None,
-    progress: Callable[[int, dict[str, float]], None] = no_progress,
+    progress: Callable[[int, dict[str, float]], None] = report_nothing,
 ) -> Pretrained:
     """Trains a planner on demonstrations; nothing is kept on disk (see `Pretrained.save`).
 

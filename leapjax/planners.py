@@ -164,8 +164,8 @@ def undefined(energies: jax.Array) -> jax.Array:
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
 
 
-def checked(energy: Energy) -> Energy:
-    """An energy whose functions must return real numbers of the right shapes.
+def guard_shapes(energy: Energy) -> Energy:
+    """Returns an energy that refuses results of wrong shapes, or that are not real numbers.
 
     Raises:
         UserError: it is no `Energy`.
@@ -213,7 +213,7 @@ def gibbs(
             f"fill {config.fill!r} chooses actions while others are MASK, and this energy scores "
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
-    energy = checked(energy)
+    energy = guard_shapes(energy)
     memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
@@ -403,7 +403,7 @@ def random_shooting(
     energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
 ) -> Plan:
     """The random plan of least energy (paper, appendix, ablation), of those that can be."""
-    energy = checked(energy)
+    energy = guard_shapes(energy)
     memory = energy.encode(params, context)
     choices = _choices(energy, params, memory, config.horizon)
     plans = _random_plans(key, choices, config.candidates)
@@ -426,7 +426,7 @@ def cross_entropy_method(
     The plan returned is the best of the last round, as in the paper; with `keep_elites`
     that is also the best ever seen.
     """
-    energy = checked(energy)
+    energy = guard_shapes(energy)
     memory = energy.encode(params, context)
     count, horizon = config.candidates, config.horizon
     choices = _choices(energy, params, memory, horizon)
@@ -499,7 +499,7 @@ def beam_search(
             "beam search begins plans that it ends later, and this energy scores complete plans "
             "only (accepts_mask is False): use another planner"
         )
-    energy = checked(energy)
+    energy = guard_shapes(energy)
     memory = energy.encode(params, context)
     actions = energy.num_actions
 
