@@ -1,8 +1,10 @@
 """Trained planners on disk: what `leapjax.load` reads and every run writes."""
 
 import dataclasses
+import importlib
 import json
 import os
+import types
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +14,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from leapjax import checkpoints, domains, rollouts, weights
+from leapjax import configurations, domains, rollouts, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
@@ -20,6 +22,7 @@ from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
 from leapjax.domains import check_imported, find_domain
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, first_line
+from leapjax.extras import missing_explained
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -173,6 +176,7 @@ class Pretrained:
                 f"a planner of {self.domain.level} cannot be saved: its domain is not made by "
                 "leap.make_domain; keep planner.params, and fit with the same domain and steps=0"
             )
+        checkpoints = _import_checkpoints()
         folder, specification = check_path(folder), self.specification
         if folder.exists():
             raise UserError(f"{folder} is there already: name a new folder")
@@ -227,7 +231,7 @@ def identity(specification: Specification) -> str:
     defaults = {name: type(getattr(specification, name))() for name in GROUPS}
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
-    changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
+    changed = {name: configurations.differences(values[name], plain[name]) for name in GROUPS}
     changed["training"] = without_unnamed(changed["training"])
     if not specification.statistics:  # as before there were any
         del values["statistics"]
@@ -262,7 +266,17 @@ def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
     whose = identity(specification)
     if (folder / WEIGHTS).exists():
         return specification, weights.check_identity(folder / WEIGHTS, whose)
-    return specification, checkpoints.check_identity(folder / CHECKPOINTS, whose)
+    return specification, _import_checkpoints().check_identity(folder / CHECKPOINTS, whose)
+
+
+def _import_checkpoints() -> types.ModuleType:
+    """Imports Orbax, which takes a while, and which published planners do not need.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    with missing_explained():
+        return importlib.import_module("leapjax.checkpoints")
 
 
 def parse_specification(folder: Path) -> Specification:
@@ -276,12 +290,12 @@ def parse_specification(folder: Path) -> Specification:
         raise UserError(
             f"{folder} is not a checkpoint: expected the folder of a run, with {SPECIFICATION}"
         )
-    values = checkpoints.read_json(path, LARGEST_SPECIFICATION)
+    values = configurations.read_json(path, LARGEST_SPECIFICATION)
     try:
         if not isinstance(values, dict):
             raise UserError(f"a Specification must be a JSON object, got {type(values).__name__}")
         method = find_method(str(values.get("method")))
-        return checkpoints.from_json(
+        return configurations.from_json(
             Specification, values,
             method_settings=method.settings, planner=method.planner,
             domain_settings=find_domain(str(values.get("domain"))).settings,
@@ -438,6 +452,7 @@ def load(
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
+        checkpoints = _import_checkpoints()
         params = checkpoints.restore_params(
             folder / CHECKPOINTS, like, whose, specification.training.steps if finished else None
         )

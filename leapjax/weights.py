@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax import files
-from leapjax.checkpoints import IDENTITY, identity_digest
+from leapjax.configurations import IDENTITY, identity_digest
 from leapjax.errors import UserError, first_line
 from leapjax.types import Params
 

@@ -26,7 +26,7 @@ from experiments.common.interruption import Interruption
 from experiments.common.results import Row
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.checkpoints import differences
+from leapjax.configurations import differences
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain

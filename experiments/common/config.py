@@ -14,7 +14,7 @@ import tyro
 
 from experiments.common import loggers, memory, program
 from experiments.common.runtime import Cluster
-from leapjax import checkpoints, pretrained
+from leapjax import checkpoints, configurations, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.checks import check_integer, check_number
 from leapjax.data import seeds, storage
@@ -423,7 +423,7 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
     defaults = resolved(blank(**names), seed=-1)
     values = resolved(config, seed)
     values["training"] = pretrained.without_unnamed(values["training"])
-    settings = checkpoints.differences(values, defaults)
+    settings = configurations.differences(values, defaults)
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

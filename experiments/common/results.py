@@ -27,8 +27,8 @@ from experiments.common.schema import (
     problem,
 )
 from leapjax import compilation, scores
-from leapjax.checkpoints import read_json
 from leapjax.checks import LARGEST_SEED
+from leapjax.configurations import read_json
 from leapjax.errors import UserError, first_line
 from leapjax.files import only_process_in, read_text, write_text
 from leapjax.rollouts import Episodes

@@ -29,7 +29,8 @@ from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
 from leapjax.agents import learning
 from leapjax.batching import CompiledPlanner, compile_planner
-from leapjax.checkpoints import Checkpoints, read_json
+from leapjax.checkpoints import Checkpoints
+from leapjax.configurations import read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
 from leapjax.domain import Domain, Source, apply_statistics
