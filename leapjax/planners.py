@@ -40,17 +40,29 @@ class GibbsConfig:
     positions every later iteration resamples: "random" ones, the next from left to right
     ("sequential"), or those that were least certain when they were chosen ("uncertain", each
     once before any is again).
+
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, passes of the model, those that fill the plan included.
+        resampled: P, positions chosen together in a pass, except where all are.
+        fill: How the first plan is made: "together", "confident", "margin", "sequential" or
+            "random".
+        order: Which positions later passes resample: "random", "sequential" or "uncertain".
+        temperature: Temperature at which actions are drawn; 0 takes the most likely action.
+        restarts: R, independent plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, for T more passes.
+        score_trace: Also return the energy after every iteration, for N * T more passes.
     """
 
-    horizon: int = 5  # T, planned actions
-    iterations: int = 10  # N, passes of the model, those that fill the plan included
-    resampled: int = 1  # P, positions chosen together in a pass, but where all are
-    fill: str = "together"  # or "confident", "margin", "sequential", "random"
-    order: str = "random"  # or "sequential", "uncertain"
-    temperature: float = 0.0  # 0 takes the most likely action
-    restarts: int = 1  # R independent plans, of which the one of least energy is kept
-    score: bool = False  # also return the energy of the plan (T more passes)
-    score_trace: bool = False  # also return the energy after every iteration (N * T passes)
+    horizon: int = 5
+    iterations: int = 10
+    resampled: int = 1
+    fill: str = "together"
+    order: str = "random"
+    temperature: float = 0.0
+    restarts: int = 1
+    score: bool = False
+    score_trace: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -78,11 +90,17 @@ class GibbsConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ShootingConfig:
-    """Random shooting (paper, appendix, ablation): the best of random plans."""
+    """Random shooting (paper, appendix, ablation): the best of random plans.
 
-    horizon: int = 5  # T
-    candidates: int = 30  # uniform action sequences
-    score: bool = False  # also return the energy of the plan (known anyway)
+    Attributes:
+        horizon: T, planned actions.
+        candidates: Uniformly drawn plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, which is known anyway.
+    """
+
+    horizon: int = 5
+    candidates: int = 30
+    score: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -91,13 +109,23 @@ class ShootingConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropyConfig:
-    """The cross-entropy method as the paper's appendix describes it."""
+    """The cross-entropy method as the paper's appendix describes it.
 
-    horizon: int = 5  # T
-    iterations: int = 10  # N, rounds; the first draws uniform sequences
-    candidates: int = 30  # sequences per round
-    elites: int = 3  # kept as parents of the next round, each child with one token changed
-    keep_elites: bool = True  # elites survive unchanged, so the best energy never rises
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, rounds; the first draws uniform plans.
+        candidates: Plans in each round.
+        elites: Plans of least energy that are the parents of the next round, each child with one
+            action changed.
+        keep_elites: Elites survive unchanged, so that the least energy never rises.
+        score: Also return the energy of the plan.
+    """
+
+    horizon: int = 5
+    iterations: int = 10
+    candidates: int = 30
+    elites: int = 3
+    keep_elites: bool = True
     score: bool = False
 
     def __post_init__(self) -> None:
@@ -109,12 +137,19 @@ class CrossEntropyConfig:
 
 @dataclasses.dataclass(frozen=True)
 class BeamConfig:
-    """Beam search, from left to right: the best of the plans that began well."""
+    """Beam search, from left to right: the best of the plans that began well.
 
-    horizon: int = 5  # T
-    beams: int = 10  # W, partial plans that are kept
-    temperature: float = 0.0  # 0 keeps the best; above it beams are drawn, all different
-    score: bool = False  # also return the energy of the plan
+    Attributes:
+        horizon: T, planned actions.
+        beams: W, partial plans that are kept.
+        temperature: 0 keeps the best beams; above it beams are drawn, all different.
+        score: Also return the energy of the plan.
+    """
+
+    horizon: int = 5
+    beams: int = 10
+    temperature: float = 0.0
+    score: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
