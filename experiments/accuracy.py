@@ -48,7 +48,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.accuracy", given)
     return program.guarded("experiments.accuracy", given, lambda: report(options))
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from scipy import stats
 
@@ -47,7 +46,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Says how energy and reward are correlated; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.atari_energy", given)
     return program.guarded("experiments.atari_energy", given, lambda: report(options))
 
 

@@ -94,7 +94,7 @@ class Recorder(BabyAIAdapter):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plays, counts, draws; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.failures", given)
     return program.guarded("experiments.failures", given, lambda: report(options))
 
 

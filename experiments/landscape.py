@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -63,7 +62,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains with each preset and says what was found; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.landscape", given)
     return program.stoppable(
         "experiments.landscape", given, lambda interruption: report(options, interruption)
     )

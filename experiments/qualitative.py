@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import tyro
 from PIL import Image
 from rich.console import Console
 
@@ -80,7 +79,7 @@ class Drawn(NamedTuple):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draws both figures; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.qualitative", given)
     return program.stoppable(
         "experiments.qualitative", given, lambda interruption: draw(options, interruption)
     )

@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -134,9 +133,11 @@ class Options:
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given, description=f"The cases: {_names(analysis.cases)}.")
+    module = f"experiments.{analysis.name}"
+    about = f"{Options.__doc__}\n\nThe cases: {_names(analysis.cases)}."
+    options = program.parse(Options, module, given, description=about)
     return program.stoppable(
-        f"experiments.{analysis.name}",
+        module,
         given,
         lambda interruption: run_all(analysis, options, interruption),
     )
@@ -434,6 +435,7 @@ def play(
         "first_episode_seed": options.played[0],
         "validation": options.validation,
         "successes": int(found.successes.sum()),
+        "success": float(found.successes.mean()),
         "first_pass_successes": first_pass,
         "violations": sum(violations) if violations else None,
         "mean_length": float(found.lengths.mean()),
@@ -466,18 +468,28 @@ def rows_of_way(
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """The rows for a terminal; below, the mean over training seeds if there are several."""
     shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
+
+    def named(row: Row) -> tuple[str, ...]:
+        return row["case"], row["way"], f"{row['method']} ({row['preset']})"
+
+    def paper(row: Row) -> str:
+        found = row["paper_success"]
+        return "-" if found is None else f"{found:.1f}%"
+
     for row in rows:
-        paper, first = row["paper_success"], row["first_pass_successes"]
+        first = row["first_pass_successes"]
         shown.add_row(
-            row["case"],
-            row["way"],
-            f"{row['method']} ({row['preset']})",
+            *named(row),
             str(row["seed"]),
             "" if first is None else f"{first / row['episodes']:.1%}",
             results.percent(row),
             f"{1e3 / row['plans_per_second']:.2f}",
-            "-" if paper is None else f"{paper:.1f}%",
+            paper(row),
         )
+    shown.add_section()
+    for group in results.group_seeds(rows, named):
+        mean = results.percent_over_seeds(group)
+        shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", paper(group[0]))
     return shown
