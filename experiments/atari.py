@@ -53,23 +53,27 @@ EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, con
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Play games with built-in demonstrators; writes what DQN-Replay's files hold."""
+    """Play games with built-in demonstrators; writes what DQN-Replay's files hold.
+
+    Attributes:
+        game: Game: Breakout, Qbert, Pong or Seaquest.
+        transitions: Transitions to make at least, in whole games; None for as many as preset
+            leapjax learns from.
+        folder: Folder for the data; if games were begun there, they are continued.
+        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
+            own.
+        longest: Decisions after which a game is cut off, because a ball can fly on for ever.
+        workers: Processes; None for one on each core.
+        record: Write the scores of the demonstrators to results/, which is committed.
+    """
 
     game: str
-    """Breakout, Qbert, Pong or Seaquest."""
     transitions: int | None = None
-    """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
-    """Where to; a game that was begun there goes on."""
     replay_run: int = 1
-    """Number of the run, as DQN-Replay has five of each game: each has games of its own."""
     longest: int = LONGEST
-    """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
-    """Processes; None: one on each core."""
     record: bool = False
-    """Write what demonstrators have reached to results/, which is committed, beside data of
-    another size."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -31,16 +31,19 @@ RESULTS = Path("atari-energy.json")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Compare the energies of trajectories with their rewards."""
+    """Compare the energies of trajectories with their rewards.
+
+    Attributes:
+        checkpoint: Folders of runs of LEAP on Atari, one for each game.
+        windows: Random windows of each trajectory to compute the energy of.
+        record: Write the result to results/, which is committed.
+        runs: Folder for a result that is not recorded.
+    """
 
     checkpoint: tuple[Path, ...]
-    """Folders of runs of LEAP on Atari, one for each game."""
     windows: int = 64
-    """Random windows of each trajectory to take the energy of."""
     record: bool = False
-    """Write what was found to results/, which is committed."""
     runs: Path = Path("runs")
-    """Where what is not recorded goes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -53,16 +53,20 @@ ASKED = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw plans, and what comes of them."""
+    """Draw plans, and what comes of them.
+
+    Attributes:
+        seed: Training seed of models that are not trained yet.
+        test_seed: Level seed to search from for episodes to draw; the first that are long enough
+            are drawn.
+        record: Write the figures to docs/, which is committed.
+        runs: Folder for trained models, and for figures that are not recorded.
+    """
 
     seed: int = 0
-    """Training seed, of what must be trained."""
     test_seed: int = seeds.UNSEEN
-    """Level seed to look from for episodes to draw: the first that are long enough are taken."""
     record: bool = False
-    """Write the figures of docs/, which are committed."""
     runs: Path = Path("runs")
-    """Where what is trained, and figures that are not recorded, go."""
 
 
 class Drawn(NamedTuple):

@@ -45,9 +45,10 @@ class GibbsConfig:
         horizon: T, planned actions.
         iterations: N, passes of the model, those that fill the plan included.
         resampled: P, positions chosen together in a pass, except where all are.
-        fill: How the first plan is made: "together", "confident", "margin", "sequential" or
-            "random".
-        order: Which positions later passes resample: "random", "sequential" or "uncertain".
+        fill: How the first plan is made: all "together", the most certain first ("confident" or
+            by "margin"), left to right ("sequential"), or in "random" order.
+        order: Which positions later passes resample: "random" ones, the next ones ("sequential"),
+            or the least certain ones ("uncertain").
         temperature: Temperature at which actions are drawn; 0 takes the most likely action.
         restarts: R, independent plans, of which the one of least energy is kept.
         score: Also return the energy of the plan, for T more passes.

@@ -97,7 +97,8 @@ def helps(main, arguments, capsys, monkeypatch):
             option, _, said = line.partition("  ")
             found[option] = said.strip()
         elif found and re.search(r"\w", line):
-            found[option] = f"{found[option]} {line}".strip()
+            assert not found[option], f"{option} is broken before {line}"
+            found[option] = line
     del found["-h, --help"]
     return {
         option: re.sub(r" ?\((default: .*|required)\)$", "", said) for option, said in found.items()

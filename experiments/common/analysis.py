@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -98,30 +99,33 @@ class Analysis(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Ask what was trained for plans on levels that it was not trained for."""
+    """Train models, plan with each in several ways, and print success beside the paper's.
+
+    Attributes:
+        only: Cases to do, by name; all of them if none is given.
+        methods: Methods to do; all that a case has if none is given.
+        ways: Ways to plan, by name; all that a case has if none is given.
+        preset: Preset that models are trained with: "leapjax" for ours, "paper" for the paper's.
+        seeds: Training seeds.
+        episodes: Held-out episodes to measure success on, for each row.
+        test_seed: Level seed of the first of these episodes.
+        validation: Measure success on validation levels instead, to choose settings.
+        record: Append rows to results/, which is committed, and skip what is recorded already.
+        force: With `--record`: do again what is recorded, and replace its rows.
+        runs: Folder for trained models and unrecorded rows.
+    """
 
     only: tuple[str, ...] = ()
-    """Cases by name; none: all of them."""
     methods: tuple[str, ...] = ()
-    """Methods; none: all that a case has."""
     ways: tuple[str, ...] = ()
-    """Ways to plan, by name; none: all that a case has."""
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's. Of what is trained."""
     seeds: tuple[int, ...] = (0,)
-    """Training seeds."""
     episodes: int = 200
-    """Held-out episodes to measure success on, for each row."""
     test_seed: int = UNSEEN
-    """Level seed of the first of them."""
     validation: bool = False
-    """Measure on validation levels instead: for choosing settings."""
     record: bool = False
-    """Append rows to results/, which is committed, and skip what is recorded already."""
     force: bool = False
-    """With --record: do again what is recorded, and replace its rows."""
     runs: Path = Path("runs")
-    """Where what is trained, and unrecorded rows, go."""
 
     @property
     def played(self) -> range:
@@ -134,7 +138,8 @@ def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
     given = program.arguments_of(arguments)
     module = f"experiments.{analysis.name}"
-    about = f"{Options.__doc__}\n\nThe cases: {_names(analysis.cases)}."
+    about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
+    about += f"\n\nThe cases: {_names(analysis.cases)}."
     options = program.parse(Options, module, given, description=about)
     return program.stoppable(
         module,

@@ -35,11 +35,10 @@ D = TypeVar("D")
 P = TypeVar("P")
 
 
+# A program that calls options otherwise has a subclass, which annotates their fields.
 @dataclasses.dataclass(frozen=True)
 class Config(Generic[M, D, P]):
     """Train a method on demonstrations of a level, then measure its success.
-
-    A program may call options otherwise: a subclass annotates their fields with other names.
 
     Attributes:
         level: Level by its name or id, or "all" for those of the paper.

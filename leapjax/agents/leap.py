@@ -39,8 +39,8 @@ class Settings:
     """The options of LEAP alone.
 
     Attributes:
-        masking: Which actions of a window are masked in training: "one", "each", "all", "random" or
-            "stratified" (see `leapjax.schedules.sample_masks`).
+        masking: Actions to mask in training: "one", "each", "all", "random" or "stratified". The
+            function `leapjax.schedules.sample_masks` explains them.
         end: A plan may end early. If not, what follows the end is padding that nothing predicts.
         repeat_state: Every position sees the whole state (eq. 4). If not, later ones see it without
             the agent's pose.

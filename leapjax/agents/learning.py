@@ -65,8 +65,8 @@ class TrainingConfig:
         betas: Decay rates of AdamW's two moments.
         weight_decay: Weight decay of all parameters but embeddings, norms and biases.
         clip: Largest global norm of the gradient; inf for no clipping.
-        windows: How training windows are drawn: by "episode" (each episode equally often), by
-            "step" (each step equally often), or at the "start" of episodes.
+        windows: How training windows are drawn: by "episode", each equally often, by "step", each
+            equally often, or at the "start" of episodes.
         microbatch: Windows whose loss a device computes at a time; 0 for all of its share.
         run: Consecutive windows in one training example, in which each state is encoded once; 1
             draws windows alone.

@@ -38,9 +38,9 @@ class Settings:
     """What an environment does not always say of itself.
 
     Attributes:
-        success_return: Return that an episode must reach to count as a success; None for the
-            `reward_threshold` of the environment, or, where it has none, for an episode that ends
-            of its own with a positive reward.
+        success_return: Return that an episode must reach to count as a success. None for the
+            environment's own `reward_threshold`; if it has none, an episode succeeds that ends of
+            its own with a positive reward.
         max_steps: Steps after which an episode is cut off; None for the limit that the environment
             has.
         arguments: Keyword arguments of `gymnasium.make`, as a JSON object.

@@ -38,8 +38,8 @@ class ModelConfig:
         dtype: Type of matrix products, "float32" or "bfloat16"; parameters are always float32.
         attention: Attention between the actions of a plan: "full", or "causal", where no action
             sees a later one.
-        neighbours: The token of an action also holds the actions beside it (LEAP with architecture
-            "leapjax").
+        neighbours: The token of an action also holds the actions beside it. Only LEAP with
+            architecture "leapjax" has this.
     """
 
     architecture: str = "leapjax"
