@@ -34,7 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         expected = f"expected one of {', '.join(PROGRAMS)}{did_you_mean(name, PROGRAMS)}"
         print(f"error: unknown program {name!r}: {expected}", file=sys.stderr)
         return 2
-    return importlib.import_module(f"experiments.{name}").main(rest)
+    module = f"experiments.{name}"
+    # An extra that is missing ends this import.
+    failed = program.guarded(module, rest, lambda: importlib.import_module(module))
+    return failed or importlib.import_module(module).main(rest)
 
 
 if __name__ == "__main__":

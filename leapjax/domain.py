@@ -7,18 +7,21 @@ of each, in a folder of its own, and a line in `leapjax.domains`.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import flax.linen as nn
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
-from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
+
+if TYPE_CHECKING:
+    import flax.linen as nn
+    import gymnasium as gym
+
+    from leapjax.models.trajectory import ModelConfig
 
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # what a network must know of its training data, kept with its checkpoint: by array of an
@@ -52,7 +55,7 @@ class Described(NamedTuple):
     wrappers: Sequence[Mapping[str, Any]] | None = None  # around it, the innermost first, each with
     # `name`, `entry_point` and `kwargs`; None: it does not say
     max_steps: int | None = None  # of an episode, by that environment
-    spaces: Mapping[str, gym.Space] = {}  # of each "observation" and "action", where it says more
+    spaces: Mapping[str, "gym.Space"] = {}  # of each "observation" and "action", where it says more
     # than shapes and types
 
 
@@ -119,7 +122,7 @@ class Domain(NamedTuple):
     actions: tuple[str, ...]  # names; the last is the end action
     max_steps: int  # of the longest episode
     blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
-    encoders: Mapping[str, Callable[[ModelConfig, int], nn.Module]]
+    encoders: Mapping[str, Callable[["ModelConfig", int], "nn.Module"]]
     # by architecture, (model, K) -> module; see leapjax.models.trajectory. One of `paper` may have
     # `of_all` as well, (B contexts) -> tokens [B, K + 1, D], where training is faster with it
     augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window

@@ -8,11 +8,11 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 
 from leapjax.checks import check_at_least, check_kind, check_number, check_types
+from leapjax.errors import UserError
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number
@@ -240,7 +240,12 @@ def _gibbs_chain(
 
     def energies_at(tokens: jax.Array, where: jax.Array) -> jax.Array:
         energies = energy.conditional(params, memory, tokens, where)
-        chex.assert_shape(energies, (where.shape[0], energy.num_actions))
+        expected = (where.shape[0], energy.num_actions)
+        if energies.shape != expected:
+            raise UserError(
+                f"conditional returned energies of shape {energies.shape}: expected {expected}, "
+                "positions and actions"
+            )
         return energies
 
     def draw(

@@ -18,7 +18,7 @@ from leapjax import checkpoints, domains, files, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
-from leapjax.domains import DOMAINS
+from leapjax.domains import DOMAINS, find_domain
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
@@ -181,7 +181,7 @@ def test_every_program_is_known_by_name(capsys):
 
 KINDS = [
     *dict.fromkeys(method.settings for method in METHODS.values()),
-    *(domain.settings for domain in DOMAINS.values()),
+    *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
 FIELDS = [

@@ -21,7 +21,7 @@ from tests.programs import LONG, ROOT
 )
 def test_an_example_runs(name, arguments, says, monkeypatch, capsys):
     if name == "pure_environment":
-        pytest.importorskip("jumanji")  # an extra
+        pytest.importorskip("jumanji")
     if name == "add_a_constraint" and not LONG:
         pytest.skip("make test-long runs it")
     monkeypatch.setattr(sys, "argv", [name, *arguments])

@@ -571,6 +571,12 @@ def test_a_child_differs_from_its_parent_in_one_token():
     assert fit_p_value(np.bincount(shifts, minlength=ACTIONS), [0, 0.5, 0.5]) > ACCEPTED
 
 
+def test_energies_of_another_shape_are_refused():
+    wrong = COUNTER._replace(conditional=lambda *_: jnp.zeros(5))
+    with pytest.raises(UserError, match=r"energies of shape \(5,\): expected \(1, 5\)"):
+        gibbs(wrong, (), jax.random.key(0), (), GibbsConfig(horizon=1, iterations=1))
+
+
 # What no plan can begin with: as the end action is in a model of plans.
 FORBIDDEN = NO_TILT.copy()
 FORBIDDEN[0, 2] = -np.inf

@@ -50,11 +50,12 @@ def test_the_library_never_imports_experiments():
 def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/types.py", "checks")
     may_import("leapjax/errors.py")
+    may_import("leapjax/extras.py", "errors")
     may_import("leapjax/checks.py", "errors")
     may_import("leapjax/schedules.py", "checks")
     may_import("leapjax/energy.py", "types", "checks", "errors")
     may_import("leapjax/sharding.py", "types", "checks")
-    may_import("leapjax/planners.py", "types", "checks")
+    may_import("leapjax/planners.py", "types", "checks", "errors")
     may_import("leapjax/batching.py", "types", "checks", "errors", "planners", "sharding")
     may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
@@ -125,6 +126,24 @@ def test_there_is_no_cycle_of_imports():
 def test_the_public_names_are_sorted_and_exist():
     assert leapjax.__all__ == sorted(leapjax.__all__)
     assert all(hasattr(leapjax, name) for name in leapjax.__all__)
+    assert set(leapjax.__all__) <= set(dir(leapjax))
+    assert not hasattr(leapjax, "no_such_name")
+
+
+def test_names_that_are_imported_later_hide_no_module():
+    modules = {path.stem for path in (ROOT / "leapjax").iterdir()}
+    assert set(leapjax._LATER) <= set(leapjax.__all__) - modules
+
+
+def test_only_one_module_needs_what_jax_may_change_with_every_release():
+    names = re.compile(r"\bjax(\.| import .*\b)(_src|extend|interpreters)\b")
+    paths = [
+        path
+        for folder in ("leapjax", "experiments", "benchmarks", "tests", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+        if names.search(path.read_text())
+    ]
+    assert paths == [ROOT / "leapjax/models/linear.py"]  # which says why
 
 
 def test_the_public_names_are_documented():

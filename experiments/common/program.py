@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeVar
 
 import jax
-import tyro
 
 from experiments.common import runtime, startup
 from experiments.common.interruption import Interrupted, Interruption, interruptible
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
+from leapjax.extras import missing_explained
 from leapjax.training import NonFiniteLoss
 
 T = TypeVar("T")
@@ -57,6 +57,8 @@ def parse(kind: type[T], module: str, arguments: Sequence[str], **options: Any) 
         arguments: of the command line.
         options: of `tyro.cli`.
     """
+    import tyro  # noqa: PLC0415  (`leapjax --help` needs no extra)
+
     return tyro.cli(kind, prog=startup.command(module), args=list(arguments), **options)
 
 
@@ -74,7 +76,8 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         work: all that it does.
     """
     try:
-        work()
+        with missing_explained(startup.extra_of(module)):
+            work()
     except Interrupted as stopped:
         stop(module, arguments, stopped)
     except UserError as error:

@@ -10,13 +10,21 @@ import signal
 import sys
 from importlib import metadata
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import NoReturn, TextIO
 
 from experiments.common.interruption import SIGNALS, Interrupted
 
 COMMAND = "leapjax"  # the installed script
 UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
+# The extra of the package that a program needs, where it is not `babyai`.
+EXTRAS = {
+    "atari": "atari",
+    "atari_energy": "atari",
+    "gymnasium": "train",
+    "stars": "train",
+    "sudoku": "train",
+}
 
 
 def is_program() -> bool:
@@ -46,6 +54,7 @@ def prepare() -> None:
         print(COMMAND, find_version())
         sys.exit(0)
     sys.unraisablehook = print_unraisable
+    sys.excepthook = print_uncaught
     # Figures go to files. Matplotlib refuses an unknown backend with a traceback.
     os.environ["MPLBACKEND"] = "agg"
     try:
@@ -146,6 +155,30 @@ def print_unraisable(failure: "sys.UnraisableHookArgs") -> None:
     """
     if failure.object is not None or str(failure.exc_value) != "Event loop is closed":
         sys.__unraisablehook__(failure)
+
+
+def print_uncaught(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """The hook for exceptions that end the program.
+
+    A missing extra is one line and exit code 2: a program imports optional modules before its
+    `main` can handle errors. All other errors are printed as Python does.
+    """
+    from leapjax.extras import explain_missing  # noqa: PLC0415  (imports JAX)
+
+    spec = sys.modules["__main__"].__spec__  # None for the installed script
+    explanation = explain_missing(error, extra_of(spec.name if spec else ""))
+    if explanation is None:
+        sys.__excepthook__(kind, error, trace)
+        return
+    print(f"error: {explanation}", file=sys.stderr)
+    sys.exit(2)
+
+
+def extra_of(module: str) -> str:
+    """The extra of the package that a program needs, by its module, such as `experiments.atari`."""
+    return EXTRAS.get(module.rpartition(".")[2], "babyai")
 
 
 def settings_of_jax() -> str:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from leapjax.data.seeds import MAX_TRAINING_SEED
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
+from leapjax.extras import missing_explained
 from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
@@ -68,8 +68,8 @@ def make(name: str, settings: Settings) -> Domain:
         UserError: there is none, or ale-py is not installed.
     """
     game = find_game(name)
-    if importlib.util.find_spec("ale_py") is None:
-        raise UserError("Atari needs ale-py, which is missing: pip install 'leapjax[atari]'")
+    with missing_explained("atari"):
+        import ale_py  # noqa: F401, PLC0415  (to say so now if it is missing)
 
     def make_adapter() -> Adapter:
         from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
