@@ -37,6 +37,7 @@ from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
 from leapjax.scores import aggregate, interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+from leapjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from leapjax.fitting import fit

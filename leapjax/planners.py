@@ -32,21 +32,26 @@ def check_temperature(temperature: float) -> None:
 class GibbsConfig:
     """Iterative planning through energy minimisation (paper, algorithm 1).
 
+    `fill` says how the first plan is made: "together", all positions in one pass, as in the
+    paper; or P positions in each pass, while the others stay MASK: those that are most certain
+    ("confident": by the probability of the likeliest action, "margin": by its lead over the
+    second), or from left to right ("sequential"), or in "random" order. `order` says which P
+    positions every later iteration resamples: "random" ones, the next from left to right
+    ("sequential"), or those that were least certain when they were chosen ("uncertain", each
+    once before any is again).
+
     Attributes:
         horizon: T, planned actions.
         iterations: N, passes of the model, those that fill the plan included.
-        resampled: P, positions chosen together in a pass, except where a pass fills all.
-        fill: how the first plan is made. "together": all positions in one pass, as in the paper.
-            Else P positions in each pass, while the others stay MASK: those that are most certain
-            ("confident": by the probability of the likeliest action, "margin": by its lead over
-            the second), from left to right ("sequential"), or in "random" order.
-        order: which P positions every later iteration resamples: "random" ones, the next from left
-            to right ("sequential"), or those that were least certain when they were chosen
-            ("uncertain", each once before any is again).
-        temperature: of the draw; 0 takes the most likely action.
-        restarts: R independent plans, of which the one of least energy is kept.
-        score: also return the energy of the plan (T more passes).
-        score_trace: also return the energy after every iteration (N * T passes).
+        resampled: P, positions chosen together in a pass, except where all are.
+        fill: How the first plan is made: all "together", the most certain first ("confident" or
+            by "margin"), left to right ("sequential"), or in "random" order.
+        order: Which positions later passes resample: "random" ones, the next ones ("sequential"),
+            or the least certain ones ("uncertain").
+        temperature: Temperature at which actions are drawn; 0 takes the most likely action.
+        restarts: R, independent plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, for T more passes.
+        score_trace: Also return the energy after every iteration, for N * T more passes.
     """
 
     horizon: int = 5
@@ -89,8 +94,8 @@ class ShootingConfig:
 
     Attributes:
         horizon: T, planned actions.
-        candidates: uniform action sequences.
-        score: also return the energy of the plan (known anyway).
+        candidates: Uniformly drawn plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, which is known anyway.
     """
 
     horizon: int = 5
@@ -108,11 +113,12 @@ class CrossEntropyConfig:
 
     Attributes:
         horizon: T, planned actions.
-        iterations: N, rounds; the first draws uniform sequences.
-        candidates: sequences per round.
-        elites: kept as parents of the next round; each child has one token changed.
-        keep_elites: elites survive unchanged, so that the best energy never rises.
-        score: also return the energy of the plan (known anyway).
+        iterations: N, rounds; the first draws uniform plans.
+        candidates: Plans in each round.
+        elites: Plans of least energy that are the parents of the next round, each child with one
+            action changed.
+        keep_elites: Elites survive unchanged, so that the least energy never rises.
+        score: Also return the energy of the plan.
     """
 
     horizon: int = 5
@@ -136,8 +142,8 @@ class BeamConfig:
     Attributes:
         horizon: T, planned actions.
         beams: W, partial plans that are kept.
-        temperature: 0 keeps the best; above it beams are drawn, all different.
-        score: also return the energy of the plan.
+        temperature: 0 keeps the best beams; above it beams are drawn, all different.
+        score: Also return the energy of the plan.
     """
 
     horizon: int = 5

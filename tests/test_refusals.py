@@ -726,22 +726,6 @@ def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
     assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
 
 
-@only_long
-def test_output_that_nobody_reads_any_more_is_one_line():
-    """As in `--help | head -1`."""
-    code = """
-from experiments.common import program
-raise SystemExit(program.guarded("m", [], lambda: print("much to say " * 10_000)))
-"""
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
-    os.close(writer)
-    assert done.returncode == 1
-    assert done.stderr == b"stopped: nobody reads the output any more\n"
-
-
 def test_a_link_to_no_folder_of_checkpoints(workplace):
     (workplace / "checkpoints").symlink_to(workplace / "nowhere")
     with pytest.raises(UserError, match="cannot write to"):

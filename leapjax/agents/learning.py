@@ -54,19 +54,22 @@ UNNAMED = ("microbatch",)
 class TrainingConfig:
     """How a network is trained. The defaults are the paper's (appendix, table 5).
 
+    1600 steps are 200 epochs of one window for each of 500 demonstrations.
+
     Attributes:
-        steps: of the optimizer; 1600 are 200 epochs of one window per demonstration, 500
-            demonstrations.
-        batch: windows in a step.
-        learning_rate: the highest.
-        warmup: steps of linear warm-up, at most a tenth of all; then cosine decay.
-        final_fraction: of the learning rate that is left at the end.
-        betas: of Adam.
-        weight_decay: not on embeddings, norms and biases.
-        clip: global norm of the gradient.
-        windows: drawn by "episode", by "step", or at the "start" of episodes.
-        microbatch: examples whose loss a device takes at a time; 0: all of its own.
-        run: windows in a row that make an example; each state of theirs is encoded once.
+        steps: Training steps.
+        batch: Training windows in a step.
+        learning_rate: Learning rate of AdamW after the warm-up.
+        warmup: Steps of linear warm-up, at most a tenth of all; cosine decay follows.
+        final_fraction: Share of the learning rate that is left at the end.
+        betas: Decay rates of AdamW's two moments.
+        weight_decay: Weight decay of all parameters but embeddings, norms and biases.
+        clip: Largest global norm of the gradient; inf for no clipping.
+        windows: How training windows are drawn: by "episode", each equally often, by "step", each
+            equally often, or at the "start" of episodes.
+        microbatch: Windows whose loss a device computes at a time; 0 for all of its share.
+        run: Consecutive windows in one training example, in which each state is encoded once; 1
+            draws windows alone.
     """
 
     steps: int = 1600

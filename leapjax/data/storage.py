@@ -87,10 +87,7 @@ def source(domain: Domain, count: int, seed: int) -> Source:
 
 def no_demonstrator(domain: Domain) -> str:
     """What to say where demonstrations would have to be made, and nobody can."""
-    return (
-        f"{domain.level} has no demonstrator: name a Minari data set of it with --dataset "
-        "(--demonstrations)"
-    )
+    return f"{domain.level} has no demonstrator: name a Minari data set of it to train on"
 
 
 def observation_space(blank: PyTree) -> gym.Space:

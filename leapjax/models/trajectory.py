@@ -30,14 +30,16 @@ class ModelConfig:
     """The network. The defaults are the paper's transformer.
 
     Attributes:
-        architecture: "paper": the appendix's network; "leapjax": ours.
-        layers: transformer layers.
-        heads: attention heads.
-        width: D, embedding dimension.
-        dropout: of embeddings, attention and residuals.
-        dtype: of matrix products: "float32" or "bfloat16"; parameters are float32.
-        attention: of a plan's actions, "full"; with "causal" no action sees a later one.
-        neighbours: LEAP's token of an action also holds the actions beside it.
+        architecture: Network: "leapjax" for ours, "paper" for that of the appendix.
+        layers: Transformer layers.
+        heads: Attention heads.
+        width: D, embedding dimension; a multiple of the heads.
+        dropout: Dropout rate of embeddings, attention and residuals.
+        dtype: Type of matrix products, "float32" or "bfloat16"; parameters are always float32.
+        attention: Attention between the actions of a plan: "full", or "causal", where no action
+            sees a later one.
+        neighbours: The token of an action also holds the actions beside it. Only LEAP with
+            architecture "leapjax" has this.
     """
 
     architecture: str = "leapjax"
