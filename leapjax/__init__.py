@@ -34,10 +34,12 @@ from leapjax.planners import (
 )
 from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import interval_over_seeds, wilson_interval
+from leapjax.scores import aggregate, interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+from leapjax.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from leapjax.fitting import fit, make_domain
     from leapjax.pretrained import Pretrained, load
 
 __all__ = [
@@ -57,6 +59,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "aggregate",
     "autoregressive",
     "beam_search",
     "classifier",
@@ -66,10 +69,12 @@ __all__ = [
     "constrain",
     "cross_entropy_method",
     "evaluate",
+    "fit",
     "from_total",
     "gibbs",
     "interval_over_seeds",
     "load",
+    "make_domain",
     "neutral",
     "plan_keys",
     "pseudo_likelihood",
@@ -82,7 +87,9 @@ __all__ = [
 # Names that need Flax and an extra, by the module that `__getattr__` imports them from.
 _LATER = {
     "Pretrained": "leapjax.pretrained",
+    "fit": "leapjax.fitting",
     "load": "leapjax.pretrained",
+    "make_domain": "leapjax.fitting",
 }
 
 if not TYPE_CHECKING:  # a type checker would take every name for one that exists

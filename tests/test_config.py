@@ -14,7 +14,7 @@ import experiments.__main__ as programs
 from experiments.common import config, memory
 from experiments.common.config import GROUPS
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, files, pretrained
+from leapjax import domains, files, pretrained, serialization
 from leapjax.agents.learning import TrainingConfig
 from leapjax.configuration import configuration_hash, resolved
 from leapjax.domains import DOMAINS, find_domain
@@ -102,13 +102,13 @@ def test_the_settings_of_a_row_can_be_read_back():
     row = resolved(chosen, seed=0)
     for group in GROUPS:
         settings = getattr(chosen, group)
-        assert checkpoints.from_json(type(settings), row[group]) == settings
+        assert serialization.from_json(type(settings), row[group]) == settings
         for field in dataclasses.fields(settings):
             fewer = {name: value for name, value in row[group].items() if name != field.name}
             default = dataclasses.replace(settings, **{field.name: field.default})
-            assert checkpoints.from_json(type(settings), fewer) == default
+            assert serialization.from_json(type(settings), fewer) == default
         with pytest.raises(UserError, match="missing or unknown mood"):
-            checkpoints.from_json(type(settings), {**row[group], "mood": "calm"})
+            serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
 def test_options_have_the_names_and_defaults_of_their_group():

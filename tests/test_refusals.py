@@ -423,18 +423,6 @@ def test_a_folder_of_another_user(workplace):
         os.chown(folder, 0, -1)
 
 
-def test_programs_that_others_may_have_compiled_are_not_run(workplace, capsys, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    (workplace / "shared").mkdir()
-    (workplace / "shared").chmod(0o777)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(workplace / "shared"))
-    runtime.use_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
-    said = capsys.readouterr().err
-    assert said.startswith("compiled programs are not kept: others can write to")
-    assert said.count("\n") == 1
-
-
 # Rows.
 
 
@@ -737,31 +725,6 @@ def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
     monkeypatch.setattr(demonstrations, "collect", lambda *rest: pytest.fail("collected"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
-
-
-@only_long
-def test_output_that_nobody_reads_any_more_is_one_line():
-    """As in `--help | head -1`."""
-    code = """
-from experiments.common import program
-raise SystemExit(program.guarded("m", [], lambda: print("much to say " * 10_000)))
-"""
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
-    os.close(writer)
-    assert done.returncode == 1
-    assert done.stderr == b"stopped: nobody reads the output any more\n"
-
-
-def test_a_home_that_cannot_be_written_to_has_no_compilation_cache(workplace, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    (workplace / "home").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(workplace / "home"))
-    monkeypatch.delenv("LEAPJAX_COMPILATION_CACHE", raising=False)
-    runtime.use_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
 
 
 def test_a_link_to_no_folder_of_checkpoints(workplace):

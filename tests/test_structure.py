@@ -14,6 +14,9 @@ import pytest
 import leapjax
 from experiments import report
 from experiments.common import results, runtime
+from leapjax import types
+from leapjax.agents.learning import TrainingConfig
+from leapjax.models.trajectory import ModelConfig
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -48,6 +51,22 @@ def test_the_public_names_are_documented():
     for name in leapjax.__all__:
         said = inspect.getdoc(getattr(leapjax, name)) or ""
         assert len(said) > 20 and not said.startswith(f"{name}("), name
+
+
+def fields_of(kind):
+    """The names of the fields of a named tuple or a dataclass."""
+    return getattr(kind, "_fields", None) or getattr(kind, "__dataclass_fields__", {}).keys()
+
+
+def test_fields_are_documented_in_the_docstring_of_their_class():
+    public = [getattr(leapjax, name) for name in leapjax.__all__]
+    public = [each for each in public if isinstance(each, type)]
+    documented = [*public, types.Window, types.TransitionWindow, ModelConfig, TrainingConfig]
+    assert sum(map(len, map(fields_of, documented))) > 100
+    for kind in documented:
+        said = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
+        for field in fields_of(kind):
+            assert re.search(rf"^    {field}: \S", said, re.MULTILINE), f"{kind.__name__}.{field}"
 
 
 def test_the_readme_snippets_run():

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import tyro
 
-from experiments.common import loggers, memory, program
+from experiments.common import loggers, memory, program, startup
 from leapjax import checkpoints, pretrained
 from leapjax.checks import check_integer, check_number
 from leapjax.configuration import AnyConfig, Config, change
@@ -19,7 +18,7 @@ from leapjax.data.storage import Described
 from leapjax.domain import Domain
 from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
-from leapjax.methods import METHODS
+from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
@@ -33,20 +32,34 @@ OUTCOME = 320  # bytes of an episode that is over, while all are gathered and wr
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
 
 
-def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
+def parse(
+    domain: str,
+    arguments: Sequence[str],
+    kind: type[AnyConfig] = Config,
+    module: str = "experiments",
+) -> list[AnyConfig]:
     """One configuration per level and method from a command line; exits with 2 if it is bad.
+
+    Args:
+        domain: by name.
+        arguments: of the command line.
+        kind: `Config`, or a subclass with the program's own names of options.
+        module: of the program, for usage lines.
 
     Raises:
         UserError: an unknown level, method or preset, or options that cannot be.
     """
     program.check_values(arguments)
     # These come first: they decide the defaults of all the rest, and of --help.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
-        first.add_argument(name)
-    first.add_argument("--demos")
+    command = startup.command(module)
+    several = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
+    several.add_argument("--method", nargs="*")
+    named, others = several.parse_known_args(list(arguments))
+    first = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
+    for field in ("level", "preset", "checkpoint", "demonstrations", "demos"):
+        first.add_argument(kind.flag(field), dest=field)
     first.add_argument("--pretrained", action="store_true")
-    chosen, _ = first.parse_known_args(list(arguments))
+    chosen, _ = first.parse_known_args(others)
     folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
     if folder is not None and chosen.pretrained:
         raise UserError("--checkpoint and --pretrained: give one of them")
@@ -56,30 +69,55 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     level = chosen.level or (trained.level if trained else data.level or levels[0])
     if not chosen.level:
         check_imported(level, str(folder or chosen.demonstrations))
-    if chosen.method == "all" and (folder is not None or chosen.pretrained):
-        raise UserError("--method all: a planner that is trained already is of one method")
+    methods = None if named.method is None else find_methods(named.method)
+    if methods and len(methods) > 1 and (folder is not None or chosen.pretrained):
+        raise UserError(
+            f"--method {' '.join(named.method)}: a planner that is trained already is of one method"
+        )
     configs = []
     for each in levels if level == "all" else [level]:
         if chosen.pretrained:
             folder = pretrained.published(each)
             trained = pretrained.read_specification(folder)
-        method = chosen.method or (trained.method if trained else Config.method)
         name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        every = [other for other in METHODS if METHODS[other].everywhere]
-        for one in every if method == "all" else [method]:
-            default = find_preset(domain, each, one, name)
+        for method in methods or [trained.method if trained else Config.method]:
+            default = as_kind(kind, find_preset(domain, each, method, name))
             if data.episodes is not None and chosen.demos is None:  # as many as there are
                 default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
-            if trained and (trained.domain, trained.method) == (domain, one):
+            if trained and (trained.domain, trained.method) == (domain, method):
                 default = _as_trained(default, trained)
-            given = _parse(arguments, default)
-            if method == "all" and not default.training.steps:
+            given = _parse(["--method", method, *others], default, module)
+            if methods and len(methods) > 1 and not default.training.steps:
                 # --steps is for those that learn.
                 given = change(given, training={"steps": 0})
-            config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
+            config = dataclasses.replace(given, level=each, method=method, checkpoint=folder)
             check(config)
             configs.append(config)
     return configs
+
+
+def as_kind(kind: type[AnyConfig], config: AnyConfig) -> AnyConfig:
+    """Returns the same configuration as a program's own subclass of `Config`."""
+    return kind(**{each.name: getattr(config, each.name) for each in dataclasses.fields(config)})
+
+
+def find_methods(names: Sequence[str]) -> list[str]:
+    """The methods that a command line names, each once.
+
+    Args:
+        names: of methods; "all" stands for those that fit every domain.
+
+    Raises:
+        UserError: an unknown method, or none.
+    """
+    every = [name for name in METHODS if METHODS[name].everywhere]
+    if not names:
+        raise UserError(f"--method needs a name: some of {', '.join(METHODS)}, or all")
+    for name in names:
+        if name != "all":
+            find_method(name)
+    found = [each for name in names for each in (every if name == "all" else [name])]
+    return list(dict.fromkeys(found))
 
 
 def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
@@ -94,14 +132,13 @@ def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
     )
 
 
-def _parse(arguments: Sequence[str], default: AnyConfig) -> AnyConfig:
+def _parse(arguments: Sequence[str], default: AnyConfig, module: str) -> AnyConfig:
     # Which options there are depends on the method and the domain.
     groups = ("method_settings", "domain_settings", "planner")
     settings = tuple(type(getattr(default, group)) for group in groups)
-    generic: Any = Config
-    kind = generic[settings]
+    generic: Any = type(default)
     try:
-        return tyro.cli(kind, args=list(arguments), default=default)
+        return program.parse(generic[settings], module, arguments, default=default)
     except ValueError as error:  # the dataclasses refuse values that cannot be
         raise UserError(str(error)) from None
 
@@ -136,13 +173,13 @@ def check(config: AnyConfig) -> None:
     # `module:id` is an environment that a module registers; data know it by its id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
-            f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "
-            f"use --level {recorded}"
+            f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
+            f"{config.level}: use {config.flag('level')} {recorded}"
         )
     domain = make_domain(config)
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.collect is None and domain.source is None:
-        raise UserError(storage.no_demonstrator(domain))
+        raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     limit = domain.shortest_limit
