@@ -12,6 +12,7 @@ from experiments.common import config
 from leapjax import fitting, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.models.trajectory import ModelConfig
+from leapjax.presets import find_preset
 from tests import frozen_lake
 from tests.parameters import make_begin
 
@@ -67,7 +68,7 @@ def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypat
     )  # fmt: skip
     made = made._replace(check=lambda observations, where: None)
     found = leap.fit([episode], made, method).specification
-    chosen = dataclasses.replace(config.preset(domain, level, method, "leapjax"), demos=1)
+    chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
     expected = config.specify(chosen, 0, made)
     assert dataclasses.replace(found, statistics=()) == expected
 
