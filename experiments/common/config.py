@@ -105,7 +105,7 @@ class Config(Generic[M, D, P]):
         """What the command line calls a field, such as "--level"."""
         hint = typing.get_type_hints(cls, include_extras=True)[field]
         names = [getattr(each, "name", None) for each in getattr(hint, "__metadata__", ())]
-        return f"--{next(filter(None, names), field)}"
+        return f"--{next(filter(None, names), field.replace('_', '-'))}"
 
 
 AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
@@ -212,7 +212,9 @@ def parse(
                 default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
             if trained and (trained.domain, trained.method) == (domain, method):
                 default = _as_trained(default, trained)
-            given = _parse(["--method", method, *others], default, module)
+            # Which options there are depends on the method: usage lines name it.
+            shown = f"{module} --method {method}" if methods else module
+            given = _parse(["--method", method, *others], default, shown)
             if methods and len(methods) > 1 and not default.training.steps:
                 # --steps is for those that learn.
                 given = with_options(given, {"steps": 0})
