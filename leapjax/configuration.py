@@ -92,7 +92,7 @@ class Config(Generic[M, D, P]):
         """What the command line calls a field, such as "--level"."""
         hint = typing.get_type_hints(cls, include_extras=True)[field]
         names = [getattr(each, "name", None) for each in getattr(hint, "__metadata__", ())]
-        return f"--{next(filter(None, names), field)}"
+        return f"--{next(filter(None, names), field.replace('_', '-'))}"
 
 
 AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner

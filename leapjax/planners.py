@@ -32,22 +32,17 @@ def check_temperature(temperature: float) -> None:
 class GibbsConfig:
     """Iterative planning through energy minimisation (paper, algorithm 1).
 
-    `fill` says how the first plan is made: "together", all positions in one pass, as in the
-    paper; or P positions in each pass, while the others stay MASK: those that are most certain
-    ("confident": by the probability of the likeliest action, "margin": by its lead over the
-    second), or from left to right ("sequential"), or in "random" order. `order` says which P
-    positions every later iteration resamples: "random" ones, the next from left to right
-    ("sequential"), or those that were least certain when they were chosen ("uncertain", each
-    once before any is again).
-
     Attributes:
         horizon: T, planned actions.
         iterations: N, passes of the model, those that fill the plan included.
-        resampled: P, positions chosen together in a pass, except where all are.
-        fill: How the first plan is made: all "together", the most certain first ("confident" or
-            by "margin"), left to right ("sequential"), or in "random" order.
-        order: Which positions later passes resample: "random" ones, the next ones ("sequential"),
-            or the least certain ones ("uncertain").
+        resampled: P, positions chosen together in a pass, except where a pass fills all.
+        fill: How the first plan is made. "together": all positions in one pass, as in the paper.
+            Otherwise P positions in each pass, while the others stay MASK: the most certain ones by
+            the probability of the likeliest action ("confident") or by its lead over the
+            second ("margin"), those from left to right ("sequential"), or those in "random" order.
+        order: Which P positions every later iteration resamples: "random" ones, the next from left
+            to right ("sequential"), or those that were least certain when they were chosen, each
+            once before any is again ("uncertain").
         temperature: Temperature at which actions are drawn; 0 takes the most likely action.
         restarts: R, independent plans, of which the one of least energy is kept.
         score: Also return the energy of the plan, for T more passes.

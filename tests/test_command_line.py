@@ -29,11 +29,10 @@ def python(*arguments, **options):
                           env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
 
 
-@pytest.mark.parametrize("arguments", ["", "babyai", pytest.param("stars -x", marks=only_long)])
-def test_the_version_needs_no_jax(arguments):
+@pytest.mark.parametrize("command", ["experiments", "experiments babyai", "experiments.babyai"])
+def test_the_version_needs_no_jax(command):
     """-S hides all that is installed, and with it the version."""
-    package = ["experiments.babyai"] if arguments == "babyai" else ["experiments", arguments]
-    done = python("-S", "-m", *filter(None, package), "--version", stdout=subprocess.PIPE)
+    done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
 
@@ -65,12 +64,12 @@ def test_usage_lines_say_how_a_program_was_started(started, command, monkeypatch
 
 @pytest.mark.parametrize("buffered", [[], pytest.param(["-u"], marks=only_long)])
 @pytest.mark.parametrize(
-    "program", [["experiments"], pytest.param(["experiments.stars"], marks=only_long)]
+    "name", ["experiments", pytest.param("experiments.stars", marks=only_long)]
 )
-def test_output_that_nobody_reads_ends_a_program_quietly(buffered, program):
+def test_output_that_nobody_reads_ends_a_program_quietly(buffered, name):
     reader, writer = os.pipe()
     os.close(reader)
-    done = python(*buffered, "-m", *program, "--help", stdout=writer)
+    done = python(*buffered, "-m", name, "--help", stdout=writer)
     os.close(writer)
     assert (done.returncode, done.stderr) == (startup.UNREAD, "")
 
@@ -165,13 +164,19 @@ def test_methods_that_cannot_be_run_are_refused(arguments, says):
         config.parse("babyai", arguments.split())
 
 
+def test_usage_names_the_method_that_has_no_such_option(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        config.parse("babyai", "--method leap bc --masking each".split(), module="experiments.x")
+    assert "run python -m experiments.x --method bc --help" in capsys.readouterr().err
+
+
 def row(seed, method="bc", successes=5):
     said = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
     return {**said, "seed": seed, "method": method, "episodes": 10, "successes": successes,
             "mean_return": 0.5, "hash": f"{seed}{method}"}  # fmt: skip
 
 
-def test_tables_end_with_the_mean_over_seeds(capsys):
+def test_tables_end_with_the_mean_over_seeds():
     rows = [row(0), row(1, successes=7), row(0, "dt"), {**row(1, "dt"), "paper_success": 60.0}]
     rows.append({**row(2, "dt"), "configuration": {"planner": {"iterations": 3}}})
     table = results.success_table(rows)

@@ -86,7 +86,9 @@ def parse(
                 default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
             if trained and (trained.domain, trained.method) == (domain, method):
                 default = _as_trained(default, trained)
-            given = _parse(["--method", method, *others], default, module)
+            # Which options there are depends on the method: usage lines name it.
+            shown = f"{module} --method {method}" if methods else module
+            given = _parse(["--method", method, *others], default, shown)
             if methods and len(methods) > 1 and not default.training.steps:
                 # --steps is for those that learn.
                 given = change(given, training={"steps": 0})
