@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.common import program, startup
 from leapjax.errors import did_you_mean
+from leapjax.running import shell, startup
 
 # In the order in which someone new meets them; what they do is the first line of each.
 PROGRAMS = (
@@ -19,7 +19,7 @@ PROGRAMS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the program that comes first with all that follows it; the exit code."""
     startup.find_modules_here()
-    name, *rest = program.arguments_of(arguments) or ["--help"]
+    name, *rest = shell.arguments_of(arguments) or ["--help"]
     if name in ("-h", "--help"):
         command = startup.command("experiments.NAME")
         print(f"usage: {command} [OPTIONS]\n")
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     module = f"experiments.{name}"
     # An extra that is missing ends this import.
-    failed = program.guarded(module, rest, lambda: importlib.import_module(module))
+    failed = shell.guarded(module, rest, lambda: importlib.import_module(module))
     return failed or importlib.import_module(module).main(rest)
 
 

@@ -20,14 +20,14 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.common import program, runtime
-from experiments.common.config import check_counts
 from leapjax import pretrained
 from leapjax.data import seeds, storage, windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.pretrained import Origin, Pretrained
+from leapjax.running import jax_setup, shell
+from leapjax.running.limits import check_counts
 from leapjax.types import Demonstration, Energy, Params, Window, mask_token
 
 TOGETHER = 64  # windows scored in one go
@@ -50,9 +50,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
-    given = program.arguments_of(arguments)
-    options = program.parse(Options, "experiments.accuracy", given)
-    return program.guarded("experiments.accuracy", given, lambda: report(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.accuracy", given)
+    return shell.guarded("experiments.accuracy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
@@ -69,7 +69,7 @@ def report(options: Options) -> None:
                 f"{run} is of {specification.level}, which nobody here demonstrates: there are no "
                 "other demonstrations to compare with"
             )
-    runtime.start()
+    jax_setup.start()
     for run in options.runs:
         Console(markup=False).print(describe(pretrained.load(run), options, run.name))
 

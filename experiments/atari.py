@@ -9,49 +9,28 @@ import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, memory, program, results
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.progress import Meter
-from leapjax import configuration
-from leapjax.configuration import D, M, P
 from leapjax.domains.atari.domain import FOLDER, LONGEST, Settings, make
 from leapjax.domains.atari.games import find_game
 from leapjax.errors import UserError
 from leapjax.presets import atari as presets
+from leapjax.running import main as running
+from leapjax.running import memory, results, shell
+from leapjax.running.limits import check_counts
+from leapjax.running.progress import Meter
+from leapjax.running.run import Experiment
+from leapjax.running.spelling import AtariConfig
 
 RECORDED = Path("results/atari-data.json")
 SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
 
 
-@dataclasses.dataclass(frozen=True)
-class Config(configuration.Config[M, D, P]):
-    """Train a method on played games, then measure its score.
-
-    Attributes:
-        level: Game: Breakout, Qbert, Pong or Seaquest; "all" for all of them.
-        demos: Games to learn from, at most; see `--transitions`.
-        demonstrations: Folder of DQN-Replay's files to train on, in place of data/atari, where
-            games of built-in demonstrators are made.
-        episodes: Held-out games to measure the score on.
-        test_seed: Seed of the first of these games.
-        validation: Measure the score on validation games instead, to choose settings.
-        play: Game to play instead of the one that the planner of a checkpoint was trained on.
-        pretrained: Evaluate the planner that comes with the library for the game, instead of
-            training.
-    """
-
-    level: Annotated[str, tyro.conf.arg(name="game")]
-
-
-EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=Config)
+EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=AtariConfig)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +60,11 @@ class Collect:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
-    given = program.arguments_of(arguments)
+    given = shell.arguments_of(arguments)
     if given[:1] == ["collect"]:
-        options = program.parse(Collect, "experiments.atari collect", given[1:])
-        return program.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
-    return experiment.main(EXPERIMENT, given)
+        options = shell.parse(Collect, "experiments.atari collect", given[1:])
+        return shell.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+    return running.main(EXPERIMENT, given)
 
 
 def run(options: Collect) -> None:

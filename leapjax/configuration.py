@@ -12,10 +12,13 @@ import tyro
 
 from leapjax import pretrained, serialization
 from leapjax.agents.learning import TrainingConfig
+from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
+from leapjax.domain import Domain
 from leapjax.domains import find_domain
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
+from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.processes import Cluster
 
 M = TypeVar("M")
@@ -153,3 +156,28 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def make_domain(config: AnyConfig) -> Domain:
+    """The level of a configuration: the one that is played."""
+    return find_domain(config.domain).make(config.play or config.level, config.domain_settings)
+
+
+def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
+    """What a run leaves beside its parameters."""
+    return Specification(
+        config.domain, config.level, config.method, config.context,
+        **{group: getattr(config, group) for group in GROUPS},
+        signature=dict(domain.signature),
+        origin=Origin(config.preset, seed, config.demos, config.demonstrations),
+    )  # fmt: skip
+
+
+def episode_seeds(config: AnyConfig) -> range:
+    """The level seeds of the episodes that success is measured on.
+
+    Raises:
+        UserError: they leave their range.
+    """
+    first = seeds.validation_seeds if config.validation else seeds.test_seeds
+    return first(config.test_seed, config.episodes)

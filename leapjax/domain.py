@@ -171,7 +171,6 @@ class Domain(NamedTuple):
         shortest_limit: steps that every episode may last, if that is known.
         signature: JSON values that a checkpoint must agree on.
         return_scale: what returns are divided by before a network sees them.
-        paper_success: the paper's results by method, in percent.
         made_from: its domain's name in `leapjax.domains` and the settings that `make_domain` made
             it with; None: it is of no such domain, and no planner of it can be saved.
     """
@@ -197,7 +196,6 @@ class Domain(NamedTuple):
     shortest_limit: int | None = None
     signature: Mapping[str, Any] = {}
     return_scale: float = 1.0
-    paper_success: Mapping[str, float] = {}
     made_from: tuple[str, Any] | None = None
 
     @property

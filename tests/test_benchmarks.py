@@ -10,12 +10,12 @@ import pytest
 
 from benchmarks import atari, methods, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
-from experiments.common.config import make_domain, specify
-from experiments.common.runtime import Cluster
 from leapjax import pretrained, sharding
+from leapjax.configuration import make_domain, specify
 from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
 from leapjax.presets import find_preset
+from leapjax.running.jax_setup import Cluster
 from tests.programs import only_long, untrained_run, with_options
 
 HORIZON = 5

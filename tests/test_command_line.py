@@ -14,10 +14,11 @@ import pytest
 import experiments.__main__ as programs
 import leapjax
 from experiments import atari, babyai, gymnasium
-from experiments.common import config, experiment, results, startup
 from leapjax import scores, version
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
+from leapjax.running import command_line, results, startup
+from leapjax.running import main as running
 from tests.programs import RANDOM, ROOT, only_long
 
 LEVEL = "GoToLocalS7N5"
@@ -135,11 +136,13 @@ def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, m
 def test_messages_have_the_names_of_the_program():
     options = ["--env", "CartPole-v1", "--method", "bc"]
     with pytest.raises(UserError, match=r"Minari data set of it to train on \(--dataset\)"):
-        config.parse("gymnasium", options, gymnasium.Config)
+        command_line.parse("gymnasium", options, gymnasium.Config)
 
 
 def methods_of(*names):
-    found = config.parse("babyai", ["--level", LEVEL, "--method", *names, "--seeds", "0", "1"])
+    found = command_line.parse(
+        "babyai", ["--level", LEVEL, "--method", *names, "--seeds", "0", "1"]
+    )
     return [each.method for each in found]
 
 
@@ -147,7 +150,7 @@ def test_a_command_line_may_name_several_methods():
     assert methods_of("leap", "bc", "dt", "bc") == ["leap", "bc", "dt"]
     every = [name for name in METHODS if METHODS[name].everywhere]
     assert methods_of("all") == every and methods_of("bc", "all")[0] == "bc"
-    chosen = config.parse("babyai", ["--method", "bc", "random", "--steps", "5"])
+    chosen = command_line.parse("babyai", ["--method", "bc", "random", "--steps", "5"])
     assert [each.training.steps for each in chosen] == [5, 0]
 
 
@@ -161,12 +164,14 @@ def test_a_command_line_may_name_several_methods():
 )
 def test_methods_that_cannot_be_run_are_refused(arguments, says):
     with pytest.raises(UserError, match=says):
-        config.parse("babyai", arguments.split())
+        command_line.parse("babyai", arguments.split())
 
 
 def test_usage_names_the_method_that_has_no_such_option(capsys):
     with pytest.raises(SystemExit, match="2"):
-        config.parse("babyai", "--method leap bc --masking each".split(), module="experiments.x")
+        command_line.parse(
+            "babyai", "--method leap bc --masking each".split(), module="experiments.x"
+        )
     assert "run python -m experiments.x --method bc --help" in capsys.readouterr().err
 
 
@@ -189,9 +194,7 @@ def test_tables_end_with_the_mean_over_seeds():
 
 
 def test_each_method_and_seed_is_run(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        experiment, "run_one", lambda _, chosen, seed, *rest: row(seed, chosen.method)
-    )
+    monkeypatch.setattr(running, "finish", lambda _, chosen, seed, *rest: row(seed, chosen.method))
     monkeypatch.chdir(tmp_path)
     assert babyai.main(["--method", "bc", "dt", "--seeds", "0", "1"]) == 0
     assert len(re.findall(r"mean of 2", capsys.readouterr().out)) == 2

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from experiments.common import runtime
 from leapjax import compilation
 from leapjax.batching import compile_planner
 from leapjax.energy import from_total
 from leapjax.planners import ShootingConfig
+from leapjax.running import jax_setup
 
 FOLDER = "jax_compilation_cache_dir"
 SHORTEST = "jax_persistent_cache_min_compile_time_secs"
@@ -66,7 +66,7 @@ def test_it_can_be_turned_off(no_cache, monkeypatch):
 
 def test_programs_whose_compile_times_are_measured_have_none(no_cache, tmp_path, monkeypatch):
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
-    runtime.start(cache=False)
+    jax_setup.start(cache=False)
     compilation.use_disk_cache()  # as `compile_planner` does
     assert getattr(jax.config, FOLDER) is None
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from experiments.common import config
 from leapjax import fitting, pretrained
 from leapjax.agents.learning import TrainingConfig
+from leapjax.configuration import specify
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets import find_preset
 from tests import frozen_lake
@@ -69,7 +69,7 @@ def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypat
     made = made._replace(check=lambda observations, where: None)
     found = leap.fit([episode], made, method).specification
     chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
-    expected = config.specify(chosen, 0, made)
+    expected = specify(chosen, 0, made)
     assert dataclasses.replace(found, statistics=()) == expected
 
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments.common import results
 from experiments.tables import measured
 from leapjax.errors import UserError
+from leapjax.running import results
 from tests.programs import ROOT
 
 

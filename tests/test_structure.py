@@ -13,10 +13,10 @@ import pytest
 
 import leapjax
 from experiments import report
-from experiments.common import results, runtime
 from leapjax import types
 from leapjax.agents.learning import TrainingConfig
 from leapjax.models.trajectory import ModelConfig
+from leapjax.running import results
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -134,7 +134,9 @@ def test_every_program_says_how_it_is_used_and_refuses_what_it_does_not_know(
 ):
     monkeypatch.chdir(tmp_path)
     main = importlib.import_module(name).main
-    monkeypatch.setattr(runtime, "start", lambda *rest, **more: pytest.fail("something was begun"))
+    monkeypatch.setattr(
+        jax_setup, "start", lambda *rest, **more: pytest.fail("something was begun")
+    )
     assert exit_code(main, ["--help"]) == 0
     assert "usage" in capsys.readouterr().out.lower()
     for arguments in (["--no-such-option", "3"], ["nothing-of-that-name"]):
@@ -160,11 +162,11 @@ def test_neither_imports_nor_a_command_line_start_a_backend():
         "import importlib, jax\n"
         f"for name in {modules}:\n"
         "    importlib.import_module(name)\n"
-        "from experiments.common import config, runtime\n"
+        "from leapjax.running import jax_setup, command_line\n"
         "for method in ('leap', 'classifier', 'random'):\n"
         "    for preset in ('paper', 'leapjax'):\n"
-        "        config.parse('babyai', ['--method', method, '--preset', preset])\n"
-        "runtime.start()\n"
+        "        command_line.parse('babyai', ['--method', method, '--preset', preset])\n"
+        "jax_setup.start()\n"
         "import os\n"
         "assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()\n"
     )

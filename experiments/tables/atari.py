@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from experiments.atari import data_name, game_of
-from experiments.common.results import Row
 from experiments.tables.cells import table
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
@@ -15,6 +14,7 @@ from leapjax.domains.atari.domain import LONGEST
 from leapjax.domains.atari.encoders import STACK
 from leapjax.domains.atari.games import GAMES, Game
 from leapjax.presets.atari import PAPER_TRANSITIONS
+from leapjax.running.results import Row
 
 COLUMNS = {
     "LEAP": Setting("LEAP", "leapjax"),

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.results import Row
+from experiments.paper import paper_success
 from experiments.tables.cells import mean_length, mean_rate, rate, table, with_interval
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
-from leapjax.domains.babyai.levels import LEVELS, paper_success
+from leapjax.domains.babyai.levels import LEVELS
+from leapjax.running.results import Row
 
 OURS = Setting("preset `leapjax`", "leapjax")
 PAPER = Setting("preset `paper`", "paper")

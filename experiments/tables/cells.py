@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from experiments.common.results import Row
 from leapjax import scores
+from leapjax.running.results import Row
 
 
 def rate(rows: Sequence[Row]) -> str:

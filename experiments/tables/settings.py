@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common.results import Row
 from leapjax.configuration import change, configuration_hash
 from leapjax.presets import find_preset
+from leapjax.running.results import Row
 
 
 @dataclasses.dataclass(frozen=True)

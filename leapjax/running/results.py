@@ -15,8 +15,13 @@ from typing import Any
 import jax
 from rich.table import Table
 
-from experiments.common import runtime
-from experiments.common.schema import (
+from leapjax import compilation, scores
+from leapjax.checks import LARGEST_SEED
+from leapjax.errors import UserError, first_line
+from leapjax.files import only_process_in, read_text, write_text
+from leapjax.rollouts import Episodes
+from leapjax.running import jax_setup
+from leapjax.running.schema import (
     AMOUNT,
     COUNT,
     POSITIVE,
@@ -28,11 +33,6 @@ from experiments.common.schema import (
     loads,
     problem,
 )
-from leapjax import compilation, scores
-from leapjax.checks import LARGEST_SEED
-from leapjax.errors import UserError, first_line
-from leapjax.files import only_process_in, read_text, write_text
-from leapjax.rollouts import Episodes
 from leapjax.serialization import read_json
 from leapjax.version import find_version
 
@@ -197,7 +197,7 @@ def versions() -> dict[str, str]:
     with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
         found["ale-py"] = metadata.version("ale-py")
     found["leapjax"] = find_version() + code_version(Path(__file__).parent.parent.parent)
-    machine = f"{compilation.name_processor()}, cores: {runtime.cores()}"
+    machine = f"{compilation.name_processor()}, cores: {jax_setup.cores()}"
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         machine += f", {len(devices)} {devices[0].device_kind}"

@@ -1,148 +1,25 @@
-"""The configuration of a run: presets, the command line, the hash that names it."""
+"""What a configuration may ask for: refused before any long work."""
 
-import argparse
-import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import jax
 
-from experiments.common import loggers, memory, program, startup
 from leapjax import checkpoints, pretrained
 from leapjax.checks import check_integer, check_number
-from leapjax.configuration import AnyConfig, Config, change
+from leapjax.configuration import AnyConfig, episode_seeds, make_domain, specify
 from leapjax.data import seeds, storage
-from leapjax.data.storage import Described
 from leapjax.domain import Domain
-from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
-from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
-from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.rollouts import MOST_OPEN
+from leapjax.running import loggers, memory
+from leapjax.running.programs import PLANS_TOGETHER
 
-# Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
-# faster, and the last episodes of an evaluation would rather have smaller ones.
-PLANS_TOGETHER = 32
 OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
-
-
-def parse(
-    domain: str,
-    arguments: Sequence[str],
-    kind: type[AnyConfig] = Config,
-    module: str = "experiments",
-) -> list[AnyConfig]:
-    """One configuration per level and method from a command line; exits with 2 if it is bad.
-
-    Args:
-        domain: by name.
-        arguments: of the command line.
-        kind: `Config`, or a subclass with the program's own names of options.
-        module: of the program, for usage lines.
-
-    Raises:
-        UserError: an unknown level, method or preset, or options that cannot be.
-    """
-    program.check_values(arguments)
-    # These come first: they decide the defaults of all the rest, and of --help.
-    command = startup.command(module)
-    several = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
-    several.add_argument("--method", nargs="*")
-    named, others = several.parse_known_args(list(arguments))
-    first = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
-    for field in ("level", "preset", "checkpoint", "demonstrations", "demos"):
-        first.add_argument(kind.flag(field), dest=field)
-    first.add_argument("--pretrained", action="store_true")
-    chosen, _ = first.parse_known_args(others)
-    folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
-    if folder is not None and chosen.pretrained:
-        raise UserError("--checkpoint and --pretrained: give one of them")
-    trained = None if folder is None else pretrained.read_specification(folder)
-    levels = find_domain(domain).levels
-    data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
-    level = chosen.level or (trained.level if trained else data.level or levels[0])
-    if not chosen.level:
-        check_imported(level, str(folder or chosen.demonstrations))
-    methods = None if named.method is None else find_methods(named.method)
-    if methods and len(methods) > 1 and (folder is not None or chosen.pretrained):
-        raise UserError(
-            f"--method {' '.join(named.method)}: a planner that is trained already is of one method"
-        )
-    configs = []
-    for each in levels if level == "all" else [level]:
-        if chosen.pretrained:
-            folder = pretrained.published(each)
-            trained = pretrained.read_specification(folder)
-        name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        for method in methods or [trained.method if trained else Config.method]:
-            default = as_kind(kind, find_preset(domain, each, method, name))
-            if data.episodes is not None and chosen.demos is None:  # as many as there are
-                default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
-            if trained and (trained.domain, trained.method) == (domain, method):
-                default = _as_trained(default, trained)
-            # Which options there are depends on the method: usage lines name it.
-            shown = f"{module} --method {method}" if methods else module
-            given = _parse(["--method", method, *others], default, shown)
-            if methods and len(methods) > 1 and not default.training.steps:
-                # --steps is for those that learn.
-                given = change(given, training={"steps": 0})
-            config = dataclasses.replace(given, level=each, method=method, checkpoint=folder)
-            check(config)
-            configs.append(config)
-    return configs
-
-
-def as_kind(kind: type[AnyConfig], config: AnyConfig) -> AnyConfig:
-    """Returns the same configuration as a program's own subclass of `Config`."""
-    return kind(**{each.name: getattr(config, each.name) for each in dataclasses.fields(config)})
-
-
-def find_methods(names: Sequence[str]) -> list[str]:
-    """The methods that a command line names, each once.
-
-    Args:
-        names: of methods; "all" stands for those that fit every domain.
-
-    Raises:
-        UserError: an unknown method, or none.
-    """
-    every = [name for name in METHODS if METHODS[name].everywhere]
-    if not names:
-        raise UserError(f"--method needs a name: some of {', '.join(METHODS)}, or all")
-    for name in names:
-        if name != "all":
-            find_method(name)
-    found = [each for name in names for each in (every if name == "all" else [name])]
-    return list(dict.fromkeys(found))
-
-
-def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
-    """Defaults that are what an earlier run has."""
-    return dataclasses.replace(
-        default,
-        **{group: getattr(trained, group) for group in GROUPS},
-        context=trained.context,
-        seeds=(trained.origin.seed,),
-        demos=trained.origin.demos,
-        demonstrations=trained.origin.demonstrations,
-    )
-
-
-def _parse(arguments: Sequence[str], default: AnyConfig, module: str) -> AnyConfig:
-    # Which options there are depends on the method and the domain.
-    groups = ("method_settings", "domain_settings", "planner")
-    settings = tuple(type(getattr(default, group)) for group in groups)
-    generic: Any = type(default)
-    try:
-        return program.parse(generic[settings], module, arguments, default=default)
-    except ValueError as error:  # the dataclasses refuse values that cannot be
-        raise UserError(str(error)) from None
 
 
 def check(config: AnyConfig) -> None:
@@ -291,21 +168,6 @@ def layer_bytes(model: ModelConfig, tokens: int) -> int:
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
-def make_domain(config: AnyConfig) -> Domain:
-    """The level of a configuration: the one that is played."""
-    return find_domain(config.domain).make(config.play or config.level, config.domain_settings)
-
-
-def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
-    """What a run leaves beside its parameters."""
-    return Specification(
-        config.domain, config.level, config.method, config.context,
-        **{group: getattr(config, group) for group in GROUPS},
-        signature=dict(domain.signature),
-        origin=Origin(config.preset, seed, config.demos, config.demonstrations),
-    )  # fmt: skip
-
-
 def check_counts(options: object, *names: str) -> None:
     """Refuses options that count something and are not positive, or more than can be counted.
 
@@ -324,13 +186,3 @@ def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
     """
     if executed is not None and not 1 <= executed <= horizon:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
-
-
-def episode_seeds(config: AnyConfig) -> range:
-    """The level seeds of the episodes that success is measured on.
-
-    Raises:
-        UserError: they leave their range.
-    """
-    first = seeds.validation_seeds if config.validation else seeds.test_seeds
-    return first(config.test_seed, config.episodes)

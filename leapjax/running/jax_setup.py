@@ -11,10 +11,10 @@ from typing import Any, NamedTuple, NoReturn
 
 import jax
 
-from experiments.common import startup
 from leapjax import compilation
 from leapjax.errors import UserError, first_line
 from leapjax.processes import Cluster
+from leapjax.running import startup
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000

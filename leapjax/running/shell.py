@@ -8,11 +8,11 @@ from typing import Any, NoReturn, TypeVar
 
 import jax
 
-from experiments.common import runtime, startup
-from experiments.common.interruption import Interrupted, Interruption, interruptible
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
 from leapjax.extras import missing_explained
+from leapjax.running import jax_setup, startup
+from leapjax.running.interruption import Interrupted, Interruption, interruptible
 from leapjax.training import NonFiniteLoss
 
 T = TypeVar("T")
@@ -124,9 +124,9 @@ def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoRetur
     command = " ".join([startup.command(module), *map(shlex.quote, arguments)])
     print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
     # At once: threads that still compile or write would crash in the interpreter's own end.
-    runtime.exit_at_once(stopped.exit_code)
+    jax_setup.exit_at_once(stopped.exit_code)
 
 
 def _end(message: str, code: int) -> int:
     print(message, file=sys.stderr)
-    return runtime.leave(code)
+    return jax_setup.leave(code)

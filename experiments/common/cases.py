@@ -18,12 +18,6 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from experiments.common import config as configs
-from experiments.common import experiment, program, results, run, runtime
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.interruption import Interruption
-from experiments.common.results import Row
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
 from leapjax.configuration import AnyConfig, configuration_hash
@@ -38,6 +32,15 @@ from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, Sho
 from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
+from leapjax.running import jax_setup, limits, results, shell
+from leapjax.running.data import load_demonstrations
+from leapjax.running.interruption import Interruption
+from leapjax.running.limits import check_counts
+from leapjax.running.metrics import read_metrics
+from leapjax.running.programs import PLANS_TOGETHER
+from leapjax.running.results import Row
+from leapjax.running.run import Experiment, find_folder, open_run
+from leapjax.running.train import train
 from leapjax.serialization import differences
 from leapjax.types import Energy
 
@@ -150,12 +153,12 @@ class Options:
 
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
-    given = program.arguments_of(arguments)
+    given = shell.arguments_of(arguments)
     module = f"experiments.{analysis.name}"
     about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
     about += f"\n\nThe cases: {_names(analysis.cases)}."
-    options = program.parse(Options, module, given, description=about)
-    return program.stoppable(
+    options = shell.parse(Options, module, given, description=about)
+    return shell.stoppable(
         module,
         given,
         lambda interruption: run_all(analysis, options, interruption),
@@ -181,7 +184,7 @@ class Work(NamedTuple):
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
     """Every case, method and seed asked for, and their table."""
     wanted = check(analysis, options)
-    runtime.start()
+    jax_setup.start()
     versions = results.versions()
     work = Work(analysis, options, versions, Console(markup=False), interruption)
     for where in (work.rows.parent, options.runs):  # not after hours of work
@@ -202,7 +205,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
     """
     check_counts(options, "episodes")
     len(options.played)  # raises where their seeds leave their range
-    configs.check_seeds(options.seeds)
+    limits.check_seeds(options.seeds)
     known = [case.name for case in analysis.cases]
     for name in options.only:
         if name not in known:
@@ -225,7 +228,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
         for method in methods_of(case):
             for seed in options.seeds:
                 for config in configurations(analysis, case, method, seed, options):
-                    configs.check(config)
+                    limits.check(config)
     return wanted
 
 
@@ -356,12 +359,12 @@ def training_of(config: AnyConfig) -> Experiment:
 
 def run_folder(config: AnyConfig, seed: int) -> Path:
     """Where a model is, or will be."""
-    return experiment.run_folder(training_of(config), config, seed)
+    return find_folder(training_of(config), config, seed)
 
 
 def training_seconds(folder: Path) -> float:
     """How long the training of a run has taken, stops and continuations included."""
-    metrics = run.read_metrics(folder)
+    metrics = read_metrics(folder)
     return metrics[-1]["seconds"] if metrics else 0.0
 
 
@@ -371,11 +374,13 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
         with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
-            return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES, finished=True)
+            return pretrained.load(folder, chunk_sizes=(PLANS_TOGETHER,), finished=True)
     work.console.print(f"training {folder}", highlight=False)
-    this = experiment.make_run(training, config, seed, work.console, work.interruption)
-    with contextlib.ExitStack() as stack:
-        return experiment.train(this, work.options.played, stack, plays=False)[0]
+    opened = open_run(
+        training, config, seed, work.console, work.interruption, work.options.played, plays=False
+    )
+    with opened as run:
+        return train(run, load_demonstrations(run))
 
 
 def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
@@ -398,7 +403,7 @@ def asked(
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     # What weighs many plans of a context at once has a full batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
-    plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
+    plan = compile_planner(energy, search, (1, 2) if weighs_many else (PLANS_TOGETHER,))
     return Pretrained(specification, energy, params, plan, domain)
 
 

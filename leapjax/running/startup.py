@@ -8,12 +8,12 @@ import io
 import os
 import signal
 import sys
-from importlib import metadata
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import NoReturn, TextIO
 
-from experiments.common.interruption import SIGNALS, Interrupted
+from leapjax.running.interruption import SIGNALS, Interrupted
+from leapjax.version import find_version
 
 COMMAND = "leapjax"  # the installed script
 UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
@@ -102,14 +102,6 @@ def end_unread() -> NoReturn:
     os._exit(UNREAD)
 
 
-def find_version() -> str:
-    """`leapjax.__version__`, which would import JAX."""
-    try:
-        return metadata.version(COMMAND)
-    except metadata.PackageNotFoundError:
-        return "0+unknown"
-
-
 def command(module: str) -> str:
     """How a program was started: `leapjax babyai`, or `python -m experiments.babyai`.
 
@@ -117,7 +109,7 @@ def command(module: str) -> str:
         module: of the program, such as "experiments.babyai".
     """
     package, _, name = module.partition(".")
-    if package == "experiments" and started().stem == COMMAND:
+    if started().stem == COMMAND:
         return f"{COMMAND} {name}"
     if started().parts[-2:] == (package, "__main__.py"):
         return f"python -m {package} {name}"
@@ -127,8 +119,7 @@ def command(module: str) -> str:
 def find_modules_here() -> None:
     """Lets the installed command import from the working folder, as `python -m` does.
 
-    Called once `leapjax` and `experiments` are imported: both are the installed ones, whatever is
-    in that folder.
+    Called once `leapjax` is imported: it is the installed one, whatever is in that folder.
     """
     if started().stem == COMMAND and not sys.flags.safe_path:
         with contextlib.suppress(OSError):  # the working folder was removed
