@@ -4,8 +4,6 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from leapjax.domains import DOMAINS
-from leapjax.errors import did_you_mean
 from leapjax.running import startup
 
 if startup.is_program():
@@ -27,7 +25,9 @@ A checkout has more programs, which reproduce the tables of the paper: python -m
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains on a domain and plays it; the exit code."""
-    from leapjax.running import shell  # noqa: PLC0415  (it imports JAX)
+    from leapjax.domains import DOMAINS  # noqa: PLC0415  (all of these import JAX)
+    from leapjax.errors import did_you_mean  # noqa: PLC0415
+    from leapjax.running import shell  # noqa: PLC0415
 
     startup.find_modules_here()
     name, *rest = shell.arguments_of(arguments) or ["--help"]

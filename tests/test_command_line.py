@@ -13,12 +13,14 @@ import pytest
 
 import experiments.__main__ as programs
 import leapjax
+import leapjax.__main__
 from experiments import atari, babyai, gymnasium
 from leapjax import scores, version
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.running import command_line, results, startup
 from leapjax.running import main as running
+from leapjax.running.spelling import GymnasiumConfig
 from tests.programs import RANDOM, ROOT, only_long
 
 LEVEL = "GoToLocalS7N5"
@@ -30,7 +32,7 @@ def python(*arguments, **options):
                           env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["experiments", "experiments babyai", "experiments.babyai"])
+@pytest.mark.parametrize("command", ["leapjax", "experiments babyai", "experiments.babyai"])
 def test_the_version_needs_no_jax(command):
     """-S hides all that is installed, and with it the version."""
     done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
@@ -38,27 +40,27 @@ def test_the_version_needs_no_jax(command):
     assert done.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
 
 
-@pytest.mark.parametrize("find", [version.find_version, startup.find_version])
-def test_a_checkout_that_is_not_installed_has_a_version(find, monkeypatch):
-    assert find() == leapjax.__version__
+def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
+    assert version.find_version() == leapjax.__version__
     monkeypatch.setattr(metadata, "distribution", lambda name: metadata.Distribution.from_name("-"))
-    assert find() == "0+unknown"
+    assert version.find_version() == "0+unknown"
 
 
 @pytest.mark.parametrize(
-    ("started", "command"),
+    ("main", "started", "command"),
     [
-        ("/env/bin/leapjax", "leapjax babyai"),
-        ("/site/experiments/__main__.py", "python -m experiments babyai"),
-        ("/site/experiments/babyai.py", "python -m experiments.babyai"),
+        (leapjax.__main__.main, "/env/bin/leapjax", "leapjax babyai"),
+        (leapjax.__main__.main, "/site/leapjax/__main__.py", "python -m leapjax babyai"),
+        (programs.main, "/site/experiments/__main__.py", "python -m experiments babyai"),
+        (programs.main, "/site/experiments/babyai.py", "python -m experiments.babyai"),
     ],
 )
-def test_usage_lines_say_how_a_program_was_started(started, command, monkeypatch, capsys):
+def test_usage_lines_say_how_a_program_was_started(main, started, command, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [started])
     monkeypatch.setattr(sys, "path", list(sys.path))
     for arguments, code in (["--help"], 0), (["--nothing"], 2):
         with pytest.raises(SystemExit, match=str(code)):
-            programs.main(["babyai", *arguments])
+            main(["babyai", *arguments])
     said = capsys.readouterr()
     assert said.out.startswith(f"usage: {command} [-h]") and f"{command} --help" in said.err
 
@@ -136,7 +138,7 @@ def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, m
 def test_messages_have_the_names_of_the_program():
     options = ["--env", "CartPole-v1", "--method", "bc"]
     with pytest.raises(UserError, match=r"Minari data set of it to train on \(--dataset\)"):
-        command_line.parse("gymnasium", options, gymnasium.Config)
+        command_line.parse("gymnasium", options, GymnasiumConfig)
 
 
 def methods_of(*names):

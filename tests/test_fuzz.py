@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from experiments import report
-from experiments.common import cases
+from experiments.common import cases as analyses
 from experiments.tables import measured
 from leapjax import checkpoints, pretrained, weights
 from leapjax.checkpoints import Checkpoints
@@ -309,7 +309,7 @@ def tables_of(root, name, rows):
         rows = {**rows, name: measured.read(root / "results" / f"{name}.json")}
     else:
         rows = {**rows, name: report.rows_of(root, name)}
-        shown = cases.table if name in report.ANALYSES else results.success_table
+        shown = analyses.table if name in report.ANALYSES else results.success_table
         assert shown(rows[name]).row_count == results.time_table(rows[name]).row_count
         assert all(isinstance(report.is_used(row), bool) for row in rows[name])
     rows["puzzles"] = [row for puzzle in report.PUZZLES for row in rows[puzzle]]

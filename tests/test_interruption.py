@@ -120,8 +120,8 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
     program = (
         [*"-m experiments.stars".split(), *RANDOM],
         ["-m", "benchmarks.methods"],
-        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; import experiments.__main__ as leapjax; "
-         "leapjax.main(['stars', *sys.argv[1:]])", *RANDOM],
+        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; from leapjax.__main__ import main; "
+         "main(['stars', *sys.argv[1:]])", *RANDOM],
     )[trial % 3]  # fmt: skip
     run = subprocess.Popen(
         [sys.executable, *program], cwd=tmp_path, text=True,

@@ -16,7 +16,7 @@ from experiments import report
 from leapjax import types
 from leapjax.agents.learning import TrainingConfig
 from leapjax.models.trajectory import ModelConfig
-from leapjax.running import results
+from leapjax.running import jax_setup, results
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -31,7 +31,7 @@ def test_the_public_names_are_sorted_and_exist():
 
 def test_names_that_are_imported_later_hide_no_module():
     modules = {path.stem for path in (ROOT / "leapjax").iterdir()}
-    assert set(leapjax._LATER) <= set(leapjax.__all__) - modules
+    assert set(leapjax._PLACES) - {"__version__"} == set(leapjax.__all__) - modules
 
 
 def test_only_one_module_needs_what_jax_may_change_with_every_release():
