@@ -403,6 +403,7 @@ def test_collecting_goes_on_where_it_was_stopped(collected):
     assert shard.stat().st_mtime_ns > when and shard.read_bytes() == before
 
 
+@only_long
 def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
     monkeypatch.setattr(collect, "make_shard", _die)
     with pytest.raises(UserError, match="a process that played games has ended"):
