@@ -1,7 +1,6 @@
 """Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -20,7 +19,7 @@ from experiments.common.interruption import SIGNALS, Interrupted, interruptible
 from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
-from leapjax.files import only_process_in, write_text
+from leapjax.files import only_process_in
 from leapjax.types import TrainState
 from tests.programs import LONG, RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
 
