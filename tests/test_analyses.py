@@ -246,27 +246,6 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
     assert report.is_used(row) and not report.is_used(stale)
 
 
-def test_plans_stand_beside_single_actions():
-    of = properties.ANALYSIS
-    case = next(case for case in of.cases if case.name == "composition-medium")
-
-    def row(name: str, successes: int, violations: int = 0) -> dict:
-        way = next(way for way in case.ways if way.name == name)
-        settings = analysis.configurations(of, case, way.method, 0, Options())
-        named = analysis.row_name(of, case, way, settings, 0, Options())
-        return {
-            "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "hash": named,
-            "episodes": 200, "successes": successes, "violations": violations,
-        }  # fmt: skip
-
-    rows = [row("sum", 120), row("pick-up alone", 180, 11), row("dt", 130), row("iql", 140)]
-    rows.append(row("iql, exploring", 199))
-    (line,) = (line for line in analyses.compared(of, rows).splitlines() if case.name in line)
-    assert [cell.strip() for cell in line.split("|")[2:-1]] == [
-        "**43.0%**", "15.5%", "-", "-", "60.0%", "**70.0%**", "-", "-", "-", "99.5%",
-    ]  # fmt: skip
-
-
 @only_long
 def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
 

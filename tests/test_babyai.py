@@ -1,7 +1,6 @@
 """The real `main`, end to end at toy size, and what it says to wrong input."""
 
 import json
-import os
 import shutil
 
 import jax
@@ -13,7 +12,7 @@ from benchmarks import quality
 from experiments import babyai
 from experiments.common import results, run
 from experiments.common.config import parse, preset
-from leapjax import UserError, files, load, plan_keys, pretrained, rollouts
+from leapjax import UserError, load, plan_keys, pretrained, rollouts
 from leapjax.agents import leap
 from leapjax.babyai.adapter import BabyAIAdapter
 from leapjax.babyai.domain import BABYAI
@@ -198,12 +197,9 @@ def test_a_loaded_planner_plans(planner):
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(planner.params))
 
 
-def test_a_planner_of_another_horizon_is_refused(workplace):
+def test_a_planner_of_another_horizon_or_a_smaller_grid_is_refused(planner, workplace):
     with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
         load(run_folder(workplace), GibbsConfig(horizon=4))
-
-
-def test_a_planner_of_a_smaller_grid_is_refused_a_larger_level(planner):
     large = LEVELS["GoToLocalS8N7"]
     with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
         rollouts.evaluate(
@@ -314,13 +310,6 @@ def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, cap
     assert babyai.main(arguments) == 2
     assert "is of another configuration" in capsys.readouterr().err
     assert specification.read_text() == before
-
-
-def test_a_folder_in_use_is_refused(workplace, capsys):
-    with files.only_process_in(run_folder(workplace)):
-        assert babyai.main(TOY_RUN) == 2
-    error = capsys.readouterr().err
-    assert f"in use by another process ({os.getpid()})" in error and error.count("\n") == 1
 
 
 def test_a_data_set_of_the_users_own_is_trained_on(workplace):

@@ -17,7 +17,7 @@ from leapjax.energy import (
     single_action,
     view,
 )
-from leapjax.planners import BeamConfig, GibbsConfig, bind, gibbs
+from leapjax.planners import GibbsConfig, bind, gibbs
 from leapjax.types import Energy, mask_token, no_violation, pad_token
 from tests.enumerable import (
     all_plans,
@@ -358,16 +358,6 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
     np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
 
 
-def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
-    """The model's best action is taken, and the plan says that it is not as it should be."""
-    rows = jnp.array([[3.0, -jnp.inf, 1.0, -jnp.inf], [2.0, -jnp.inf, 3.0, -jnp.inf]])
-    only = pseudo_likelihood(lambda params, context: (), lambda p, m, a, at: rows[at], 4)
-    asked = constrain(only, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
-    for config in (GibbsConfig(2, 2), BeamConfig(2, beams=2)):
-        plan = compile_planner(asked, config)((), jax.random.split(jax.random.key(0), 1), {})
-        assert plan.actions.tolist() == [[0, 2]] and not plan.satisfied[0]
-
-
 def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
     plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
@@ -429,19 +419,6 @@ def test_a_mask_and_a_number_mean_the_same_neutral_action(actions):
         neutral(ENUMERABLE, actions).conditional(TABLE, memory, tokens, positions),
         neutral(ENUMERABLE, [2]).conditional(TABLE, memory, tokens, positions),
     )
-
-
-def test_a_constrained_or_composed_energy_takes_what_others_take():
-    """Arrays of NumPy, and lists."""
-    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
-    for energy, params in (
-        (CONSTRAINED, TABLE), (compose([CONSTRAINED, CONSTRAINED]), (TABLE, TABLE))
-    ):  # fmt: skip
-        memory = energy.encode(params, context)
-        actions, positions = PLANS[5], np.arange(HORIZON)
-        expected = energy.conditional(params, memory, jnp.asarray(actions), jnp.asarray(positions))
-        for given in ((actions, positions), (actions.tolist(), positions.tolist())):
-            np.testing.assert_array_equal(energy.conditional(params, memory, *given), expected)
 
 
 def test_a_reward_excuses_no_other_violation():
@@ -552,6 +529,16 @@ def scoring(scores):
         lambda params, memory, tokens, positions: jnp.asarray(scores)[positions],
         ACTIONS,
     )
+
+
+def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
+    """The model's best action is taken, and the plan says that it is not as it should be."""
+    free = scoring(np.tile([3.0, -np.inf, 1.0], (HORIZON, 1)).astype(np.float32))
+    asked = constrain(free, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
+    start, first = jnp.zeros(HORIZON, jnp.int32), jnp.array([0])
+    found = asked.conditional(None, (None, None), start, first)
+    np.testing.assert_array_equal(found, free.conditional(None, None, start, first))
+    assert asked.violation(None, (None, None), start) > 0
 
 
 TABLED = from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)

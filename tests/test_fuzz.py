@@ -36,7 +36,7 @@ from leapjax.errors import UserError
 from leapjax.types import TrainState
 from tests import extreme_options
 from tests.programs import LONG, ROOT, only_long
-from tests.test_storage import LEVEL, NAME, SIDE, assert_same
+from tests.test_storage import LEVEL, NAME, SIDE
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
 MEBIBYTES = 512
@@ -245,10 +245,6 @@ def test_arrays_that_are_not_there(data_set, replace, says):
 
     with bounded(), pytest.raises(UserError, match=says):
         read_data_set(data_set, change)
-
-
-def test_the_data_set_as_it_was(data_set, local_demonstrations):
-    assert_same(read_data_set(data_set, lambda folder: None), local_demonstrations)
 
 
 # Rows, the training curve, what a checkpoint says of itself.

@@ -247,6 +247,14 @@ def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
     assert (tmp_path / "checkpoints" / "1").is_dir()
 
 
+def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
+    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
+    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+        pass
+    with only_process_in(tmp_path / "run"):
+        pass
+
+
 def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
     program = f"""
 import resource, sys
@@ -292,9 +300,3 @@ with files.only_process_in(folder / "run"):  # which takes no room
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1
 
 
-def test_a_lock_is_let_go_of(tmp_path):
-    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
-        pass
-    with only_process_in(tmp_path / "run"):
-        pass

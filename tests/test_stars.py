@@ -210,17 +210,6 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.check(states._replace(goal=np.full(5, 50)), "here")
 
 
-@pytest.mark.parametrize("star", [STAR, Star(5, 10)])
-def test_nodes_are_drawn_apart_and_in_the_picture(star):
-    graph, _ = graphs.draw(star, 0)
-    places = np.array(list(star_animation.layout(star, graph).values()))
-    assert len(places) == star.nodes
-    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(star.nodes)
-    assert apart.min() > 2 * star_animation.RADIUS
-    assert (places > star_animation.RADIUS).all()
-    assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
-
-
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
     """And plans that are shorter or longer than the way are, too."""
