@@ -298,5 +298,3 @@ with files.only_process_in(folder / "run"):  # which takes no room
     assert (tmp_path / "row.json").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1
-
-
