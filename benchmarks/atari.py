@@ -16,7 +16,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import tyro
 from jax.sharding import NamedSharding
 from rich.console import Console
 from rich.table import Table
@@ -64,7 +63,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints tables, and writes what was asked for."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "benchmarks.atari", given)
     return program.guarded("benchmarks.atari", given, lambda: run(options))
 
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -46,7 +45,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "benchmarks.methods", given)
     return program.guarded("benchmarks.methods", given, lambda: run(options))
 
 

@@ -18,7 +18,6 @@ from typing import Any
 import jax
 import matplotlib
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -67,7 +66,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "benchmarks.planning", given)
     return program.guarded("benchmarks.planning", given, lambda: run(options))
 
 

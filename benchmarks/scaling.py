@@ -54,7 +54,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "benchmarks.scaling", given)
     return program.guarded("benchmarks.scaling", given, lambda: run(options, given))
 
 

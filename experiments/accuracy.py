@@ -35,20 +35,23 @@ TOGETHER = 64  # windows scored in one go
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say what models know of demonstrations that they have, and have not, learned from."""
+    """Say what models know of demonstrations that they have, and have not, learned from.
+
+    Attributes:
+        runs: Folders of runs.
+        demos: Demonstrations of each kind, learned from or not.
+        samples: Steps of the demonstrations to predict the actions of, at most.
+    """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs."""
     demos: int = 200
-    """Demonstrations of each kind."""
     samples: int = 2000
-    """Steps of them to predict from, at most."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.accuracy", given)
     return program.guarded("experiments.accuracy", given, lambda: report(options))
 
 

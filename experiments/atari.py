@@ -9,15 +9,15 @@ import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, memory, program, results
-from experiments.common.config import check_counts
+from experiments.common import config, experiment, memory, program, results
+from experiments.common.config import D, M, P, check_counts
 from experiments.common.experiment import Experiment
 from experiments.common.progress import Meter
 from leapjax.atari.domain import FOLDER, LONGEST, Settings, data_name, make, preset
@@ -25,39 +25,64 @@ from leapjax.atari.games import find_game
 from leapjax.errors import UserError
 
 RECORDED = Path("results/atari-data.json")
-EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
 SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
-NAMES = {"--game": "--level"}  # what its users call the options of every experiment
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(config.Config[M, D, P]):
+    """Train a method on played games, then measure its score.
+
+    Attributes:
+        level: Game: Breakout, Qbert, Pong or Seaquest; "all" for all of them.
+        demos: Games to learn from, at most; see `--transitions`.
+        demonstrations: Folder of DQN-Replay's files to train on, in place of data/atari, where
+            games of built-in demonstrators are made.
+        episodes: Held-out games to measure the score on.
+        test_seed: Seed of the first of these games.
+        validation: Measure the score on validation games instead, to choose settings.
+        play: Game to play instead of the one that the planner of a checkpoint was trained on.
+        pretrained: Evaluate the planner that comes with the library for the game, instead of
+            training.
+    """
+
+    level: Annotated[str, tyro.conf.arg(name="game")]
+
+
+EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=Config)
 
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Play games with built-in demonstrators; writes what DQN-Replay's files hold."""
+    """Play games with built-in demonstrators; writes what DQN-Replay's files hold.
+
+    Attributes:
+        game: Game: Breakout, Qbert, Pong or Seaquest.
+        transitions: Transitions to make at least, in whole games; None for as many as preset
+            leapjax learns from.
+        folder: Folder for the data; if games were begun there, they are continued.
+        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
+            own.
+        longest: Decisions after which a game is cut off, because a ball can fly on for ever.
+        workers: Processes; None for one on each core.
+        record: Write the scores of the demonstrators to results/, which is committed.
+    """
 
     game: str
-    """Breakout, Qbert, Pong or Seaquest."""
     transitions: int | None = None
-    """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
-    """Where to; a game that was begun there goes on."""
     replay_run: int = 1
-    """Number of the run, as DQN-Replay has five of each game: each has games of its own."""
     longest: int = LONGEST
-    """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
-    """Processes; None: one on each core."""
     record: bool = False
-    """Write what demonstrators have reached to results/, which is committed, beside data of
-    another size."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
     given = program.arguments_of(arguments)
     if given[:1] == ["collect"]:
-        options = tyro.cli(Collect, prog="experiments.atari collect", args=given[1:])
+        options = program.parse(Collect, "experiments.atari collect", given[1:])
         return program.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
-    return experiment.main(EXPERIMENT, program.renamed(given, NAMES))
+    return experiment.main(EXPERIMENT, given)
 
 
 def run(options: Collect) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from scipy import stats
 
@@ -32,22 +31,25 @@ RESULTS = Path("atari-energy.json")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Compare the energies of trajectories with their rewards."""
+    """Compare the energies of trajectories with their rewards.
+
+    Attributes:
+        checkpoint: Folders of runs of LEAP on Atari, one for each game.
+        windows: Random windows of each trajectory to compute the energy of.
+        record: Write the result to results/, which is committed.
+        runs: Folder for a result that is not recorded.
+    """
 
     checkpoint: tuple[Path, ...]
-    """Folders of runs of LEAP on Atari, one for each game."""
     windows: int = 64
-    """Random windows of each trajectory to take the energy of."""
     record: bool = False
-    """Write what was found to results/, which is committed."""
     runs: Path = Path("runs")
-    """Where what is not recorded goes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Says how energy and reward are correlated; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.atari_energy", given)
     return program.guarded("experiments.atari_energy", given, lambda: report(options))
 
 

@@ -49,18 +49,21 @@ class Cause(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say why episodes fail."""
+    """Say why episodes fail.
+
+    Attributes:
+        runs: Folders of runs of one level, for instance of several seeds.
+        episodes: Validation episodes for each run.
+        executed: Actions to execute before replanning; None for the whole plan.
+        gallery: Path of the picture of failures; None for failures.png in the first run's folder.
+        drawn: Failures in the picture, at most.
+    """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs of one level, for instance of several seeds."""
     episodes: int = 500
-    """Validation episodes for each."""
     executed: int | None = None
-    """Actions to execute before replanning; None: the whole plan."""
     gallery: Path | None = None
-    """The picture to draw; None: failures.png in the first run's folder."""
     drawn: int = 8
-    """Failures in it, at most."""
 
 
 class Recorder(BabyAIAdapter):
@@ -94,7 +97,7 @@ class Recorder(BabyAIAdapter):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plays, counts, draws; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.failures", given)
     return program.guarded("experiments.failures", given, lambda: report(options))
 
 

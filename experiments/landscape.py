@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -42,28 +41,31 @@ RESULTS = Path("landscape.json")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train, and watch the energies of good and bad plans."""
+    """Train, and watch the energies of good and bad plans.
+
+    Attributes:
+        level: Level of BabyAI; the paper's is the default.
+        presets: Presets to train with, "paper" or "leapjax" or both.
+        seed: Training seed.
+        trajectories: Demonstrations to compute the energy of, and contexts to plan for.
+        steps: Training steps; None for as many as the preset has.
+        record: Write the result to results/, which is committed.
+        runs: Folder for trained models, and for a result that is not recorded.
+    """
 
     level: str = "GoToLocalS7N5"
-    """A level of BabyAI; the paper's is this one."""
     presets: tuple[str, ...] = ("paper", "leapjax")
-    """What is trained."""
     seed: int = 0
-    """Training seed."""
     trajectories: int = 200
-    """Demonstrations to take the energy of, and contexts to plan for."""
     steps: int | None = None
-    """Train for so many steps; None: as long as the preset says."""
     record: bool = False
-    """Write what was found to results/, which is committed."""
     runs: Path = Path("runs")
-    """Where what is trained, and what is not recorded, goes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains with each preset and says what was found; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.landscape", given)
     return program.stoppable(
         "experiments.landscape", given, lambda interruption: report(options, interruption)
     )

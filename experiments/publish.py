@@ -26,7 +26,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Publishes every run that is named."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.publish", given)
     return program.guarded("experiments.publish", given, lambda: publish(options.runs))
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import tyro
 from PIL import Image
 from rich.console import Console
 
@@ -54,16 +53,20 @@ ASKED = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw plans, and what comes of them."""
+    """Draw plans, and what comes of them.
+
+    Attributes:
+        seed: Training seed of models that are not trained yet.
+        test_seed: Level seed to search from for episodes to draw; the first that are long enough
+            are drawn.
+        record: Write the figures to docs/, which is committed.
+        runs: Folder for trained models, and for figures that are not recorded.
+    """
 
     seed: int = 0
-    """Training seed, of what must be trained."""
     test_seed: int = seeds.UNSEEN
-    """Level seed to look from for episodes to draw: the first that are long enough are taken."""
     record: bool = False
-    """Write the figures of docs/, which are committed."""
     runs: Path = Path("runs")
-    """Where what is trained, and figures that are not recorded, go."""
 
 
 class Drawn(NamedTuple):
@@ -80,7 +83,7 @@ class Drawn(NamedTuple):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draws both figures; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
+    options = program.parse(Options, "experiments.qualitative", given)
     return program.stoppable(
         "experiments.qualitative", given, lambda interruption: draw(options, interruption)
     )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import plots, program, results
+from experiments.common import plots, program, results, startup
 from experiments.common.results import Row
 from experiments.tables import analyses, atari, babyai, measured, puzzles, speed
 from experiments.tables.analyses import ANALYSES
@@ -28,7 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Rewrites every table here; the exit code."""
     given = program.arguments_of(arguments)
     about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
-    argparse.ArgumentParser("experiments.report", description=about).parse_args(given)
+    command = startup.command("experiments.report")
+    argparse.ArgumentParser(command, description=about).parse_args(given)
     return program.guarded("experiments.report", given, rewrite)
 
 

@@ -4,8 +4,12 @@ An `Energy` is a few pure functions of one trajectory; a planner finds a plan of
 energy; `compile_planner` makes it plan for any number of contexts at once.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.domain import Domain
+from leapjax.domains import make_domain
 from leapjax.energy import (
     autoregressive,
     classifier,
@@ -18,6 +22,7 @@ from leapjax.energy import (
     view,
 )
 from leapjax.errors import UserError
+from leapjax.extras import missing_explained
 from leapjax.planners import (
     BeamConfig,
     CrossEntropyConfig,
@@ -28,11 +33,15 @@ from leapjax.planners import (
     gibbs,
     random_shooting,
 )
-from leapjax.pretrained import Pretrained, load
 from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import interval_over_seeds, wilson_interval
+from leapjax.scores import aggregate, interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+from leapjax.version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from leapjax.fitting import fit
+    from leapjax.pretrained import Pretrained, load
 
 __all__ = [
     "Agent",
@@ -51,6 +60,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "aggregate",
     "autoregressive",
     "beam_search",
     "classifier",
@@ -60,10 +70,12 @@ __all__ = [
     "constrain",
     "cross_entropy_method",
     "evaluate",
+    "fit",
     "from_total",
     "gibbs",
     "interval_over_seeds",
     "load",
+    "make_domain",
     "neutral",
     "plan_keys",
     "pseudo_likelihood",
@@ -72,3 +84,26 @@ __all__ = [
     "view",
     "wilson_interval",
 ]
+
+# Names that need Flax and an extra, by the module that `__getattr__` imports them from.
+_LATER = {
+    "Pretrained": "leapjax.pretrained",
+    "fit": "leapjax.fitting",
+    "load": "leapjax.pretrained",
+}
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that exists
+
+    def __getattr__(name: str) -> Any:
+        """Imports a name of `_LATER` when it is first used (PEP 562)."""
+        if name not in _LATER:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        with missing_explained():
+            value = getattr(importlib.import_module(_LATER[name]), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Lists the names that are imported later, too."""
+    return sorted({*globals(), *_LATER})

@@ -1,30 +1,75 @@
 """The table of domains: what `leapjax.load` and the experiments find by name."""
 
+import dataclasses
+import importlib
 import sys
+from typing import Any, NamedTuple
 
-from leapjax.atari.domain import ATARI
-from leapjax.babyai.domain import BABYAI
-from leapjax.domain import DomainType
+from leapjax.checks import check_kind
+from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
-from leapjax.gymnasium.domain import GYMNASIUM
-from leapjax.stars.domain import STARS
-from leapjax.sudoku.domain import SUDOKU
+from leapjax.extras import missing_explained
 
-DOMAINS: dict[str, DomainType] = {
-    "babyai": BABYAI, "stars": STARS, "sudoku": SUDOKU, "gymnasium": GYMNASIUM,
-    "atari": ATARI,
-}  # fmt: skip
+
+class Place(NamedTuple):
+    """Where a domain is defined: it is imported when it is first used.
+
+    Attributes:
+        module: that defines it.
+        name: of the `DomainType` in that module.
+        extra: of the package that the domain needs; see `leapjax.extras`.
+    """
+
+    module: str
+    name: str
+    extra: str
+
+
+DOMAINS: dict[str, DomainType | Place] = {
+    "babyai": Place("leapjax.babyai.domain", "BABYAI", "babyai"),
+    "stars": Place("leapjax.stars.domain", "STARS", "train"),
+    "sudoku": Place("leapjax.sudoku.domain", "SUDOKU", "train"),
+    "gymnasium": Place("leapjax.gymnasium.domain", "GYMNASIUM", "train"),
+    "atari": Place("leapjax.atari.domain", "ATARI", "atari"),
+}
 
 
 def find_domain(name: str) -> DomainType:
     """The domain of that name.
 
     Raises:
-        UserError: there is none; names those that there are.
+        UserError: there is none, and names those that there are; or it needs an extra that is not
+            installed.
     """
     if name not in DOMAINS:
         raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
-    return DOMAINS[name]
+    found = DOMAINS[name]
+    if isinstance(found, Place):
+        with missing_explained(found.extra):
+            found = getattr(importlib.import_module(found.module), found.name)
+    return found
+
+
+def make_domain(name: str, level: str, settings: Any = None) -> Domain:
+    """Makes one level of a domain, as `leapjax.fit` and `leapjax.evaluate` need it.
+
+    Args:
+        name: of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
+        level: by name, such as "GoToLocalS7N5"; of Gymnasium, the id of an environment.
+        settings: options of encoder and augmentation, as in the module of the domain; None for
+            those that preset `leapjax` has for LEAP on this level.
+
+    Raises:
+        UserError: an unknown domain or level, settings of another domain, or an environment that
+            cannot be made.
+    """
+    kind = find_domain(name)
+    if settings is None:
+        options = {**kind.preset(level, "leapjax"), **kind.tuned(level, "leap", "leapjax")}
+        names = {field.name for field in dataclasses.fields(kind.settings)}
+        settings = kind.settings(**{k: v for k, v in options.items() if k in names})
+    check_kind(settings, kind.settings)
+    return kind.make(level, settings)._replace(made_from=(name, settings))
 
 
 def check_imported(level: str, named_by: str) -> None:

@@ -86,13 +86,18 @@ def aggregate(
 ) -> tuple[float, tuple[float, float]]:
     """The interquartile mean of success over levels, and its confidence interval, as fractions.
 
-    A bootstrap stratified by level (Agarwal et al., 2021): within each, seeds are drawn, then
-    its episodes, as `interval_over_seeds` does. A level counts by the mean of its seeds, of which
-    some levels have more than others.
+    A bootstrap stratified by level (Agarwal et al., 2021, arXiv 2108.13264): within each of L
+    levels seeds are drawn, then episodes, as `interval_over_seeds` does. A level counts by the mean
+    of its seeds, of which some levels have more than others. A quarter of the levels, rounded
+    down, is left out at each end.
 
     Args:
-        levels: of each, successes `[S]` and episodes `[S]` of its training seeds.
+        levels: L pairs, (successes `[S]`, episodes `[S]`) of the S training seeds of each level; S
+            may differ.
         level: of confidence, between 0 and 1.
+
+    Returns:
+        The mean, and (low, high).
 
     Raises:
         ValueError: no levels; and as of `interval_over_seeds`.

@@ -21,6 +21,14 @@ HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
 
 
+@pytest.fixture(autouse=True)
+def same_cache():
+    """Benchmarks turn the cache of compiled programs off for their process, which is ours here."""
+    before = jax.config.jax_enable_compilation_cache
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
+
+
 def tiny_preset(*names):
     """The settings of a preset, with a network and batches that take no time."""
     small = {"width": 16, "heads": 2, "layers": 1, "batch": 4}

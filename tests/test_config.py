@@ -14,11 +14,11 @@ import experiments.__main__ as programs
 from experiments.common import config, memory
 from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, files, pretrained
+from leapjax import configurations, domains, files, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.babyai.domain import BABYAI
 from leapjax.babyai.settings import Settings
-from leapjax.domains import DOMAINS
+from leapjax.domains import DOMAINS, find_domain
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
@@ -99,13 +99,13 @@ def test_the_settings_of_a_row_can_be_read_back():
     row = resolved(chosen, seed=0)
     for group in GROUPS:
         settings = getattr(chosen, group)
-        assert checkpoints.from_json(type(settings), row[group]) == settings
+        assert configurations.from_json(type(settings), row[group]) == settings
         for field in dataclasses.fields(settings):
             fewer = {name: value for name, value in row[group].items() if name != field.name}
             default = dataclasses.replace(settings, **{field.name: field.default})
-            assert checkpoints.from_json(type(settings), fewer) == default
+            assert configurations.from_json(type(settings), fewer) == default
         with pytest.raises(UserError, match="missing or unknown mood"):
-            checkpoints.from_json(type(settings), {**row[group], "mood": "calm"})
+            configurations.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
 def test_options_have_the_names_and_defaults_of_their_group():
@@ -181,7 +181,7 @@ def test_every_program_is_known_by_name(capsys):
 
 KINDS = [
     *dict.fromkeys(method.settings for method in METHODS.values()),
-    *(domain.settings for domain in DOMAINS.values()),
+    *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
 FIELDS = [

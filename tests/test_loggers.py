@@ -120,7 +120,7 @@ def test_loggers_that_there_are_not_are_one_line(monkeypatch):
     with pytest.raises(UserError, match="unknown logger 'csv': expected some of tensorboard"):
         config.parse("babyai", ["--loggers", "csv"])
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(UserError, match=r"pip install 'leapjax\[tensorboard\]'"):
+    with pytest.raises(UserError, match=r'pip install "\.\[tensorboard\]"'):
         config.parse("babyai", ["--loggers", "tensorboard"])
 
 

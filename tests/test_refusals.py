@@ -368,18 +368,6 @@ def test_a_folder_to_which_the_group_of_its_user_can_write(workplace, monkeypatc
         files.make_private(made)
 
 
-def test_programs_that_others_may_have_compiled_are_not_run(workplace, capsys, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    (workplace / "shared").mkdir()
-    (workplace / "shared").chmod(0o777)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(workplace / "shared"))
-    runtime.use_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
-    said = capsys.readouterr().err
-    assert said.startswith("compiled programs are not kept: others can write to")
-    assert said.count("\n") == 1
-
-
 # Before any work.
 
 
@@ -623,20 +611,6 @@ def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplo
     np.testing.assert_array_equal(found["w"], 1.0)
 
 
-@only_long
-def test_output_that_nobody_reads_any_more_is_one_line():
-    """As in `--help | head -1`."""
-    code = """
-from experiments.common import program
-raise SystemExit(program.guarded("m", [], lambda: print("much to say " * 10_000)))
-"""
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
-    os.close(writer)
-    assert done.returncode == 1
-    assert done.stderr == b"stopped: nobody reads the output any more\n"
 
 
 # The bot.

@@ -15,6 +15,9 @@ import pytest
 import leapjax
 from experiments import report
 from experiments.common import results, runtime
+from leapjax import types
+from leapjax.agents.learning import TrainingConfig
+from leapjax.models.trajectory import ModelConfig
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -50,12 +53,17 @@ def test_the_library_never_imports_experiments():
 def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/types.py", "checks")
     may_import("leapjax/errors.py")
+    may_import("leapjax/extras.py", "errors")
     may_import("leapjax/checks.py", "errors")
     may_import("leapjax/schedules.py", "checks")
     may_import("leapjax/energy.py", "types", "checks", "errors")
     may_import("leapjax/sharding.py", "types", "checks")
     may_import("leapjax/planners.py", "types", "checks")
-    may_import("leapjax/batching.py", "types", "checks", "errors", "planners", "sharding")
+    may_import("leapjax/compilation.py", "files", "errors")
+    may_import(
+        "leapjax/batching.py",
+        *("types", "checks", "errors", "compilation", "planners", "sharding"),
+    )
     may_import("leapjax/scores.py", "checks")
     may_import("leapjax/training.py", "types", "sharding")
     may_import("leapjax/environments.py", "types", "checks", "errors")
@@ -80,7 +88,7 @@ def test_models_and_planners_meet_only_in_agents():
             n.startswith("leapjax.planners") for n in names
         )
         where = path.relative_to(ROOT / "leapjax").parts[0]
-        assert not both or where in ("agents", "pretrained.py"), path
+        assert not both or where in ("agents", "pretrained.py", "fitting.py"), path
 
 
 def test_only_babyai_knows_minigrid_and_only_atari_its_emulator():
@@ -125,6 +133,24 @@ def test_there_is_no_cycle_of_imports():
 def test_the_public_names_are_sorted_and_exist():
     assert leapjax.__all__ == sorted(leapjax.__all__)
     assert all(hasattr(leapjax, name) for name in leapjax.__all__)
+    assert set(leapjax.__all__) <= set(dir(leapjax))
+    assert not hasattr(leapjax, "no_such_name")
+
+
+def test_names_that_are_imported_later_hide_no_module():
+    modules = {path.stem for path in (ROOT / "leapjax").iterdir()}
+    assert set(leapjax._LATER) <= set(leapjax.__all__) - modules
+
+
+def test_only_one_module_needs_what_jax_may_change_with_every_release():
+    names = re.compile(r"\bjax(\.| import .*\b)(_src|extend|interpreters)\b")
+    paths = [
+        path
+        for folder in ("leapjax", "experiments", "benchmarks", "tests", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+        if names.search(path.read_text())
+    ]
+    assert paths == [ROOT / "leapjax/models/linear.py"]  # which says why
 
 
 def test_the_public_names_are_documented():
@@ -133,6 +159,22 @@ def test_the_public_names_are_documented():
     for name in leapjax.__all__:
         said = inspect.getdoc(getattr(leapjax, name)) or ""
         assert len(said) > 20 and not said.startswith(f"{name}("), name
+
+
+def fields_of(kind):
+    """The names of the fields of a named tuple or a dataclass."""
+    return getattr(kind, "_fields", None) or getattr(kind, "__dataclass_fields__", {}).keys()
+
+
+def test_fields_are_documented_in_the_docstring_of_their_class():
+    public = [getattr(leapjax, name) for name in leapjax.__all__]
+    public = [each for each in public if isinstance(each, type)]
+    documented = [*public, types.Window, types.TransitionWindow, ModelConfig, TrainingConfig]
+    assert sum(map(len, map(fields_of, documented))) > 100
+    for kind in documented:
+        said = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
+        for field in fields_of(kind):
+            assert re.search(rf"^    {field}: \S", said, re.MULTILINE), f"{kind.__name__}.{field}"
 
 
 def test_the_readme_snippets_run():

@@ -8,13 +8,13 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -26,7 +26,7 @@ from experiments.common.interruption import Interruption
 from experiments.common.results import Row
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.checkpoints import differences
+from leapjax.configurations import differences
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -99,30 +99,33 @@ class Analysis(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Ask what was trained for plans on levels that it was not trained for."""
+    """Train models, plan with each in several ways, and print success beside the paper's.
+
+    Attributes:
+        only: Cases to do, by name; all of them if none is given.
+        methods: Methods to do; all that a case has if none is given.
+        ways: Ways to plan, by name; all that a case has if none is given.
+        preset: Preset that models are trained with: "leapjax" for ours, "paper" for the paper's.
+        seeds: Training seeds.
+        episodes: Held-out episodes to measure success on, for each row.
+        test_seed: Level seed of the first of these episodes.
+        validation: Measure success on validation levels instead, to choose settings.
+        record: Append rows to results/, which is committed, and skip what is recorded already.
+        force: With `--record`: do again what is recorded, and replace its rows.
+        runs: Folder for trained models and unrecorded rows.
+    """
 
     only: tuple[str, ...] = ()
-    """Cases by name; none: all of them."""
     methods: tuple[str, ...] = ()
-    """Methods; none: all that a case has."""
     ways: tuple[str, ...] = ()
-    """Ways to plan, by name; none: all that a case has."""
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's. Of what is trained."""
     seeds: tuple[int, ...] = (0,)
-    """Training seeds."""
     episodes: int = 200
-    """Held-out episodes to measure success on, for each row."""
     test_seed: int = UNSEEN
-    """Level seed of the first of them."""
     validation: bool = False
-    """Measure on validation levels instead: for choosing settings."""
     record: bool = False
-    """Append rows to results/, which is committed, and skip what is recorded already."""
     force: bool = False
-    """With --record: do again what is recorded, and replace its rows."""
     runs: Path = Path("runs")
-    """Where what is trained, and unrecorded rows, go."""
 
     @property
     def played(self) -> range:
@@ -134,9 +137,12 @@ class Options:
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
     given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given, description=f"The cases: {_names(analysis.cases)}.")
+    module = f"experiments.{analysis.name}"
+    about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
+    about += f"\n\nThe cases: {_names(analysis.cases)}."
+    options = program.parse(Options, module, given, description=about)
     return program.stoppable(
-        f"experiments.{analysis.name}",
+        module,
         given,
         lambda interruption: run_all(analysis, options, interruption),
     )
@@ -380,7 +386,7 @@ def asked(
     # What weighs many plans of a context at once has a full batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
     plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
-    return Pretrained(specification, energy, params, plan)
+    return Pretrained(specification, energy, params, plan, domain)
 
 
 def play(
@@ -406,7 +412,7 @@ def play(
         nonlocal compile_seconds
         planner = asked(domain, way, models, config)
         begun = time.perf_counter()
-        run.warm_up(planner, domain, options.episodes, way.executed)
+        planner.compile(options.episodes, way.executed)
         compile_seconds += time.perf_counter() - begun
         adapters.clear()
         return rollouts.evaluate(
@@ -434,6 +440,7 @@ def play(
         "first_episode_seed": options.played[0],
         "validation": options.validation,
         "successes": int(found.successes.sum()),
+        "success": float(found.successes.mean()),
         "first_pass_successes": first_pass,
         "violations": sum(violations) if violations else None,
         "mean_length": float(found.lengths.mean()),
@@ -466,18 +473,28 @@ def rows_of_way(
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """The rows for a terminal; below, the mean over training seeds if there are several."""
     shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
+
+    def named(row: Row) -> tuple[str, ...]:
+        return row["case"], row["way"], f"{row['method']} ({row['preset']})"
+
+    def paper(row: Row) -> str:
+        found = row["paper_success"]
+        return "-" if found is None else f"{found:.1f}%"
+
     for row in rows:
-        paper, first = row["paper_success"], row["first_pass_successes"]
+        first = row["first_pass_successes"]
         shown.add_row(
-            row["case"],
-            row["way"],
-            f"{row['method']} ({row['preset']})",
+            *named(row),
             str(row["seed"]),
             "" if first is None else f"{first / row['episodes']:.1%}",
             results.percent(row),
             f"{1e3 / row['plans_per_second']:.2f}",
-            "-" if paper is None else f"{paper:.1f}%",
+            paper(row),
         )
+    shown.add_section()
+    for group in results.group_seeds(rows, named):
+        mean = results.percent_over_seeds(group)
+        shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", paper(group[0]))
     return shown

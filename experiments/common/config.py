@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
@@ -12,9 +13,9 @@ from typing import Annotated, Any, Generic, TypeVar
 import jax
 import tyro
 
-from experiments.common import loggers, memory, program
+from experiments.common import loggers, memory, program, startup
 from experiments.common.runtime import Cluster
-from leapjax import checkpoints, pretrained
+from leapjax import checkpoints, configurations, pretrained
 from leapjax.agents.learning import TrainingConfig
 from leapjax.checks import check_integer, check_number
 from leapjax.data import seeds, storage
@@ -23,6 +24,7 @@ from leapjax.data.storage import Described
 from leapjax.domain import Domain
 from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
+from leapjax.fitting import names_of, preset_options
 from leapjax.methods import METHODS, find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -34,63 +36,76 @@ D = TypeVar("D")
 P = TypeVar("P")
 
 
+# A program that calls options otherwise has a subclass, which annotates their fields.
 @dataclasses.dataclass(frozen=True)
 class Config(Generic[M, D, P]):
-    """Train a method on demonstrations of a level, then measure its success."""
+    """Train a method on demonstrations of a level, then measure its success.
+
+    Attributes:
+        level: Level by its name or id, or "all" for those of the paper.
+        method: How to learn and to act, one or more of: leap, classifier, bc, dt, bcq, iql, mopo,
+            plate, cql, qr_dqn, rem, rules, random; or "all" for those that fit every level.
+        preset: Defaults of all other options: "leapjax" for ours, "paper" for the paper's.
+        seeds: Training seeds; each draws its own demonstrations.
+        demos: Demonstrations to train on; of a given data set at most those that it has.
+        demonstrations: Id of a Minari data set to train on, in place of demonstrations that are
+            made for the level; the level follows from it if the data set names one.
+        episodes: Held-out episodes to measure success on.
+        test_seed: Level seed of the first of these episodes.
+        validation: Measure success on validation levels instead, to choose settings.
+        context: K, past steps that the planner sees.
+        executed: Actions to execute before replanning; None for the whole plan, as in the paper.
+        rules: Weight of the level's own rules in the energy while planning; 0 leaves them out.
+        checkpoint: Folder of an earlier run to evaluate instead of training. Its settings become
+            the defaults, except those of `--executed` and `--rules`.
+        play: Level to play instead of the one that the planner of a checkpoint was trained on.
+        pretrained: Evaluate the planner that comes with the library for the level, instead of
+            training.
+        record: Append the row to results/, which is committed, and skip what is recorded already.
+        force: With `--record`: run again what is recorded, and replace its row.
+        runs: Folder for checkpoints, metrics, plots and unrecorded rows.
+        pictures: Draw the plots and the animation.
+        loggers: Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says
+            otherwise).
+        checkpoint_seconds: Seconds between checkpoints, which a killed run can lose at most (a run
+            of several processes: and up to 20 steps more).
+    """
 
     method_settings: Annotated[M, tyro.conf.arg(name="")]
     domain_settings: Annotated[D, tyro.conf.arg(name="")]
     planner: Annotated[P, tyro.conf.arg(name="")]
     domain: Annotated[str, tyro.conf.Suppress]
     level: str
-    """A level of the domain by its name or id, or "all" for those of the paper. --game means the
-    same to experiments.atari, and --env to experiments.gymnasium."""
-    method: str = "leap"
-    """How to learn and to act: a line of the table in leapjax/methods.py, or "all" of them."""
+    method: Annotated[str, tyro.conf.arg(metavar="STR [STR ...]")] = "leap"
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's. Sets the defaults of all the rest."""
     seeds: tuple[int, ...] = (0,)
-    """Training seeds; each draws its own demonstrations."""
     demos: int = 500
-    """Demonstrations to train on; of a data set that is given, all that it has if it has fewer."""
     demonstrations: str | None = None
-    """Id of a Minari data set to train on instead of those that the domain makes; --level follows
-    from it where it says of what it is."""
     episodes: int = 200
-    """Held-out episodes to measure success on."""
     test_seed: int = UNSEEN
-    """Level seed of the first of them."""
     validation: bool = False
-    """Measure on validation levels instead: for choosing settings."""
     context: int = 0
-    """K, past steps that the planner sees."""
     executed: int | None = None
-    """Actions to execute before replanning; None: the whole plan, as in the paper."""
     rules: float = 0.0
-    """Weight of the domain's rules, which are added to what was learned while planning."""
     checkpoint: Path | None = None
-    """Folder of an earlier run to evaluate instead of training; brings its settings along, but
-    --executed and --rules."""
     play: str | None = None
-    """Another level to play with a checkpoint than the one that it was trained on."""
     pretrained: bool = False
-    """Evaluate the planner that comes with the library for each level; trains nothing."""
     record: bool = False
-    """Append the row to results/, which is committed, and skip what is recorded already."""
     force: bool = False
-    """With --record: run again what is recorded, and replace its row."""
     runs: Path = Path("runs")
-    """Where checkpoints, metrics, plots and unrecorded rows go."""
     pictures: bool = True
-    """Draw the plots and the animation."""
     loggers: tuple[str, ...] = ()
-    """Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says more)."""
     checkpoint_seconds: float = 30.0
-    """Save the training state this often: what a killed run can lose at most (of several
-    processes: and up to 20 steps more)."""
     model: Annotated[ModelConfig, tyro.conf.arg(name="")] = ModelConfig()
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = TrainingConfig()
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
+
+    @classmethod
+    def flag(cls, field: str) -> str:
+        """What the command line calls a field, such as "--level"."""
+        hint = typing.get_type_hints(cls, include_extras=True)[field]
+        names = [getattr(each, "name", None) for each in getattr(hint, "__metadata__", ())]
+        return f"--{next(filter(None, names), field)}"
 
 
 AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
@@ -108,7 +123,7 @@ _NOT_HASHED = (
 )  # fmt: skip
 
 
-def blank(domain: str, level: str, method: str) -> AnyConfig:
+def blank(domain: str, level: str, method: str, kind: type[AnyConfig] = Config) -> AnyConfig:
     """The defaults of every option, before any preset.
 
     Raises:
@@ -116,27 +131,19 @@ def blank(domain: str, level: str, method: str) -> AnyConfig:
     """
     chosen = find_method(method)
     settings = chosen.settings(), find_domain(domain).settings(), chosen.planner()
-    return Config(*settings, domain, level, method)
+    return kind(*settings, domain, level, method)
 
 
-def preset(domain: str, level: str, method: str, name: str) -> AnyConfig:
+def preset(
+    domain: str, level: str, method: str, name: str, kind: type[AnyConfig] = Config
+) -> AnyConfig:
     """The defaults of a preset: the level's, then the method's, then the level's for the method.
 
     Raises:
         UserError: an unknown domain, level, method or preset.
     """
-    config = dataclasses.replace(blank(domain, level, method), preset=name)
-    kind, presets = find_domain(domain), find_method(method).presets
-    if name not in presets:
-        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(presets)}")
-    options = {**kind.preset(level, name), **presets[name], **kind.tuned(level, method, name)}
-    # A level says how Gibbs sampling searches; other planners know less.
-    others = _names(GibbsConfig()) - _names(config.planner)
-    return with_options(config, {k: v for k, v in options.items() if k not in others})
-
-
-def _names(settings: Any) -> set[str]:
-    return {field.name for field in dataclasses.fields(settings)}
+    config = dataclasses.replace(blank(domain, level, method, kind), preset=name)
+    return with_options(config, preset_options(domain, level, method, name))
 
 
 def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
@@ -144,27 +151,41 @@ def with_options(config: AnyConfig, options: Mapping[str, Any]) -> AnyConfig:
     changed: dict[str, Any] = {}
     for group in GROUPS:
         part = getattr(config, group)
-        names = _names(part)
+        names = names_of(type(part))
         mine = {name: value for name, value in options.items() if name in names}
         changed[group] = dataclasses.replace(part, **mine)
         options = {name: value for name, value in options.items() if name not in names}
     return dataclasses.replace(config, **changed, **options)
 
 
-def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
+def parse(
+    domain: str,
+    arguments: Sequence[str],
+    kind: type[AnyConfig] = Config,
+    module: str = "experiments",
+) -> list[AnyConfig]:
     """One configuration per level and method from a command line; exits with 2 if it is bad.
+
+    Args:
+        domain: by name.
+        arguments: of the command line.
+        kind: `Config`, or a subclass with the program's own names of options.
+        module: of the program, for usage lines.
 
     Raises:
         UserError: an unknown level, method or preset, or options that cannot be.
     """
     program.check_values(arguments)
     # These come first: they decide the defaults of all the rest, and of --help.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
-        first.add_argument(name)
-    first.add_argument("--demos")
+    command = startup.command(module)
+    several = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
+    several.add_argument("--method", nargs="*")
+    named, others = several.parse_known_args(list(arguments))
+    first = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
+    for field in ("level", "preset", "checkpoint", "demonstrations", "demos"):
+        first.add_argument(kind.flag(field), dest=field)
     first.add_argument("--pretrained", action="store_true")
-    chosen, _ = first.parse_known_args(list(arguments))
+    chosen, _ = first.parse_known_args(others)
     folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
     if folder is not None and chosen.pretrained:
         raise UserError("--checkpoint and --pretrained: give one of them")
@@ -174,30 +195,50 @@ def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
     level = chosen.level or (trained.level if trained else data.level or levels[0])
     if not chosen.level:
         check_imported(level, str(folder or chosen.demonstrations))
-    if chosen.method == "all" and (folder is not None or chosen.pretrained):
-        raise UserError("--method all: a planner that is trained already is of one method")
+    methods = None if named.method is None else find_methods(named.method)
+    if methods and len(methods) > 1 and (folder is not None or chosen.pretrained):
+        raise UserError(
+            f"--method {' '.join(named.method)}: a planner that is trained already is of one method"
+        )
     configs = []
     for each in levels if level == "all" else [level]:
         if chosen.pretrained:
             folder = pretrained.published(each)
             trained = pretrained.read_specification(folder)
-        method = chosen.method or (trained.method if trained else Config.method)
         name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        every = [other for other in METHODS if METHODS[other].everywhere]
-        for one in every if method == "all" else [method]:
-            default = preset(domain, each, one, name)
+        for method in methods or [trained.method if trained else Config.method]:
+            default = preset(domain, each, method, name, kind)
             if data.episodes is not None and chosen.demos is None:  # as many as there are
                 default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
-            if trained and (trained.domain, trained.method) == (domain, one):
+            if trained and (trained.domain, trained.method) == (domain, method):
                 default = _as_trained(default, trained)
-            given = _parse(arguments, default)
-            if method == "all" and not default.training.steps:
+            given = _parse(["--method", method, *others], default, module)
+            if methods and len(methods) > 1 and not default.training.steps:
                 # --steps is for those that learn.
                 given = with_options(given, {"steps": 0})
-            config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
+            config = dataclasses.replace(given, level=each, method=method, checkpoint=folder)
             check(config)
             configs.append(config)
     return configs
+
+
+def find_methods(names: Sequence[str]) -> list[str]:
+    """The methods that a command line names, each once.
+
+    Args:
+        names: of methods; "all" stands for those that fit every domain.
+
+    Raises:
+        UserError: an unknown method, or none.
+    """
+    every = [name for name in METHODS if METHODS[name].everywhere]
+    if not names:
+        raise UserError(f"--method needs a name: some of {', '.join(METHODS)}, or all")
+    for name in names:
+        if name != "all":
+            find_method(name)
+    found = [each for name in names for each in (every if name == "all" else [name])]
+    return list(dict.fromkeys(found))
 
 
 def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
@@ -212,14 +253,13 @@ def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
     )
 
 
-def _parse(arguments: Sequence[str], default: AnyConfig) -> AnyConfig:
+def _parse(arguments: Sequence[str], default: AnyConfig, module: str) -> AnyConfig:
     # Which options there are depends on the method and the domain.
     groups = ("method_settings", "domain_settings", "planner")
     settings = tuple(type(getattr(default, group)) for group in groups)
-    generic: Any = Config
-    kind = generic[settings]
+    generic: Any = type(default)
     try:
-        return tyro.cli(kind, args=list(arguments), default=default)
+        return program.parse(generic[settings], module, arguments, default=default)
     except ValueError as error:  # the dataclasses refuse values that cannot be
         raise UserError(str(error)) from None
 
@@ -254,13 +294,13 @@ def check(config: AnyConfig) -> None:
     # `module:id` is an environment that a module registers; data know it by its id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
-            f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "
-            f"use --level {recorded}"
+            f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
+            f"{config.level}: use {config.flag('level')} {recorded}"
         )
     domain = make_domain(config)
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.collect is None and domain.source is None:
-        raise UserError(storage.no_demonstrator(domain))
+        raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     limit = domain.shortest_limit
@@ -429,10 +469,10 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
     train and to play a checkpoint again are two things.
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
-    defaults = resolved(blank(**names), seed=-1)
+    defaults = resolved(blank(config.domain, config.level, config.method), seed=-1)
     values = resolved(config, seed)
     values["training"] = pretrained.without_unnamed(values["training"])
-    settings = checkpoints.differences(values, defaults)
+    settings = configurations.differences(values, defaults)
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

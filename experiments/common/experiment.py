@@ -14,6 +14,7 @@ from rich.console import Console
 from experiments.common import program, results, run, runtime
 from experiments.common.config import (
     AnyConfig,
+    Config,
     configuration_hash,
     episode_seeds,
     make_domain,
@@ -41,13 +42,19 @@ class Experiment(NamedTuple):
     animate: Callable[[Pretrained, Run, Sequence[int], Path], None] | None = None
     # (planner, run, level seeds, path): draws plans being refined and executed
     iterations: bool = True  # draw success against the number of iterations
+    config: type[AnyConfig] = Config  # or a subclass: what its users call the options
+
+    @property
+    def module(self) -> str:
+        """The module of its program."""
+        return f"experiments.{self.name}"
 
 
 def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
     arguments = program.arguments_of(arguments)
     return program.stoppable(
-        f"experiments.{experiment.name}",
+        experiment.module,
         arguments,
         lambda interruption: run_all(experiment, arguments, interruption),
     )
@@ -55,7 +62,7 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
 
 def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
     """Every level and seed of a command line; the failure of one comes after all others."""
-    configs = parse(experiment.domain, arguments)
+    configs = parse(experiment.domain, arguments, experiment.config, experiment.module)
     runtime.start(configs[0].cluster)
     versions = results.versions()  # of the code that runs, whatever is committed meanwhile
     console = Console(quiet=not processes.is_first(), markup=False)
@@ -175,7 +182,7 @@ def run_one(
         this.log(
             config.training.steps,
             {
-                "evaluation/success": row["successes"] / row["episodes"],
+                "evaluation/success": row["success"],
                 "evaluation/return": row["mean_return"],
                 "evaluation/length": row["mean_length"],
             },
@@ -258,6 +265,7 @@ def make_row(
         "first_episode_seed": int(episodes.seeds[0]),
         "validation": config.validation,
         "successes": int(episodes.successes.sum()),
+        "success": float(episodes.successes.mean()),
         "mean_return": float(episodes.returns.mean()),
         "return_error": scores.standard_error(episodes.returns),
         "mean_length": float(lengths.mean()),

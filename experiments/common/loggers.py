@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from leapjax.errors import UserError
+from leapjax.extras import missing_explained
 
 Log = Callable[[int, Mapping[str, float]], None]  # (training step, values by name)
 
@@ -80,13 +81,9 @@ def check(names: Sequence[str]) -> None:
 
 
 def _installed(name: str) -> ModuleType:
-    """The module that a logger needs; the extra that brings it has the logger's name."""
-    try:
+    """The module that a logger needs."""
+    with missing_explained():
         return importlib.import_module(_MODULES[name])
-    except ImportError:
-        raise UserError(
-            f"--loggers {name} needs {_MODULES[name]}: pip install 'leapjax[{name}]'"
-        ) from None
 
 
 @contextlib.contextmanager

@@ -29,10 +29,11 @@ from experiments.common.progress import Meter
 from leapjax import files, pretrained, processes, rollouts, sharding, training
 from leapjax.agents import learning
 from leapjax.batching import CompiledPlanner, compile_planner
-from leapjax.checkpoints import Checkpoints, read_json
+from leapjax.checkpoints import Checkpoints
+from leapjax.configurations import read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
-from leapjax.domain import Domain, Source, apply_statistics, blank_context
+from leapjax.domain import Domain, Source, apply_statistics
 from leapjax.energy import compose
 from leapjax.environments import judge_episode
 from leapjax.errors import UserError, first_line
@@ -124,8 +125,8 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
 
     def warm_planner() -> None:
         params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), state.params)
-        blank = Pretrained(run.specification, agent.energy, params, plan)
-        warm_up(blank, domain, config.episodes, config.executed)
+        blank = Pretrained(run.specification, agent.energy, params, plan, domain)
+        blank.compile(config.episodes, config.executed)
 
     pool = concurrent.futures.ThreadPoolExecutor(2)
     compiled = pool.submit(training_programs)
@@ -282,7 +283,7 @@ def fit(
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
     # Planning is each process's own business, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
-    return Pretrained(run.specification, agent.energy, params, plan), metrics
+    return Pretrained(run.specification, agent.energy, params, plan, run.domain), metrics
 
 
 def training_mesh(config: AnyConfig) -> Mesh:
@@ -423,7 +424,7 @@ def with_rules(planner: Pretrained, run: Run) -> Pretrained:
         return planner
     energy = compose([planner.energy, rules], [1.0, weight])
     plan = compile_planner(energy, run.config.planner, chunk_sizes(run.config))
-    return Pretrained(planner.specification, energy, (planner.params, ()), plan)
+    return dataclasses.replace(planner, energy=energy, params=(planner.params, ()), plan=plan)
 
 
 def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
@@ -434,7 +435,7 @@ def measure(planner: Pretrained, run: Run, episode_seeds: range) -> Episodes:
     bounds = [len(episode_seeds) * n // count for n in range(count + 1)]
     mine = episode_seeds[bounds[index] : bounds[index + 1]]
     begun = time.perf_counter()
-    warm_up(planner, run.domain, len(mine), run.config.executed)
+    planner.compile(len(mine), run.config.executed)
     run.seconds["compile"] += time.perf_counter() - begun
     with Meter(run.console, "evaluation", len(mine)) as meter:
 
@@ -463,24 +464,6 @@ def player(planner: Pretrained, run: Run) -> Callable[..., Episodes]:
         )  # fmt: skip
 
     return play
-
-
-def warm_up(planner: Pretrained, domain: Domain, batch: int, executed: int | None) -> None:
-    """Compiles every chunk size that a batch of that many and fewer plans can need.
-
-    Args:
-        planner: that will plan.
-        domain: of its contexts.
-        batch: episodes that are played together, at most.
-        executed: actions of each plan; None for all.
-    """
-    context = blank_context(domain, planner.specification.context)
-    for size in planner.plan.sizes_up_to(batch):
-        contexts = jax.tree.map(lambda x, n=size: np.stack([x] * n), context)
-        keys = jax.random.split(jax.random.key(0), size)
-        encoded = rollouts.kept(planner(keys, contexts), executed)
-        if encoded is not None:  # as it is after the first plan
-            planner(keys, contexts._replace(encoded=encoded))
 
 
 def draw(planner: Pretrained, run: Run, episode_seeds: range | None, metrics: Metrics) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from leapjax.data.seeds import MAX_TRAINING_SEED
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
+from leapjax.extras import missing_explained
 from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
@@ -30,15 +30,26 @@ TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Atari: data, games and augmentation."""
+    """Atari: data, games and augmentation.
 
-    transitions: int = 50_000  # to learn from, by whole trajectories
-    replay_run: int = 1  # of the runs that DQN-Replay has of each game
-    sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
-    max_steps: int = MAX_STEPS  # of a game: then it is cut off
-    features: int = 32  # of the first convolution; the others have twice as many
-    mirror: bool = False  # show every other window in a mirror, to learn from more
-    shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
+    Attributes:
+        transitions: Transitions to learn from; whole games are sampled until there are so many.
+        replay_run: Number of the DQN-Replay run to learn from; the published data have five of each
+            game.
+        sticky: Probability that the game repeats the last action in place of the new one.
+        max_steps: Decisions after which a game is cut off.
+        features: Features of the first convolution; the others have twice as many.
+        mirror: Mirror every other training window, left and right exchanged.
+        shift: Pixels by which all frames of a training window may be shifted at random, at most.
+    """
+
+    transitions: int = 50_000
+    replay_run: int = 1
+    sticky: float = 0.0
+    max_steps: int = MAX_STEPS
+    features: int = 32
+    mirror: bool = False
+    shift: int = 0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -57,8 +68,8 @@ def make(name: str, settings: Settings) -> Domain:
         UserError: there is none, or ale-py is not installed.
     """
     game = find_game(name)
-    if importlib.util.find_spec("ale_py") is None:
-        raise UserError("Atari needs ale-py, which is missing: pip install 'leapjax[atari]'")
+    with missing_explained("atari"):
+        import ale_py  # noqa: F401, PLC0415  (to say so now if it is missing)
 
     def make_adapter() -> Adapter:
         from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
