@@ -611,8 +611,6 @@ def test_a_disk_that_fills_while_a_checkpoint_is_written(workplace, capfd, caplo
     np.testing.assert_array_equal(found["w"], 1.0)
 
 
-
-
 # The bot.
 
 
