@@ -686,7 +686,7 @@ def test_a_context_changes_its_own_plan_only(config):
     assert (after.actions[4] != before.actions[4]).any()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.integers(1, 500), st.sets(st.integers(1, 70), min_size=1, max_size=4))
 def test_chunks_cover_every_row_exactly_once(batch, sizes):
     sizes = sorted(sizes)
