@@ -6,7 +6,7 @@ from importlib import import_module
 
 from leapjax.running import startup
 
-if startup.is_program():
+if __name__ == "__main__" or startup.is_program():
     startup.prepare()
 
 USAGE = """usage: leapjax DOMAIN [OPTIONS]

@@ -40,7 +40,7 @@ from leapjax.running.metrics import read_metrics
 from leapjax.types import TrainState
 from tests import extreme_options
 from tests.programs import LONG, ROOT, only_long
-from tests.test_storage import LEVEL, NAME, SIDE, assert_same
+from tests.test_storage import LEVEL, NAME, SIDE
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
 MEBIBYTES = 512
@@ -169,13 +169,13 @@ def data_set(local_demonstrations, tmp_path_factory):
 
 
 def read_data_set(whole, change):
-    """What comes of a changed copy of the data set."""
+    """The demonstrations of a changed copy of the data set."""
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         copied = Path(folder) / "datasets"
         shutil.copytree(whole, copied)
         change(copied / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(copied))
-        return outcome(lambda: storage.load(NAME, LEVEL).demonstrations)
+        return storage.load(NAME, LEVEL).demonstrations
 
 
 @cases
@@ -185,7 +185,7 @@ def test_damaged_arrays(data_set, seed):
         path = folder / "main_data.hdf5"
         path.write_bytes(damaged(path.read_bytes(), np.random.default_rng(seed)))
 
-    loaded = read_data_set(data_set, change)
+    loaded = outcome(lambda: read_data_set(data_set, change))
     for demonstration in loaded or []:
         # HDF5 keeps no checksums: what is loaded need not be what was saved, but it is sound.
         grid, actions = demonstration.observations.grid, demonstration.actions
@@ -205,7 +205,7 @@ def test_damaged_metadata(data_set, data):
                 original[name] = text.decode(errors="replace")
         path.write_bytes(data.draw(changed_json(original)))
 
-    read_data_set(data_set, change)
+    outcome(lambda: read_data_set(data_set, change))
 
 
 def test_data_cannot_have_code_run(data_set, tmp_path):
@@ -224,26 +224,8 @@ def test_data_cannot_have_code_run(data_set, tmp_path):
         path.write_text(json.dumps(values))
 
     with pytest.raises(UserError, match="metadata.json has no action_space"):
-        change_and_load(data_set, change)
+        read_data_set(data_set, change)
     assert not trap.exists()
-
-
-def change_and_load(whole, change):
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        shutil.copytree(whole, Path(folder) / "datasets")
-        change(Path(folder) / "datasets" / NAME / "data")
-        patch.setenv("MINARI_DATASETS_PATH", str(Path(folder) / "datasets"))
-        return storage.load(NAME, LEVEL).demonstrations
-
-
-def replace_actions(replace):
-    def change(folder):
-        with h5py.File(folder / "main_data.hdf5", "r+") as file:
-            group = file["episode_0"]
-            del group["actions"]
-            replace(group)
-
-    return change
 
 
 @pytest.mark.parametrize(
@@ -257,25 +239,16 @@ def replace_actions(replace):
             lambda g: g.create_dataset("actions", (9,), "i8", external=[("/etc/passwd", 0, 72)]),
             "not an array of this file",
         ),
-        (lambda g: g.__setitem__("actions", g), "actions is an object that has another name too"),
     ],
 )  # fmt: skip
 def test_arrays_that_are_not_there(data_set, replace, says):
-    with bounded(), pytest.raises(UserError, match=says):
-        change_and_load(data_set, replace_actions(replace))
-
-
-def test_episodes_that_are_not_there(data_set):
     def change(folder):
-        path = folder / "metadata.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "total_episodes": 10**12}))
+        with h5py.File(folder / "main_data.hdf5", "r+") as file:
+            del file["episode_0/actions"]
+            replace(file["episode_0"])
 
-    with bounded(), pytest.raises(UserError, match="1000000000000 episodes are announced"):
-        change_and_load(data_set, change)
-
-
-def test_the_data_set_as_it_was(data_set, local_demonstrations):
-    assert_same(change_and_load(data_set, lambda folder: None), local_demonstrations)
+    with bounded(), pytest.raises(UserError, match=says):
+        read_data_set(data_set, change)
 
 
 # Rows, the training curve, what a checkpoint says of itself.

@@ -1,7 +1,6 @@
 """Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,7 @@ import pytest
 from experiments import babyai
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
-from leapjax.files import only_process_in, write_text
+from leapjax.files import only_process_in
 from leapjax.running import jax_setup, results, startup
 from leapjax.running import train as running_train
 from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
@@ -236,25 +235,26 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp
     saved.close()
 
 
-def test_a_path_that_goes_up_is_the_folder_that_it_leads_to(tmp_path):
-    (tmp_path / "below").mkdir()
-    roundabout = tmp_path / "below" / ".." / "checkpoints"
-    saved = Checkpoints(roundabout)
-    saved.save(state(1))
-    saved.close()
-    assert int(Checkpoints(roundabout).restore(state(0)).step) == 1
-    like = jax.eval_shape(lambda: state(0)).params
-    np.testing.assert_array_equal(restore_params(roundabout, like)["w"], 1.0)
-
-
 def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
-    saved = Checkpoints(tmp_path / "checkpoints")
+    (tmp_path / "below").mkdir()
+    saved = Checkpoints(tmp_path / "below" / ".." / "checkpoints")  # which leads to the same
     saved.save(state(1))
     saved.close()
+    like = jax.eval_shape(lambda: state(0)).params
+    found = restore_params(tmp_path / "below" / ".." / "checkpoints", like)
+    np.testing.assert_array_equal(found["w"], 1.0)
     other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
     with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
         Checkpoints(tmp_path / "checkpoints").restore(other)
     assert (tmp_path / "checkpoints" / "1").is_dir()
+
+
+def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
+    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
+    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+        pass
+    with only_process_in(tmp_path / "run"):
+        pass
 
 
 def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
@@ -300,21 +300,3 @@ with files.only_process_in(folder / "run"):  # which takes no room
     assert (tmp_path / "row.json").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1
-
-
-def test_a_lock_is_let_go_of(tmp_path):
-    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
-        pass
-    with only_process_in(tmp_path / "run"):
-        pass
-
-
-def test_text_is_replaced_whole(tmp_path):
-    write_text(tmp_path / "new" / "file.json", json.dumps([1]))
-    write_text(tmp_path / "new" / "file.json", json.dumps([2]))
-    assert json.loads((tmp_path / "new" / "file.json").read_text()) == [2]
-    assert [p.name for p in (tmp_path / "new").iterdir()] == ["file.json"]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot write"):
-        write_text(tmp_path / "file" / "below.json", "")

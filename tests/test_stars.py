@@ -211,17 +211,6 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.check(states._replace(goal=np.full(5, 50)), "here")
 
 
-@pytest.mark.parametrize("star", [STAR, Star(5, 10)])
-def test_nodes_are_drawn_apart_and_in_the_picture(star):
-    graph, _ = graphs.draw(star, 0)
-    places = np.array(list(star_animation.layout(star, graph).values()))
-    assert len(places) == star.nodes
-    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(star.nodes)
-    assert apart.min() > 2 * star_animation.RADIUS
-    assert (places > star_animation.RADIUS).all()
-    assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
-
-
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
     """And plans that are shorter or longer than the way are, too."""
@@ -267,7 +256,6 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     assert stars.main([*again, "Star5x2"]) == 0
     (*_, row) = results.read(tmp_path / "runs" / "stars.jsonl")
     assert (row["level"], row["played"]) == ("Star2x2", "Star5x2")
-    assert results.planner_name(row) == "N = 2, confident, on Star5x2"
     rows.append(row)
     for other, message in (
         ("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
@@ -276,8 +264,6 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     ):
         assert stars.main([*again, other]) == 2
         assert message in capsys.readouterr().err
-    assert stars.main([*arguments, "--play", "Star5x2"]) == 2
-    assert "with a --checkpoint, and there is none" in capsys.readouterr().err
     # One action at a time: one row, and nothing to animate.
     assert stars.main([*arguments, "--method", "bc", "--steps", "0", "--no-pictures"]) == 0
     assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1

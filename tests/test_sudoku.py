@@ -107,7 +107,7 @@ def transformed(size):
 
 
 @SIZES
-@pytest.mark.parametrize("cell", [0, 1, 7])
+@pytest.mark.parametrize("cell", [0, 7])
 def test_a_transformed_window_is_that_of_another_board(size, cell):
     draw, seen = transformed(size), set()
     for seed, episode in itertools.product(range(4), range(2)):
@@ -261,8 +261,6 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     [
         ("Sudoku9", "unknown level 'Sudoku9': expected Sudoku<4 or 9>x<clues>, such as Sudoku4x6"),
         ("sudoku9x36", "did you mean Sudoku9x36"),
-        ("Sudoku6x10", "unknown level"),
-        ("Sudoku9x17", r"clues must be in 26 \.\. 81, got 17"),
         ("Sudoku4x17", r"clues must be in 4 \.\. 16"),
     ],
 )
