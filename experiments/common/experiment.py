@@ -174,9 +174,8 @@ def run_one(
         )
 
         def write() -> None:
-            beside = results.episodes_path(rows, name) if config.record else folder / "episodes.csv"
-            results.write_episodes(beside, episodes)
-            results.record(rows, row)
+            results.write_csv(folder / "episodes.csv", episodes)
+            results.record(rows, row, episodes)
             if config.pictures:
                 run.draw(planner, this, played if experiment.iterations else None, metrics)
                 if experiment.animate is not None:
