@@ -34,7 +34,7 @@ from leapjax.planners import (
 )
 from leapjax.pure import PureEnvironment, compile_rollout
 from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import interval_over_seeds, wilson_interval
+from leapjax.scores import interval_of_episodes, interval_over_seeds, wilson_interval
 from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ __all__ = [
     "evaluate",
     "from_total",
     "gibbs",
+    "interval_of_episodes",
     "interval_over_seeds",
     "load",
     "neutral",

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.results import Row
-from experiments.tables.cells import mean_length, mean_rate, rate, table, with_interval
+from experiments.tables.cells import mean_length, mean_rate, outcomes, rate, table, with_interval
 from experiments.tables.settings import Setting, of_setting
 from leapjax import scores
 from leapjax.domains.babyai.levels import LEVELS, paper_success
@@ -98,8 +98,7 @@ def middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] 
     ]
     if not all(levels):
         return None
-    counts = [([r["successes"] for r in of], [r["episodes"] for r in of]) for of in levels]
-    mean, (low, high) = scores.aggregate(counts)
+    mean, (low, high) = scores.aggregate([outcomes(of) for of in levels])
     return 100 * mean, 100 * low, 100 * high
 
 

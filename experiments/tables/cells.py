@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from experiments.common.results import Row
 from leapjax import scores
 
@@ -10,13 +12,23 @@ def rate(rows: Sequence[Row]) -> str:
     """Mean success of some rows, one for each seed, with its interval and how many there are."""
     if not rows:
         return "-"
-    successes = [row["successes"] for row in rows]
-    episodes = [row["episodes"] for row in rows]
-    low, high = scores.interval_over_seeds(successes, episodes)
+    _, (low, high) = scores.aggregate([outcomes(rows)])
     said = with_interval(mean_rate(rows), 100 * low, 100 * high)
     if rows[0]["method"] == "rules":  # nothing was trained
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
+
+
+def outcomes(rows: Sequence[Row]) -> scores.Outcomes:
+    """Returns the outcomes of some rows, one for each seed: of every episode if all are recorded.
+
+    They must be of the same levels, too; otherwise only the counts are used.
+    """
+    recorded = [row["recorded"] for row in rows if row.get("recorded") is not None]
+    levels = {each["seed"].tobytes() for each in recorded}
+    if len(recorded) == len(rows) and len(levels) == 1:
+        return np.stack([each["success"] for each in recorded])
+    return [row["successes"] for row in rows], [row["episodes"] for row in rows]
 
 
 def with_interval(mean: float, low: float, high: float) -> str:
