@@ -1,11 +1,13 @@
 """What tables are made of: rates with their intervals, means, Markdown."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from experiments.common.results import Row
 from leapjax import scores
+
+Columns = Mapping[str, str | Callable[[Row], str]]
 
 
 def rate(rows: Sequence[Row]) -> str:
@@ -66,6 +68,20 @@ def minutes(rows: Sequence[Row]) -> str:
     seconds = sum(row[kind] for row in rows for kind in kinds)
     gpu = any("NVIDIA" in row["versions"]["machine"] for row in rows)
     return f"{seconds / len(rows) / 60:.1f}{'*' if gpu else ''}"
+
+
+def listed(rows: Sequence[Row], columns: Columns) -> str:
+    """A table in Markdown with a line for each row.
+
+    Args:
+        rows: in order.
+        columns: by title, a cell: a format of the row's fields, or a function of the row.
+    """
+    lines = [
+        [cell.format(**row) if isinstance(cell, str) else cell(row) for cell in columns.values()]
+        for row in rows
+    ]
+    return table(" | ".join(columns), lines)
 
 
 def table(header: str, lines: Sequence[Sequence[str]]) -> str:
