@@ -11,54 +11,60 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, memory, program, results
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.progress import Meter
 from leapjax.domains.atari.domain import FOLDER, LONGEST, Settings, make
 from leapjax.domains.atari.games import find_game
 from leapjax.errors import UserError
 from leapjax.presets import atari as presets
+from leapjax.running import main as running
+from leapjax.running import memory, results, shell
+from leapjax.running.limits import check_counts
+from leapjax.running.progress import Meter
+from leapjax.running.run import Experiment
+from leapjax.running.spelling import AtariConfig
 
 RECORDED = Path("results/atari-data.json")
-EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
 SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
-NAMES = {"--game": "--level"}  # what its users call the options of every experiment
+
+
+EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=AtariConfig)
 
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Play games with built-in demonstrators; writes what DQN-Replay's files hold."""
+    """Play games with built-in demonstrators; writes what DQN-Replay's files hold.
+
+    Attributes:
+        game: Game: Breakout, Qbert, Pong or Seaquest.
+        transitions: Transitions to make at least, in whole games; None for as many as preset
+            leapjax learns from.
+        folder: Folder for the data; if games were begun there, they are continued.
+        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
+            own.
+        longest: Decisions after which a game is cut off, because a ball can fly on for ever.
+        workers: Processes; None for one on each core.
+        record: Write the scores of the demonstrators to results/, which is committed.
+    """
 
     game: str
-    """Breakout, Qbert, Pong or Seaquest."""
     transitions: int | None = None
-    """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
-    """Where to; a game that was begun there goes on."""
     replay_run: int = 1
-    """Number of the run, as DQN-Replay has five of each game: each has games of its own."""
     longest: int = LONGEST
-    """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
-    """Processes; None: one on each core."""
     record: bool = False
-    """Write what demonstrators have reached to results/, which is committed, beside data of
-    another size."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
-    given = program.arguments_of(arguments)
+    given = shell.arguments_of(arguments)
     if given[:1] == ["collect"]:
-        options = tyro.cli(Collect, prog="experiments.atari collect", args=given[1:])
-        return program.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
-    return experiment.main(EXPERIMENT, program.renamed(given, NAMES))
+        options = shell.parse(Collect, "experiments.atari collect", given[1:])
+        return shell.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+    return running.main(EXPERIMENT, given)
 
 
 def run(options: Collect) -> None:

@@ -8,9 +8,9 @@ from PIL import Image, ImageDraw
 
 from experiments.common.episodes import watched
 from experiments.common.pictures import Frame, save_animation
-from experiments.common.run import Run
 from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
+from leapjax.running.run import Run
 from leapjax.types import Plan
 
 SIDE, MARGIN, LINE = 252, 150, 18  # pixels: of the game, of the plan beside it, of one action

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from minigrid.core.world_object import WorldObj
 
-from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way, alone, drawn_at
+from experiments.common import cases
+from experiments.common.cases import Analysis, Case, Model, Way, alone, drawn_at
 from leapjax.configuration import AnyConfig, change
 from leapjax.domains.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.domains.babyai.constraints import (
@@ -422,7 +422,7 @@ ANALYSIS = Analysis("properties", CASES)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Every case asked for; the exit code."""
-    return analysis.main(ANALYSIS, arguments)
+    return cases.main(ANALYSIS, arguments)
 
 
 if __name__ == "__main__":

@@ -23,16 +23,21 @@ LAST_PORT = 2**16 - 1
 
 @dataclasses.dataclass(frozen=True)
 class Cluster:
-    """The processes and devices that share a run."""
+    """The processes and devices that share a run.
+
+    Attributes:
+        coordinator: Address host:port of process 0, for several processes; SLURM and Open MPI give
+            it themselves.
+        num_processes: Number of processes, with a coordinator.
+        process_id: Which of the processes this is, from 0, with a coordinator.
+        fsdp: Devices that share one copy of the parameters and the optimizer; 1 keeps a whole copy
+            on each.
+    """
 
     coordinator: str | None = None
-    """host:port of process 0, for several processes; SLURM and Open MPI say it themselves."""
     num_processes: int | None = None
-    """With a coordinator: how many processes there are."""
     process_id: int | None = None
-    """With a coordinator: which of them this is, from 0."""
     fsdp: int = 1
-    """Split parameters and optimizer over groups of so many devices; 1: whole on each."""
 
     def __post_init__(self) -> None:
         given = [self.coordinator, self.num_processes, self.process_id]

@@ -113,16 +113,17 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 def aggregate(tasks: Sequence[Outcomes], level: float = 0.95) -> tuple[float, tuple[float, float]]:
     """Estimates the interquartile mean of success over tasks.
 
-    The bootstrap is stratified by task (Agarwal et al., 2021): within each, seeds and levels are
-    drawn as in `interval_of_episodes` or `interval_over_seeds`. A task counts once, however many
-    seeds it has.
+    A quarter of the tasks, rounded down, is left out at each end. The bootstrap is stratified by
+    task (Agarwal et al., 2021, arXiv 2108.13264): within each, seeds and levels are drawn as in
+    `interval_of_episodes` or `interval_over_seeds`. A task counts once, however many seeds it has.
 
     Args:
-        tasks: outcomes of each.
+        tasks: outcomes of each: `[S, L]` bool, or a pair (successes `[S]`, episodes `[S]`); S may
+            differ.
         level: confidence, between 0 and 1.
 
     Returns:
-        The interquartile mean, and the bounds of its confidence interval, as fractions.
+        The mean, and (low, high), as fractions.
 
     Raises:
         ValueError: no tasks; or see `interval_of_episodes` and `interval_over_seeds`.

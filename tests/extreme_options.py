@@ -17,7 +17,7 @@ from experiments import (
     stochastic,
     suboptimal,
 )
-from experiments.common import analysis
+from experiments.common import cases
 from leapjax.configuration import blank
 from leapjax.methods import METHODS
 from leapjax.presets import find_presets
@@ -28,10 +28,10 @@ LEVELS = {
 }  # fmt: skip
 # By name: the program, the options that it has, and what else it is given; RUN: the folder of one.
 PROGRAMS = {
-    "ablation": (ablation.main, analysis.Options, ["--only", "masked-model"]),
-    "properties": (properties.main, analysis.Options, ["--only", "generalization-easy"]),
-    "stochastic": (stochastic.main, analysis.Options, ["--only", "GoToObjMazeS4"]),
-    "suboptimal": (suboptimal.main, analysis.Options, ["--only", "GoToSeqS5R2"]),
+    "ablation": (ablation.main, cases.Options, ["--only", "masked-model"]),
+    "properties": (properties.main, cases.Options, ["--only", "generalization-easy"]),
+    "stochastic": (stochastic.main, cases.Options, ["--only", "GoToObjMazeS4"]),
+    "suboptimal": (suboptimal.main, cases.Options, ["--only", "GoToSeqS5R2"]),
     "accuracy": (accuracy.main, accuracy.Options, ["RUN"]),
     "failures": (failures.main, failures.Options, ["RUN"]),
     "landscape": (landscape.main, landscape.Options, []),

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.common import config, experiment, results
-from experiments.common.experiment import Experiment
 from leapjax import checkpoints, domains, pretrained
 from leapjax.checkpoints import Checkpoints
-from leapjax.configuration import change
+from leapjax.configuration import change, make_domain, specify
 from leapjax.files import only_process_in
 from leapjax.presets import PRESETS
+from leapjax.running import command_line, results
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
 from leapjax.types import TrainState
 from tests import frozen_lake
 from tests.parameters import random_parameters
@@ -49,7 +50,7 @@ def main():
     """An experiment in FrozenLake: `python -m tests.programs`."""
     domains.DOMAINS[LAKE.domain] = frozen_lake.FROZEN_LAKE
     PRESETS[LAKE.domain] = {"leapjax": frozen_lake.preset}
-    return experiment.main(LAKE)
+    return running.main(LAKE)
 
 
 def with_options(config, options):
@@ -67,9 +68,9 @@ def with_options(config, options):
 
 def untrained_run(folder, *options):
     """The folder of a run that has learned nothing: nothing is compiled for it."""
-    (chosen,) = config.parse("babyai", [*TOY, *options])
-    domain = config.make_domain(chosen)
-    specification = config.specify(chosen, chosen.seeds[0], domain)
+    (chosen,) = command_line.parse("babyai", [*TOY, *options])
+    domain = make_domain(chosen)
+    specification = specify(chosen, chosen.seeds[0], domain)
     pretrained.save_specification(folder, specification)
     agent = pretrained.make_agent(specification, domain)
     params = random_parameters(agent, 0.1)

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
-from experiments.common import analysis, results
-from experiments.common.analysis import Analysis, Options, Way
-from experiments.common.run import write_metrics
+from experiments.common import cases
+from experiments.common.cases import Analysis, Options, Way
 from experiments.tables import analyses
 from leapjax import pretrained
 from leapjax.domains.babyai import constraints
 from leapjax.domains.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
+from leapjax.running import results
+from leapjax.running.metrics import write_metrics
 from tests.programs import only_long, with_options
 
 TOY = {  # nothing is learned: gradients take long to compile
@@ -61,13 +62,13 @@ def case_of(name):
 
 def test_a_constraint_is_asked_for_and_counted(place, capsys):
     of = small(case_of("adaptation-medium"), "whole plan")
-    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    assert cases.main(of, [*SHORT, "--record"]) == 0
     (row,) = rows(place, "properties", "results")
     assert (row["case"], row["way"], row["method"]) == ("adaptation-medium", "whole plan", "leap")
     assert row["violations"] == 0  # an untrained model, and no step onto lava all the same
     assert row["planner"]["fill"] == "sequential" and row["paper_success"] == 64.5
     assert 0 <= row["first_pass_successes"] <= row["episodes"] == 2
-    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    assert cases.main(of, [*SHORT, "--record"]) == 0
     assert "recorded already" in capsys.readouterr().out
     assert rows(place, "properties", "results") == [row]
 
@@ -83,7 +84,7 @@ def test_constraints_remember_what_models_do_not_see(place):
     case = case_of("constraints-errand")
     way = case.ways[-1]._replace(minimise=properties.unseen(watched))
     of = small(case._replace(ways=[way]), way.name)
-    assert analysis.main(of._replace(change=one_action), SHORT) == 0
+    assert cases.main(of._replace(change=one_action), SHORT) == 0
     (row,) = rows(place, "properties")
     assert set(lengths) == {64}  # as many as an episode in that room has steps
     assert row["violations"] >= 0
@@ -91,7 +92,7 @@ def test_constraints_remember_what_models_do_not_see(place):
 
 def test_two_models_are_composed(place):
     of = small(case_of("composition-medium"), "dt")
-    assert analysis.main(of._replace(change=one_action), SHORT) == 0
+    assert cases.main(of._replace(change=one_action), SHORT) == 0
     (row,) = rows(place, "properties")
     assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
     assert row["train_seconds"] == 0  # for no step
@@ -103,7 +104,7 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
     """Of its first case; every method of its own."""
     of = program.ANALYSIS
     case = of.cases[0]
-    for method in analysis.methods_of(case):
+    for method in cases.methods_of(case):
         plans = {} if method in ("leap", "classifier") else {"horizon": 1}
         small_one = of._replace(cases=[case], change=functools.partial(toy, **plans))
         monkeypatch.setattr(program, "ANALYSIS", small_one)
@@ -115,36 +116,36 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
 def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):
     """Metrics are written first, and a kill may come before the checkpoint is."""
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
-    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
-    folder = analysis.run_folder(config, 0)
+    (config,) = cases.configurations(of, of.cases[0], "leap", 0, options)
+    folder = cases.run_folder(config, 0)
     folder.mkdir(parents=True)
     write_metrics(folder, [{"step": config.training.steps, "seconds": 1.0, "loss": 1.0}])
-    assert analysis.main(of, SHORT) == 0
+    assert cases.main(of, SHORT) == 0
     assert f"training {folder}" in capsys.readouterr().out.replace("\n", "")
-    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert cases.main(of, ["--episodes", "1"]) == 0
     assert "training" not in capsys.readouterr().out
 
 
 @only_long
 def test_a_damaged_end_of_training_is_learned_again(place, capsys):
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
-    assert analysis.main(of, SHORT) == 0
-    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
-    folder = analysis.run_folder(config, 0) / pretrained.CHECKPOINTS
+    assert cases.main(of, SHORT) == 0
+    (config,) = cases.configurations(of, of.cases[0], "leap", 0, options)
+    folder = cases.run_folder(config, 0) / pretrained.CHECKPOINTS
     for path in (folder / "0").rglob("d/*"):
         path.write_bytes(b"")
     capsys.readouterr()
-    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert cases.main(of, ["--episodes", "1"]) == 0
     assert "training" in capsys.readouterr().out and len(rows(place, "properties")) == 2
     assert (folder / "0").is_dir() and (folder / "0.damaged").is_dir()
 
 
 def test_what_training_took_is_that_of_all_its_parts(tmp_path):
-    assert analysis.training_seconds(tmp_path) == 0
+    assert cases.training_seconds(tmp_path) == 0
     write_metrics(
         tmp_path, [{"step": 1, "seconds": 2.0, "loss": 1}, {"step": 2, "seconds": 5.5, "loss": 1}]
     )
-    assert analysis.training_seconds(tmp_path) == 5.5
+    assert cases.training_seconds(tmp_path) == 5.5
 
 
 def test_every_case_can_be_made():
@@ -154,7 +155,7 @@ def test_every_case_can_be_made():
         names = [case.name for case in of.cases]
         assert len(set(names)) == len(names)
         for preset in ("leapjax", "paper"):
-            wanted = analysis.check(of, Options(preset=preset))
+            wanted = cases.check(of, Options(preset=preset))
             assert [case.name for case in wanted] == names
         for case in of.cases:
             find_level(case.level)
@@ -166,7 +167,7 @@ def test_ways_and_methods_can_be_chosen():
     def chosen(**options):
         return [
             (case.name, [way.name for way in case.ways])
-            for case in analysis.check(properties.ANALYSIS, Options(**options))
+            for case in cases.check(properties.ANALYSIS, Options(**options))
             if case.ways
         ]
 
@@ -184,14 +185,14 @@ def test_rows_are_named_by_all_that_matters():
     of, options = properties.ANALYSIS, Options()
 
     def name(way=case.ways[1], seed=0, options=options, case=case):
-        settings = [analysis.training_config(of, m, way.method, seed, options) for m in case.models]
-        return analysis.row_name(of, case, way, settings, seed, options)
+        settings = [cases.training_config(of, m, way.method, seed, options) for m in case.models]
+        return cases.row_name(of, case, way, settings, seed, options)
 
     others = [
         name(case.ways[0]), name(seed=1), name(options=Options(episodes=100)),
         name(options=Options(preset="paper")), name(options=Options(validation=True)),
         name(case.ways[1]._replace(executed=1)), name(case.ways[1]._replace(search=lambda g: g)),
-        name(case.ways[1]._replace(minimise=analysis.alone)),
+        name(case.ways[1]._replace(minimise=cases.alone)),
         name(case.ways[1]._replace(minimise=properties.unseen(constraints.lava, weight=1.0))),
         name(case.ways[1]._replace(minimise=properties.unseen(constraints.left_turns))),
         name(case.ways[1]._replace(remembers=True)),
@@ -207,7 +208,7 @@ def test_rows_are_named_by_all_that_matters():
 def test_what_a_way_minimises_can_be_told_by_its_name(program):
     for case in program.ANALYSIS.cases:
         for function in (case.adapter, *(way.minimise for way in case.ways)):
-            said = json.dumps(analysis.described(function))
+            said = json.dumps(cases.described(function))
             assert "<" not in said  # a function without a name, or what it is bound to unseen
 
 
@@ -216,7 +217,7 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
 
     def settings(method, preset="leapjax"):
         options = Options(preset=preset)
-        config = analysis.training_config(properties.ANALYSIS, model, method, 0, options)
+        config = cases.training_config(properties.ANALYSIS, model, method, 0, options)
         return config.domain_settings.detours, config.domain_settings.false_starts
 
     assert settings("leap") == (0.5, 0.6)
@@ -248,7 +249,7 @@ def test_what_cannot_be_is_one_line(arguments, message, capsys):
 def test_tables_hold_todays_rows_beside_the_papers_numbers():
     of = ablation.ANALYSIS
     case, way = of.cases[0], of.cases[0].ways[2]
-    settings = [analysis.training_config(of, m, "leap", 0, Options()) for m in case.models]
+    settings = [cases.training_config(of, m, "leap", 0, Options()) for m in case.models]
     row = {
         "experiment": "ablation", "case": case.name, "way": way.name, "method": "leap",
         "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
@@ -256,7 +257,7 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
         "train_seconds": 300.0, "compile_seconds": 20.0, "eval_seconds": 40.0,
         "versions": {"machine": "x86_64"},
-        "hash": analysis.row_name(of, case, way, settings, 0, Options()),
+        "hash": cases.row_name(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
     table = analyses.analysed(of, [row, stale])
@@ -275,8 +276,8 @@ def test_plans_stand_beside_single_actions():
 
     def row(name: str, successes: int, violations: int = 0) -> dict:
         way = next(way for way in case.ways if way.name == name)
-        settings = analysis.configurations(of, case, way.method, 0, Options())
-        named = analysis.row_name(of, case, way, settings, 0, Options())
+        settings = cases.configurations(of, case, way.method, 0, Options())
+        named = cases.row_name(of, case, way, settings, 0, Options())
         return {
             "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "hash": named,
             "episodes": 200, "successes": successes, "violations": violations,

@@ -11,10 +11,7 @@ from PIL import Image
 
 from benchmarks import quality
 from experiments import babyai
-from experiments.common import results, run
-from experiments.common.config import parse
 from leapjax import UserError, files, load, plan_keys, pretrained, rollouts
-from leapjax.agents import leap
 from leapjax.data import seeds, storage
 from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.domains.babyai.domain import BABYAI
@@ -22,6 +19,10 @@ from leapjax.domains.babyai.levels import LEVELS
 from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
+from leapjax.running import results
+from leapjax.running.command_line import parse
+from leapjax.running.data import find_demonstrated
+from leapjax.running.metrics import read_metrics
 from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
@@ -80,7 +81,7 @@ def test_a_run_leaves_a_row_with_every_field(workplace):
 
 def test_a_run_leaves_a_training_curve_and_checkpoints(workplace):
     folder = run_folder(workplace)
-    metrics = run.read_metrics(folder)
+    metrics = read_metrics(folder)
     assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["4"]
     assert not (folder / "plan.gif").exists()  # without --pictures
@@ -121,8 +122,8 @@ def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_pat
     assert "level seed 7 is both a demonstration and a test episode" in capsys.readouterr().err
     for other in ("5", '{"seeds": 5}', '{"fingerprint": "0"}'):  # of an earlier version, or damaged
         (folder / "data.json").write_text(other)
-        assert run.demonstrated(folder) == []
-    assert run.demonstrated(tmp_path / "nowhere") == []
+        assert find_demonstrated(folder) == []
+    assert find_demonstrated(tmp_path / "nowhere") == []
 
 
 def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
@@ -307,7 +308,7 @@ def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_
     assert "checkpoints/4 is damaged" in error and "there is none before it" in error
     (after,) = results.read(runs / "babyai.jsonl")
     assert after["successes"] == before["successes"]
-    assert [m["step"] for m in run.read_metrics(folder)] == [4]
+    assert [m["step"] for m in read_metrics(folder)] == [4]
     with pytest.raises(UserError, match="cannot be read"):
         damage(folder / "checkpoints" / "4")
         load(folder)
@@ -418,7 +419,7 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 
 def test_every_search_setting_can_be_made():
     for level in LEVELS.values():
-        for name in leap.PRESETS:
+        for name in ("paper", "leapjax"):
             config = find_preset("babyai", level.name, "leap", name)
             variants = quality.variants(config.planner, level.iterations)
             assert len(variants) > 10

@@ -10,16 +10,24 @@ import pytest
 
 from benchmarks import atari, methods, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
-from experiments.common.config import make_domain, specify
-from experiments.common.runtime import Cluster
 from leapjax import pretrained, sharding
+from leapjax.configuration import make_domain, specify
 from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
 from leapjax.presets import find_preset
+from leapjax.running.jax_setup import Cluster
 from tests.programs import only_long, untrained_run, with_options
 
 HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
+
+
+@pytest.fixture(autouse=True)
+def same_cache():
+    """Benchmarks turn the cache of compiled programs off for their process, which is ours here."""
+    before = jax.config.jax_enable_compilation_cache
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
 
 
 def tiny_preset(*names):

@@ -122,6 +122,12 @@ def test_planning_loads_no_optional_module_although_they_are_installed():
     assert ended.returncode == 0, ended.stderr
 
 
+def test_a_published_planner_needs_no_orbax():
+    code = "import sys, leapjax; leapjax.load('GoToLocalS7N5'); assert 'orbax' not in sys.modules"
+    ended = run(["-c", code], {})
+    assert ended.returncode == 0, ended.stderr
+
+
 def test_the_core_alone_plans_and_names_the_extra_of_a_published_planner(core_alone):
     loading = (
         "for path in ('GoToLocalS7N5', 'no-such-run'):\n"

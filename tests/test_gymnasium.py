@@ -25,7 +25,6 @@ from gymnasium.wrappers import (
 from minari import DataCollector
 
 from experiments import gymnasium as program
-from experiments.common import config, results, run
 from leapjax import domains
 from leapjax.data import storage, windows
 from leapjax.domain import Collection, Domain, blank_context
@@ -40,6 +39,8 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.environments import Criterion, GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.rollouts import evaluate
+from leapjax.running import command_line, results
+from leapjax.running.data import judge_data
 from leapjax.types import Demonstration, Plan
 from tests.parameters import random_like
 from tests.programs import SMALL, only_long
@@ -236,7 +237,7 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
     shares = {None: 1 / 5, 1.0: 3 / 5, 0.0: 4 / 5, -2.0: 1.0}
     for least, share in shares.items():
         criterion = Criterion(least, least is not None)
-        found = run.judge_data(data, domain._replace(criterion=criterion))
+        found = judge_data(data, domain._replace(criterion=criterion))
         assert found == {"success": share, "return": pytest.approx(0.2)}
         played = []
         for each in data:
@@ -244,8 +245,8 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
             adapter.reset(0)
             played.append([adapter.step(0).success for _ in each.rewards][-1])
         assert np.mean(played) == share
-    assert run.judge_data(data, domain._replace(criterion=None)) is None
-    assert run.judge_data([], domain) is None
+    assert judge_data(data, domain._replace(criterion=None)) is None
+    assert judge_data([], domain) is None
 
 
 def test_a_criterion_says_where_it_comes_from():
@@ -362,7 +363,7 @@ def test_without_data_it_says_what_is_missing(tmp_path, monkeypatch, capsys):
 def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 4)
-    (chosen,) = config.parse("gymnasium", ["--demonstrations", name])
+    (chosen,) = command_line.parse("gymnasium", ["--demonstrations", name])
     assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # as the data say
     options = [*SMALL, "--horizon", "3", "--context", "1", "--steps", "40"]
     assert program.main(["--dataset", name, *options]) == 0

@@ -12,8 +12,8 @@ import pytest
 from gymnasium import spaces
 
 from experiments import gymnasium as program
-from experiments.common import config, results
 from leapjax import pretrained
+from leapjax.configuration import specify
 from leapjax.data import storage
 from leapjax.domain import apply_statistics, blank_context
 from leapjax.domains.gymnasium.domain import Settings, make
@@ -35,6 +35,7 @@ from leapjax.domains.gymnasium.scaling import (
     scale_numbers,
 )
 from leapjax.errors import UserError
+from leapjax.running import command_line, results
 from leapjax.types import Demonstration
 from tests.parameters import random_like
 from tests.programs import SMALL, only_long
@@ -312,8 +313,10 @@ def test_statistics_are_of_the_training_data_and_only_of_numbers():
 def test_statistics_are_kept_with_the_specification(tmp_path):
     domain = make("Sign-v0", Settings())
     data = [demonstration(np.array([[100], [200], [200]], np.float32))]
-    (chosen,) = config.parse("gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"])
-    before = config.specify(chosen, 0, domain)
+    (chosen,) = command_line.parse(
+        "gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"]
+    )
+    before = specify(chosen, 0, domain)
     after = dataclasses.replace(before, statistics=domain.measure(data))
     assert after.statistics == (((100.0, 200.0),),)
     assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before

@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from experiments import babyai
-from experiments.common import results, run, runtime, startup
-from experiments.common.interruption import SIGNALS, Interrupted, interruptible
-from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
 from leapjax.files import only_process_in, write_text
+from leapjax.running import jax_setup, results, startup
+from leapjax.running import train as running_train
+from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
+from leapjax.running.metrics import read_metrics
+from leapjax.running.progress import Meter
 from leapjax.types import TrainState
 from tests.programs import LONG, RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
 
@@ -54,8 +56,8 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
 
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
     with monkeypatch.context() as patch:
-        patch.setattr(run, "Meter", Stopped)
-        patch.setattr(runtime, "exit_at_once", sys.exit)
+        patch.setattr(running_train, "Meter", Stopped)
+        patch.setattr(jax_setup, "exit_at_once", sys.exit)
         with pytest.raises(SystemExit, match=str(code)):
             babyai.main(options)
     error = capsys.readouterr().err
@@ -66,7 +68,7 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
     assert not (tmp_path / "runs" / "babyai.jsonl").exists()
     assert babyai.main(options) == 0
     assert "continuing at step 20 of 60" in capsys.readouterr().out
-    assert [m["step"] for m in run.read_metrics(folder)] == [20, 40, 60]
+    assert [m["step"] for m in read_metrics(folder)] == [20, 40, 60]
     assert len(results.read(tmp_path / "runs" / "babyai.jsonl")) == 1
 
 
@@ -118,8 +120,8 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
     program = (
         [*"-m experiments.stars".split(), *RANDOM],
         ["-m", "benchmarks.methods"],
-        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; import experiments.__main__ as leapjax; "
-         "leapjax.main(['stars', *sys.argv[1:]])", *RANDOM],
+        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; from leapjax.__main__ import main; "
+         "main(['stars', *sys.argv[1:]])", *RANDOM],
     )[trial % 3]  # fmt: skip
     run = subprocess.Popen(
         [sys.executable, *program], cwd=tmp_path, text=True,
@@ -176,7 +178,7 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
-    monkeypatch.setattr("experiments.common.interruption.GRACE", 0.05)
+    monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
     with interruptible(ended.append) as interruption:
         with pytest.raises(Interrupted), interruption.deferred():

@@ -958,6 +958,50 @@ def test_sizes_up_to_a_batch_are_those_that_its_chunks_need(batch, sizes):
     assert planner.sizes_up_to(batch) == sorted(needed)
 
 
+def test_after_compiling_ahead_nothing_is_traced():
+    traced = []
+
+    def encode(params, context):
+        traced.append(context)
+        return ENUMERABLE.encode(params, context)
+
+    planner = compile_planner(ENUMERABLE._replace(encode=encode), CONFIGS["gibbs"], (1, 4, 16))
+    planner.compile(TABLE, NO_TILT, 20)
+    before = len(traced)
+    assert before
+    for batch in (1, 3, 4, 15, 20):
+        contexts = np.broadcast_to(NO_TILT, (batch, *NO_TILT.shape))
+        planner(TABLE, jax.random.split(jax.random.key(0), batch), contexts)
+    assert len(traced) == before
+    with pytest.raises(UserError, match="batch must be at least 1"):
+        planner.compile(TABLE, NO_TILT, 0)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap])
+def test_a_compiled_planner_inside_a_program_is_refused_in_one_line(transform):
+    planner = compile_planner(ENUMERABLE, CONFIGS["gibbs"])
+    keys = jax.random.split(jax.random.key(0), 2)[None]
+    contexts = np.zeros((1, 2, *NO_TILT.shape), np.float32)
+    with pytest.raises(UserError, match=r"inside of jit, vmap or grad.* use leap.gibbs"):
+        transform(lambda keys, contexts: planner(TABLE, keys, contexts))(keys, contexts)
+
+
+@pytest.mark.parametrize("name", ["conditional", "total", "violation"])
+@pytest.mark.parametrize(
+    "config",
+    [
+        GibbsConfig(HORIZON, score=True),
+        ShootingConfig(HORIZON),
+        CrossEntropyConfig(HORIZON),
+        BeamConfig(HORIZON, score=True),
+    ],
+)
+def test_an_energy_of_another_shape_is_refused(name, config):
+    wrong = ENUMERABLE._replace(**{name: lambda *given: jnp.zeros((2, 7))})
+    with pytest.raises(UserError, match=rf"^{name} of the energy must be .*, got shape \(2, 7\)"):
+        jax.eval_shape(bind(wrong, config), TABLE, jax.random.key(0), NO_TILT)
+
+
 def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
     episodes, replans = np.array([3, 0, 3, 1]), np.array([0, 2, 1, 2])
     data = np.asarray(jax.random.key_data(plan_keys(7, episodes, replans)))

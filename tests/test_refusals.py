@@ -34,14 +34,17 @@ from experiments import (
     qualitative,
     report,
 )
-from experiments.common import config, experiment, plots, program, results, run, runtime, startup
-from experiments.common.config import parse
+from experiments.common import cases
 from leapjax import checkpoints, files, pretrained
 from leapjax.checkpoints import Checkpoints
-from leapjax.configuration import configuration_hash
+from leapjax.configuration import configuration_hash, make_domain, specify
 from leapjax.data import storage
 from leapjax.domains.babyai import demonstrations, levels
 from leapjax.errors import UserError
+from leapjax.running import jax_setup, plots, results, shell, startup
+from leapjax.running import main as running
+from leapjax.running.command_line import parse
+from leapjax.running.metrics import read_metrics
 from leapjax.types import TrainState
 from tests.programs import LONG, ROOT, TOY_RUN, only_long, seal, untrained_run
 
@@ -101,7 +104,7 @@ def test_an_empty_value_is_refused(workplace, capsys, main, arguments, option):
 
 
 def test_a_value_may_have_any_other_shape():
-    program.check_values(["--arguments", '{"a": ""}', "--runs==", "--runs", "=", "--runs=a=", "-x"])
+    shell.check_values(["--arguments", '{"a": ""}', "--runs==", "--runs", "=", "--runs=a=", "-x"])
     with pytest.raises(UserError, match="--level is empty"):
         parse("babyai", ["--level", ""])
 
@@ -226,7 +229,7 @@ def test_a_setting_that_an_old_specification_lacks_has_its_default(toy_run, work
 def sealed(folder, **changes) -> Path:
     """A run of nothing, whoever made it: its specification and parameters agree."""
     (chosen,) = parse("gymnasium", ["--level", "CartPole-v1", "--method", "random"])
-    made = config.specify(chosen, 0, config.make_domain(chosen))
+    made = specify(chosen, 0, make_domain(chosen))
     pretrained.save_specification(folder, dataclasses.replace(made, **changes))
     seal(folder)
     return folder
@@ -423,18 +426,6 @@ def test_a_folder_of_another_user(workplace):
         os.chown(folder, 0, -1)
 
 
-def test_programs_that_others_may_have_compiled_are_not_run(workplace, capsys, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    (workplace / "shared").mkdir()
-    (workplace / "shared").chmod(0o777)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(workplace / "shared"))
-    runtime.use_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
-    said = capsys.readouterr().err
-    assert said.startswith("compiled programs are not kept: others can write to")
-    assert said.count("\n") == 1
-
-
 # Rows.
 
 
@@ -445,7 +436,7 @@ def test_to_train_and_to_play_again_are_two_rows(toy_run):
 
 
 def test_a_damaged_file_of_rows_is_found_before_the_run(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(run, "collect", lambda *rest: pytest.fail("the run began"))
+    monkeypatch.setattr(running, "load_demonstrations", lambda run: pytest.fail("the run began"))
     (workplace / "runs").mkdir()
     for line in ("{oops", json.dumps({"successes": 10**400})):
         (workplace / "runs" / "babyai.jsonl").write_text(line + "\n")
@@ -473,7 +464,7 @@ def test_a_level_that_fails_does_not_end_the_others(workplace, capsys, monkeypat
             "level": config.level,
         }
 
-    monkeypatch.setattr(experiment, "run_one", run_one)
+    monkeypatch.setattr(running, "finish", run_one)
     assert babyai.main(["--level", "all", "--seeds", "0", "1", "--no-pictures"]) == 2
     assert played == [(level, seed) for level in levels.LEVELS for seed in (0, 1)]
     said = capsys.readouterr()
@@ -483,7 +474,7 @@ def test_a_level_that_fails_does_not_end_the_others(workplace, capsys, monkeypat
 
 @pytest.mark.parametrize("main", [properties.main, qualitative.main])
 def test_an_analysis_trains_nothing_where_it_cannot_write(workplace, capsys, monkeypatch, main):
-    monkeypatch.setattr(run, "collect", lambda *given: pytest.fail("work was done"))
+    monkeypatch.setattr(cases, "load_demonstrations", lambda run: pytest.fail("work was done"))
     (workplace / "file").write_text("")
     assert main(["--runs", "file/runs"]) == 2
     said = capsys.readouterr().err
@@ -508,8 +499,8 @@ def test_where_nothing_can_be_written_nothing_is_done(
     toy_run, workplace, capsys, monkeypatch, record, trained
 ):
     (workplace / ("results" if record else "runs")).write_text("")
-    for name in ("collect", "load", "measure"):
-        monkeypatch.setattr(run, name, lambda *given: pytest.fail("work was done"))
+    for name in ("load_demonstrations", "load_trained", "evaluate"):
+        monkeypatch.setattr(running, name, lambda *given: pytest.fail("work was done"))
     more = ["--checkpoint", toy_run] if trained else []
     said = one_line(capsys, *more, *["--record"] * record)
     # A file that is a folder of rows is found when it is read.
@@ -547,7 +538,7 @@ def test_a_level_that_was_learned_is_not_played_where_it_was_learned(toy_run, wo
 def test_a_training_curve_of_no_numbers(workplace):
     (workplace / "metrics.csv").write_text("step,seconds,loss\nnan,1.0,2.0\n")
     with pytest.raises(UserError, match="damaged"):
-        run.read_metrics(workplace)
+        read_metrics(workplace)
 
 
 def test_the_report_where_there_are_no_rows(workplace, capsys):
@@ -594,12 +585,12 @@ def test_a_temperature_at_which_noise_is_no_number(temperature, capsys):
     ],
 )
 def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
-    monkeypatch.setattr(runtime, "connect", lambda cluster: pytest.fail("went on"))
+    monkeypatch.setattr(jax_setup, "connect", lambda cluster: pytest.fail("went on"))
     before = getattr(jax.config, setting)
     jax.config.update(setting, value)
     try:
         with pytest.raises(UserError, match=f"{setting} is .*unset {setting.upper()}, or use"):
-            runtime.start()
+            jax_setup.start()
     finally:
         jax.config.update(setting, before)
 
@@ -607,28 +598,28 @@ def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
 def test_settings_of_jax_that_break_nothing(monkeypatch):
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
     with jax.debug_nans(True), jax.numpy_rank_promotion("warn"), jax.log_compiles(True):
-        runtime.start()
+        jax_setup.start()
 
 
 @pytest.mark.parametrize("count", [0, -2, 10**6])
 def test_a_number_of_devices_that_cannot_be_made(count, monkeypatch):
     monkeypatch.setattr(
-        runtime, "jax", SimpleNamespace(config=SimpleNamespace(jax_num_cpu_devices=count))
+        jax_setup, "jax", SimpleNamespace(config=SimpleNamespace(jax_num_cpu_devices=count))
     )
     with pytest.raises(UserError, match=f"JAX_NUM_CPU_DEVICES is {count}: expected a number in 1"):
-        runtime.use_every_core()
+        jax_setup.use_every_core()
 
 
 def test_no_device_is_one_line(monkeypatch):
     def fail():
         raise AssertionError  # as JAX does where JAX_PLATFORMS is cuda and no plugin is installed
 
-    monkeypatch.setattr(runtime.jax, "devices", fail)
+    monkeypatch.setattr(jax_setup.jax, "devices", fail)
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     with pytest.raises(
         UserError, match=r"no device with .*JAX_PLATFORMS=cuda.* \(AssertionError\)"
     ):
-        runtime.check_devices()
+        jax_setup.check_devices()
 
 
 @only_long
@@ -662,9 +653,9 @@ def test_a_terminal_of_ascii_shows_what_it_can():
 def test_a_launcher_that_says_nothing(count, monkeypatch):
     monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", count)
     monkeypatch.setattr(
-        runtime.jax.distributed, "initialize", lambda *rest, **more: pytest.fail("joined")
+        jax_setup.jax.distributed, "initialize", lambda *rest, **more: pytest.fail("joined")
     )
-    runtime.connect(runtime.Cluster())
+    jax_setup.connect(jax_setup.Cluster())
 
 
 def test_what_is_written_is_on_the_disk(workplace, monkeypatch):
@@ -739,31 +730,6 @@ def test_a_folder_of_data_sets_that_cannot_be_written_to(capsys, monkeypatch):
     assert "name another folder in MINARI_DATASETS_PATH" in one_line(capsys, "--demos", "7")
 
 
-@only_long
-def test_output_that_nobody_reads_any_more_is_one_line():
-    """As in `--help | head -1`."""
-    code = """
-from experiments.common import program
-raise SystemExit(program.guarded("m", [], lambda: print("much to say " * 10_000)))
-"""
-    reader, writer = os.pipe()
-    os.close(reader)
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
-    os.close(writer)
-    assert done.returncode == 1
-    assert done.stderr == b"stopped: nobody reads the output any more\n"
-
-
-def test_a_home_that_cannot_be_written_to_has_no_compilation_cache(workplace, monkeypatch):
-    before = jax.config.jax_compilation_cache_dir
-    (workplace / "home").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(workplace / "home"))
-    monkeypatch.delenv("LEAPJAX_COMPILATION_CACHE", raising=False)
-    runtime.use_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
-
-
 def test_a_link_to_no_folder_of_checkpoints(workplace):
     (workplace / "checkpoints").symlink_to(workplace / "nowhere")
     with pytest.raises(UserError, match="cannot write to"):
@@ -793,5 +759,5 @@ def test_a_working_folder_that_was_removed_is_one_line(capsys):
     def work():
         raise FileNotFoundError(2, "No such file or directory")  # as `Path.cwd` does there
 
-    assert program.guarded("experiments.babyai", [], work) == 2
+    assert shell.guarded("experiments.babyai", [], work) == 2
     assert capsys.readouterr().err == "error: No such file or directory: the working folder\n"

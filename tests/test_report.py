@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from experiments import report
-from experiments.common import plots
+from experiments.common import figures
 from experiments.tables import analyses, babyai, puzzles
 from leapjax.configuration import configuration_hash
 from leapjax.domains.babyai.levels import LEVELS
@@ -65,8 +65,8 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert found["preset paper"][1].startswith("**20.0% [")
     assert found["preset leapjax"][2:7] == ["-"] * 5
     names, found = babyai.COMPARED, babyai.success_by_method(rows)
-    plots.methods_by_level(found, names, tmp_path / "methods.png")
-    plots.methods_by_level({}, names, tmp_path / "empty.png")
+    figures.methods_by_level(found, names, tmp_path / "methods.png")
+    figures.methods_by_level({}, names, tmp_path / "empty.png")
     # All have their place and colour on every level, also where there are no rows of them.
     everywhere = babyai.success_by_method([*rows, row("PickUpLoc", method="bc")])
     whose = [list(each) for each in everywhere.values()]
@@ -83,7 +83,7 @@ def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
     ours = [row(level, rate=0.9) for level in LEVELS]
     (line,) = (x for x in babyai.success(ours).splitlines() if "interquartile" in x)
     assert "| 63.6% | - | - | 90.0% [" in line
-    plots.intervals(found, tmp_path / "aggregate.png")
+    figures.intervals(found, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 
 
@@ -139,7 +139,7 @@ def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path
     rates = [[cell.strip() for cell in line] for line in lines]
     assert rates[0][2:6] == ["10.0%", "20.0%", "50.0%", "100.0%"]
     assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
-    plots.iterations_by_level(found, tmp_path / "figure.png")
+    figures.iterations_by_level(found, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
@@ -187,7 +187,7 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
         "most certain first": {5: {"successes": 190, "episodes": 200}},
         "Gibbs sampling, random order": {20: {"successes": 30, "episodes": 100}},
     }
-    plots.iterations_by_level(by_passes, tmp_path / "searches.png")
+    figures.iterations_by_level(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0
 
 

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.common import results
 from experiments.tables import measured
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes
+from leapjax.running import results
 from tests.programs import ROOT
 
 
@@ -65,6 +65,7 @@ def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):
 
 
 ROW = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
+ROW["success"] = 1.0
 
 
 def write_rows(path, *rows):
@@ -76,7 +77,7 @@ def test_a_row_twice_is_refused_in_files_that_were_merged(tmp_path):
     other = {**ROW, "hash": "y", "seed": 2}
     path = write_rows(tmp_path / "rows.jsonl", ROW, other)
     assert results.read(path) == [ROW, other]
-    for twice in (ROW, {**ROW, "seed": 3, "successes": 0}):
+    for twice in (ROW, {**ROW, "seed": 3, "successes": 0, "success": 0.0}):
         write_rows(path, ROW, other, twice)
         with pytest.raises(UserError, match="line 3: the same hash, x, as line 1.* delete one"):
             results.read(path)

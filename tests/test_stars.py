@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from experiments import star_animation, stars
-from experiments.common import results, searches
+from experiments.common import searches
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
@@ -21,6 +21,7 @@ from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets import find_preset
+from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
 from tests.programs import only_long, with_options

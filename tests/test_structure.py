@@ -12,7 +12,10 @@ import pytest
 
 import leapjax
 from experiments import report
-from experiments.common import results, runtime
+from leapjax import types
+from leapjax.agents.learning import TrainingConfig
+from leapjax.models.trajectory import ModelConfig
+from leapjax.running import jax_setup, results
 from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
@@ -27,7 +30,7 @@ def test_the_public_names_are_sorted_and_exist():
 
 def test_names_that_are_imported_later_hide_no_module():
     modules = {path.stem for path in (ROOT / "leapjax").iterdir()}
-    assert set(leapjax._LATER) <= set(leapjax.__all__) - modules
+    assert set(leapjax._PLACES) - {"__version__"} == set(leapjax.__all__) - modules
 
 
 def test_only_one_module_needs_what_jax_may_change_with_every_release():
@@ -47,6 +50,22 @@ def test_the_public_names_are_documented():
     for name in leapjax.__all__:
         said = inspect.getdoc(getattr(leapjax, name)) or ""
         assert len(said) > 20 and not said.startswith(f"{name}("), name
+
+
+def fields_of(kind):
+    """The names of the fields of a named tuple or a dataclass."""
+    return getattr(kind, "_fields", None) or getattr(kind, "__dataclass_fields__", {}).keys()
+
+
+def test_fields_are_documented_in_the_docstring_of_their_class():
+    public = [getattr(leapjax, name) for name in leapjax.__all__]
+    public = [each for each in public if isinstance(each, type)]
+    documented = [*public, types.Window, types.TransitionWindow, ModelConfig, TrainingConfig]
+    assert sum(map(len, map(fields_of, documented))) > 100
+    for kind in documented:
+        said = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
+        for field in fields_of(kind):
+            assert re.search(rf"^    {field}: \S", said, re.MULTILINE), f"{kind.__name__}.{field}"
 
 
 def test_the_readme_snippets_run():
@@ -114,7 +133,9 @@ def test_every_program_says_how_it_is_used_and_refuses_what_it_does_not_know(
 ):
     monkeypatch.chdir(tmp_path)
     main = importlib.import_module(name).main
-    monkeypatch.setattr(runtime, "start", lambda *rest, **more: pytest.fail("something was begun"))
+    monkeypatch.setattr(
+        jax_setup, "start", lambda *rest, **more: pytest.fail("something was begun")
+    )
     assert exit_code(main, ["--help"]) == 0
     assert "usage" in capsys.readouterr().out.lower()
     for arguments in (["--no-such-option", "3"], ["nothing-of-that-name"]):
@@ -140,11 +161,11 @@ def test_neither_imports_nor_a_command_line_start_a_backend():
         "import importlib, jax\n"
         f"for name in {modules}:\n"
         "    importlib.import_module(name)\n"
-        "from experiments.common import config, runtime\n"
+        "from leapjax.running import jax_setup, command_line\n"
         "for method in ('leap', 'classifier', 'random'):\n"
         "    for preset in ('paper', 'leapjax'):\n"
-        "        config.parse('babyai', ['--method', method, '--preset', preset])\n"
-        "runtime.start()\n"
+        "        command_line.parse('babyai', ['--method', method, '--preset', preset])\n"
+        "jax_setup.start()\n"
         "import os\n"
         "assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()\n"
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import babyai, sudoku
-from experiments.common import results, searches
+from experiments.common import searches
 from leapjax.batching import compile_planner
 from leapjax.data import windows
 from leapjax.domain import blank_context
@@ -20,6 +20,7 @@ from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
+from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long

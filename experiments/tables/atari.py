@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from experiments.atari import data_name, game_of
-from experiments.common.results import Row
 from experiments.tables.cells import Columns, listed, table
 from experiments.tables.settings import Setting, select
 from leapjax import scores
@@ -14,6 +13,7 @@ from leapjax.domains.atari.domain import LONGEST
 from leapjax.domains.atari.encoders import STACK
 from leapjax.domains.atari.games import GAMES
 from leapjax.presets.atari import PAPER_TRANSITIONS
+from leapjax.running.results import Row
 
 COLUMNS = {
     "LEAP": Setting("leapjax"),

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from experiments.common.results import Row
+from experiments.paper import paper_success
 from experiments.tables.cells import mean_length, mean_rate, outcomes, rate, table, with_interval
 from experiments.tables.settings import Setting, select
 from leapjax import scores
-from leapjax.domains.babyai.levels import LEVELS, paper_success
+from leapjax.domains.babyai.levels import LEVELS
+from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
 SETTINGS = {
@@ -62,29 +63,26 @@ def success(rows: Sequence[Row]) -> str:
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
     """
-    papers = [paper_success(level)["leap"] for level in LEVELS]
-    middles = [middle(rows, setting) for setting in SETTINGS.values()]
+    found = select(rows, LEVELS, SETTINGS)
     lines = [
-        *(
-            [f"{paper:.1f}%", *cells]
-            for paper, cells in zip(papers, _cells(rows, rate), strict=True)
-        ),
-        [f"{middle_of_paper():.1f}%", *("-" if m is None else with_interval(*m) for m in middles)],
+        [
+            level,
+            f"{paper_success(level)['leap']:.1f}%",
+            *(rate(found[level, title]) for title in SETTINGS),
+        ]
+        for level in LEVELS
     ]
-    named = zip((*LEVELS, "interquartile mean"), lines, strict=True)
-    return table(" | ".join(["level", "paper", *SETTINGS]), [[name, *line] for name, line in named])
+    middles = [middle(rows, setting) for setting in SETTINGS.values()]
+    cells = ["-" if each is None else with_interval(*each) for each in middles]
+    lines.append(["interquartile mean", f"{middle_of_paper():.1f}%", *cells])
+    return table(" | ".join(["level", "paper", *SETTINGS]), lines)
 
 
 def steps(rows: Sequence[Row]) -> str:
     """Steps per episode, failed episodes included, of every setting."""
-    lines = zip(LEVELS, _cells(rows, mean_length), strict=True)
-    return table(" | ".join(["level", *SETTINGS]), [[level, *cells] for level, cells in lines])
-
-
-def _cells(rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> list[list[str]]:
-    """For each level what `cell` makes of its rows, setting by setting."""
-    found = select(rows, list(LEVELS), SETTINGS)
-    return [[cell(found[level, title]) for title in SETTINGS] for level in LEVELS]
+    found = select(rows, LEVELS, SETTINGS)
+    lines = [[level, *(mean_length(found[level, title]) for title in SETTINGS)] for level in LEVELS]
+    return table(" | ".join(["level", *SETTINGS]), lines)
 
 
 def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
@@ -111,7 +109,7 @@ def middle_of_paper() -> float:
 
 def middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
     """The interquartile mean of a setting over all levels, and its interval, in percent."""
-    levels = select(rows, list(LEVELS), {"": setting}).values()
+    levels = select(rows, LEVELS, {"": setting}).values()
     if not all(levels):
         return None
     mean, (low, high) = scores.aggregate([outcomes(of) for of in levels])
@@ -130,7 +128,7 @@ def iterations(rows: Sequence[Row]) -> str:
 
 def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
     """Rows of training seed 0 by level, title of the setting, and N."""
-    first = select([row for row in rows if row["seed"] == 0], list(LEVELS), BY_ITERATIONS)
+    first = select([row for row in rows if row["seed"] == 0], LEVELS, BY_ITERATIONS)
     found: dict[str, dict[str, dict[int, Row]]] = {}
     for level in LEVELS:
         for title in ITERATED:

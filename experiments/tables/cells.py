@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from experiments.common.results import Row
 from leapjax import scores
+from leapjax.running.results import Row
 
 Columns = Mapping[str, str | Callable[[Row], str]]
 

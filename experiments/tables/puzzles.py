@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from experiments.common.results import Row
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from experiments.tables.cells import rate, table
 from experiments.tables.settings import Setting, select
 from leapjax.presets import find_preset
+from leapjax.running.results import Row
 
 LEARNED = ", learned"
 MINIMISED = {

@@ -3,13 +3,13 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from experiments.common.results import Row
 from leapjax.configuration import change, configuration_hash
 from leapjax.presets import find_preset
+from leapjax.running.results import Row
 
 Key = TypeVar("Key")
 
@@ -55,7 +55,7 @@ def _hashes(
 
 
 def select(
-    rows: Sequence[Row], levels: Sequence[str], settings: Mapping[Key, Setting]
+    rows: Sequence[Row], levels: Iterable[str], settings: Mapping[Key, Setting]
 ) -> dict[tuple[str, Key], list[Row]]:
     """Groups rows by level and setting, one for each seed.
 

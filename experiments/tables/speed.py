@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from experiments.common.results import Row
 from experiments.tables.cells import Columns, listed, table
+from leapjax.running.results import Row
 
 
 def speed(rows: Sequence[Row]) -> str:

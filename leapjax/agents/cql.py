@@ -24,9 +24,12 @@ class Settings(q_learning.Settings):
 
     In the authors' code, and in d3rlpy, Q-values are means of 200 quantiles, whose losses are
     summed. An `alpha` of 4 weighs against those what 0.04 weighs here, against one loss.
+
+    Attributes:
+        alpha: Weight of the conservative term; 0 leaves double Q-learning.
     """
 
-    alpha: float = 0.04  # of the conservative term; 0 leaves double Q-learning
+    alpha: float = 0.04
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,9 +17,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of Decision Transformer alone."""
+    """The options of Decision Transformer alone.
 
-    target_return: float = 1.0  # of an episode, asked for while acting
+    Attributes:
+        target_return: Return of an episode that is asked for while acting.
+    """
+
+    target_return: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -21,13 +21,23 @@ from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pa
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of LEAP alone."""
+    """The options of LEAP alone.
 
-    masking: str = "one"  # one of leapjax.schedules.MASKINGS
-    end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
-    repeat_state: bool = True  # at every position (eq. 4); if not, without a pose at later ones
-    returns: bool = False  # condition plans on the return to go, as Decision Transformer does
-    target_return: float = 1.0  # of an episode, asked for while acting
+    Attributes:
+        masking: Actions to mask in training: "one", "each", "all", "random" or "stratified". The
+            function `leapjax.schedules.sample_masks` explains them.
+        end: A plan may end early. If not, what follows the end is padding that nothing predicts.
+        repeat_state: Every position sees the whole state (eq. 4). If not, later ones see it without
+            the agent's pose.
+        returns: Condition plans on the return to go, as Decision Transformer does.
+        target_return: Return of an episode that is asked for while acting. It needs `returns`.
+    """
+
+    masking: str = "one"
+    end: bool = True
+    repeat_state: bool = True
+    returns: bool = False
+    target_return: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)

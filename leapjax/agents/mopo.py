@@ -29,12 +29,19 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings(iql.Settings):
-    """The options of MOPO, and those of the IQL that it trains."""
+    """The options of MOPO, and those of the IQL that it trains.
 
-    members: int = 5  # of the ensemble
-    rollout: int = 1  # steps that are imagined from the current state of each context
-    penalty: float = 1.0  # on the disagreement of the ensemble
-    real_share: float = 0.5  # of the loss: that of the data, not of what is imagined
+    Attributes:
+        members: Dynamics models in the ensemble.
+        rollout: Steps to imagine from the current state of each context.
+        penalty: Weight of the ensemble's disagreement, which is taken off imagined rewards.
+        real_share: Share of the loss that is of the data; the rest is of imagined steps.
+    """
+
+    members: int = 5
+    rollout: int = 1
+    penalty: float = 1.0
+    real_share: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -22,9 +22,13 @@ from leapjax.types import Agent, Context, Params, PyTree, Window
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of PlaTe alone."""
+    """The options of PlaTe alone.
 
-    state_weight: float = 1.0  # of the states' loss beside the actions'
+    Attributes:
+        state_weight: Weight of the loss of predicted states beside that of actions.
+    """
+
+    state_weight: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -18,9 +18,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of QR-DQN. The defaults are the paper's, but for the target network."""
+    """The options of QR-DQN. The defaults are the paper's, but for the target network.
 
-    quantiles: int = 200  # of the return of each action
+    Attributes:
+        quantiles: Quantiles of the return that are learned of each action.
+    """
+
+    quantiles: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()

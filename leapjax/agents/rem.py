@@ -20,9 +20,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of REM. The defaults are the original's, but for the target network."""
+    """The options of REM. The defaults are the original's, but for the target network.
 
-    q_heads: int = 200  # Q-functions that are mixed
+    Attributes:
+        q_heads: Q-functions that are mixed at random.
+    """
+
+    q_heads: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()

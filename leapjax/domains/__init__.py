@@ -2,9 +2,10 @@
 
 import importlib
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from leapjax.domain import DomainType
+from leapjax.checks import check_kind
+from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
 from leapjax.extras import missing_explained
 
@@ -46,6 +47,23 @@ def find_domain(name: str) -> DomainType:
         with missing_explained(found.extra):
             found = getattr(importlib.import_module(found.module), found.name)
     return found
+
+
+def make_level(name: str, level: str, settings: Any) -> Domain:
+    """Makes one level of a domain, which remembers what it was made from.
+
+    Args:
+        name: of the domain.
+        level: by name.
+        settings: of the domain: an instance of its `DomainType.settings`.
+
+    Raises:
+        UserError: an unknown domain or level, settings of another domain, or an environment that
+            cannot be made.
+    """
+    kind = find_domain(name)
+    check_kind(settings, kind.settings)
+    return kind.make(level, settings)._replace(made_from=(name, settings))
 
 
 def check_imported(level: str, named_by: str) -> None:

@@ -28,15 +28,26 @@ TOKENS = 4  # of a state, of our encoder
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Atari: data, games and augmentation."""
+    """Atari: data, games and augmentation.
 
-    transitions: int = 50_000  # to learn from, by whole trajectories
-    replay_run: int = 1  # of the runs that DQN-Replay has of each game
-    sticky: float = 0.0  # the probability that a game repeats the last action, not the new one
-    max_steps: int = MAX_STEPS  # of a game: then it is cut off
-    features: int = 32  # of the first convolution; the others have twice as many
-    mirror: bool = False  # show every other window in a mirror, to learn from more
-    shift: int = 0  # move all frames of a window by at most so many pixels, to learn from more
+    Attributes:
+        transitions: Transitions to learn from; whole games are sampled until there are so many.
+        replay_run: Number of the DQN-Replay run to learn from; the published data have five of each
+            game.
+        sticky: Probability that the game repeats the last action in place of the new one.
+        max_steps: Decisions after which a game is cut off.
+        features: Features of the first convolution; the others have twice as many.
+        mirror: Mirror every other training window, left and right exchanged.
+        shift: Pixels by which all frames of a training window may be shifted at random, at most.
+    """
+
+    transitions: int = 50_000
+    replay_run: int = 1
+    sticky: float = 0.0
+    max_steps: int = MAX_STEPS
+    features: int = 32
+    mirror: bool = False
+    shift: int = 0
 
     def __post_init__(self) -> None:
         check_types(self)

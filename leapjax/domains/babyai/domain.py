@@ -62,7 +62,6 @@ def make(name: str, options: Settings) -> Domain:
         replay=functools.partial(replay.replay, level=level),
         shortest_limit=shortest,
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
-        paper_success=levels.paper_success(level.name),
     )
 
 

@@ -7,20 +7,39 @@ from leapjax.checks import check_at_least, check_types, check_within
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """BabyAI: augmentation of demonstrations, and the encoders."""
+    """BabyAI: augmentation of demonstrations, and the encoders.
 
-    augment: bool = False  # mirror, recolour, rename, restate at random
-    exchange_objects: bool = False  # with augment: key, ball and box are alike
-    clutter: float = 0.0  # fill up to this share of the cells that nobody needs
-    lookalikes: bool = False  # clutter may be like the target in kind or in colour
-    false_starts: float = 0.0  # share of windows that begin with random moves (no past states)
-    detours: float = 0.0  # share of windows that are to lead around things (no past states)
-    channels: int = 32  # features per grid cell
-    rounds: int = 2  # rounds of convolution over the grid
-    fields: int = 8  # learned distance fields; 0: convolutions alone
-    sweeps: int = 16  # rounds of value iteration that make them
-    word_heads: int = 0  # attention heads from cells to words; 0: none
-    radius: int = 3  # how far around the agent its cells are read one by one
+    Attributes:
+        augment: Change training windows at random: mirror the level, recolour and rename objects,
+            and restate the instruction.
+        exchange_objects: With `augment`: also exchange keys, balls and boxes for each other.
+        clutter: Largest share of the cells not needed by the demonstration to fill with random
+            objects, in 0 .. 1.
+        lookalikes: Clutter may share the kind or the colour of the target.
+        false_starts: Share of training windows that begin with random moves, in 0 .. 1. It needs a
+            context of 0.
+        detours: Share of training windows that lead around obstacles, in 0 .. 1. It needs a context
+            of 0.
+        channels: Features of each grid cell.
+        rounds: Rounds of convolution over the grid.
+        fields: Learned distance fields; 0 leaves convolutions alone.
+        sweeps: Rounds of value iteration that compute the distance fields.
+        word_heads: Attention heads from cells to the words of the instruction; 0 for none.
+        radius: Cells around the agent, in each direction, that are read one by one.
+    """
+
+    augment: bool = False
+    exchange_objects: bool = False
+    clutter: float = 0.0
+    lookalikes: bool = False
+    false_starts: float = 0.0
+    detours: float = 0.0
+    channels: int = 32
+    rounds: int = 2
+    fields: int = 8
+    sweeps: int = 16
+    word_heads: int = 0
+    radius: int = 3
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -35,12 +35,20 @@ EXAMPLES = ("CartPole-v1",)
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What an environment does not always say of itself."""
+    """What an environment does not always say of itself.
 
-    success_return: float | None = None  # of an episode that succeeds; None: what its authors
-    # say, or a positive reward at its end where they say nothing
-    max_steps: int | None = None  # of an episode; None: what its authors say
-    arguments: str = "{}"  # that it is made with, as a JSON object
+    Attributes:
+        success_return: Return that an episode must reach to count as a success. None for the
+            environment's own `reward_threshold`; if it has none, an episode succeeds that ends of
+            its own with a positive reward.
+        max_steps: Steps after which an episode is cut off; None for the limit that the environment
+            has.
+        arguments: Keyword arguments of `gymnasium.make`, as a JSON object.
+    """
+
+    success_return: float | None = None
+    max_steps: int | None = None
+    arguments: str = "{}"
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -23,10 +23,16 @@ LARGE = 20  # nodes: in a larger graph it takes long to find out by itself which
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Star graphs: augmentation."""
+    """Star graphs: augmentation.
 
-    augment: bool = True  # draw names and the order of edges anew: every window is a new graph
-    fewer_arms: bool = False  # with augment: leave out some arms, a random number of them
+    Attributes:
+        augment: Draw the names of nodes and the order of edges anew in every training window, which
+            makes it a new graph.
+        fewer_arms: With `augment`: also leave out a random number of arms.
+    """
+
+    augment: bool = True
+    fewer_arms: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)

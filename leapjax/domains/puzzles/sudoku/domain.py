@@ -20,9 +20,14 @@ from leapjax.types import Context
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Sudoku: augmentation."""
+    """Sudoku: augmentation.
 
-    augment: bool = True  # every window becomes one of another board, by what keeps the rules
+    Attributes:
+        augment: Turn every training window into one of another board, by symmetries that keep the
+            rules.
+    """
+
+    augment: bool = True
 
     def __post_init__(self) -> None:
         check_types(self)

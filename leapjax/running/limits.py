@@ -1,109 +1,25 @@
-"""The configuration of a run: presets, the command line, the hash that names it."""
+"""What a configuration may ask for: refused before any long work."""
 
-import argparse
-import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import jax
-import tyro
 
-from experiments.common import loggers, memory, program
 from leapjax import checkpoints, pretrained
 from leapjax.checks import check_integer, check_number
-from leapjax.configuration import AnyConfig, Config, change
+from leapjax.configuration import AnyConfig, episode_seeds, make_domain, specify
 from leapjax.data import seeds, storage
-from leapjax.data.storage import Described
 from leapjax.domain import Domain
-from leapjax.domains import check_imported, find_domain
 from leapjax.errors import UserError
-from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
-from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.rollouts import MOST_OPEN
+from leapjax.running import loggers, memory
+from leapjax.running.programs import PLANS_TOGETHER
 
-# Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
-# faster, and the last episodes of an evaluation would rather have smaller ones.
-PLANS_TOGETHER = 32
 OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
-
-
-def parse(domain: str, arguments: Sequence[str]) -> list[AnyConfig]:
-    """One configuration per level and method from a command line; exits with 2 if it is bad.
-
-    Raises:
-        UserError: an unknown level, method or preset, or options that cannot be.
-    """
-    program.check_values(arguments)
-    # These come first: they decide the defaults of all the rest, and of --help.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("--level", "--method", "--preset", "--checkpoint", "--demonstrations"):
-        first.add_argument(name)
-    first.add_argument("--demos")
-    first.add_argument("--pretrained", action="store_true")
-    chosen, _ = first.parse_known_args(list(arguments))
-    folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
-    if folder is not None and chosen.pretrained:
-        raise UserError("--checkpoint and --pretrained: give one of them")
-    trained = None if folder is None else pretrained.read_specification(folder)
-    levels = find_domain(domain).levels
-    data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
-    level = chosen.level or (trained.level if trained else data.level or levels[0])
-    if not chosen.level:
-        check_imported(level, str(folder or chosen.demonstrations))
-    if chosen.method == "all" and (folder is not None or chosen.pretrained):
-        raise UserError("--method all: a planner that is trained already is of one method")
-    configs = []
-    for each in levels if level == "all" else [level]:
-        if chosen.pretrained:
-            folder = pretrained.published(each)
-            trained = pretrained.read_specification(folder)
-        method = chosen.method or (trained.method if trained else Config.method)
-        name = chosen.preset or (trained.origin.preset if trained else Config.preset)
-        every = [other for other in METHODS if METHODS[other].everywhere]
-        for one in every if method == "all" else [method]:
-            default = find_preset(domain, each, one, name)
-            if data.episodes is not None and chosen.demos is None:  # as many as there are
-                default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
-            if trained and (trained.domain, trained.method) == (domain, one):
-                default = _as_trained(default, trained)
-            given = _parse(arguments, default)
-            if method == "all" and not default.training.steps:
-                # --steps is for those that learn.
-                given = change(given, training={"steps": 0})
-            config = dataclasses.replace(given, level=each, method=one, checkpoint=folder)
-            check(config)
-            configs.append(config)
-    return configs
-
-
-def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
-    """Defaults that are what an earlier run has."""
-    return dataclasses.replace(
-        default,
-        **{group: getattr(trained, group) for group in GROUPS},
-        context=trained.context,
-        seeds=(trained.origin.seed,),
-        demos=trained.origin.demos,
-        demonstrations=trained.origin.demonstrations,
-    )
-
-
-def _parse(arguments: Sequence[str], default: AnyConfig) -> AnyConfig:
-    # Which options there are depends on the method and the domain.
-    groups = ("method_settings", "domain_settings", "planner")
-    settings = tuple(type(getattr(default, group)) for group in groups)
-    generic: Any = Config
-    kind = generic[settings]
-    try:
-        return tyro.cli(kind, args=list(arguments), default=default)
-    except ValueError as error:  # the dataclasses refuse values that cannot be
-        raise UserError(str(error)) from None
 
 
 def check(config: AnyConfig) -> None:
@@ -136,13 +52,13 @@ def check(config: AnyConfig) -> None:
     # `module:id` is an environment that a module registers; data know it by its id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
-            f"--demonstrations {config.demonstrations} is of {recorded}, not of {config.level}: "
-            f"use --level {recorded}"
+            f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
+            f"{config.level}: use {config.flag('level')} {recorded}"
         )
     domain = make_domain(config)
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.collect is None and domain.source is None:
-        raise UserError(storage.no_demonstrator(domain))
+        raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     limit = domain.shortest_limit
@@ -252,21 +168,6 @@ def layer_bytes(model: ModelConfig, tokens: int) -> int:
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
-def make_domain(config: AnyConfig) -> Domain:
-    """The level of a configuration: the one that is played."""
-    return find_domain(config.domain).make(config.play or config.level, config.domain_settings)
-
-
-def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
-    """What a run leaves beside its parameters."""
-    return Specification(
-        config.domain, config.level, config.method, config.context,
-        **{group: getattr(config, group) for group in GROUPS},
-        signature=dict(domain.signature),
-        origin=Origin(config.preset, seed, config.demos, config.demonstrations),
-    )  # fmt: skip
-
-
 def check_counts(options: object, *names: str) -> None:
     """Refuses options that count something and are not positive, or more than can be counted.
 
@@ -285,13 +186,3 @@ def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
     """
     if executed is not None and not 1 <= executed <= horizon:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")
-
-
-def episode_seeds(config: AnyConfig) -> range:
-    """The level seeds of the episodes that success is measured on.
-
-    Raises:
-        UserError: they leave their range.
-    """
-    first = seeds.validation_seeds if config.validation else seeds.test_seeds
-    return first(config.test_seed, config.episodes)

@@ -3,20 +3,18 @@
 import contextlib
 import enum
 import os
-import platform
 import signal
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 import jax
 
-from experiments.common import startup
-from leapjax import files
+from leapjax import compilation
 from leapjax.errors import UserError, first_line
 from leapjax.processes import Cluster
+from leapjax.running import startup
 
 MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
@@ -82,7 +80,9 @@ def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
     check_promises()
     use_every_core()
     if cache:
-        use_compilation_cache()
+        compilation.use_disk_cache()
+    else:
+        jax.config.update("jax_enable_compilation_cache", False)
     connect(cluster)
     check_devices()
 
@@ -193,37 +193,3 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder: a second start takes seconds.
-
-    Programs are compiled for one processor, so each kind has its own folder.
-    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off". A compiled program is code that
-    this process will run: where others can write to the folder, it is not used.
-    """
-    choice = os.environ.get("LEAPJAX_COMPILATION_CACHE", "")
-    if choice == "off":
-        return
-    try:
-        folder = Path(choice) if choice else files.cache_folder() / "xla" / processor()
-        files.make_private(folder.absolute())
-    except UserError as error:  # JAX would say so at every program, with its traceback
-        print(f"compiled programs are not kept: {error}", file=sys.stderr)
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def processor() -> str:
-    """A name for this kind of processor."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    fields = dict(line.split(":", 1) for line in lines if ":" in line)
-    names = {key.strip(): value.strip() for key, value in fields.items()}
-    wanted = ("vendor_id", "cpu family", "model", "stepping", "model name")
-    label = "-".join([model, *(names[key] for key in wanted if key in names)])
-    return "".join(c if c.isalnum() or c in "-." else "_" for c in label)

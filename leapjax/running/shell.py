@@ -1,21 +1,21 @@
 """Where a program begins and ends: a user's mistake is one line and exit code 2."""
 
 import errno
-import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, TypeVar
 
 import jax
 
-from experiments.common import runtime, startup
-from experiments.common.interruption import Interrupted, Interruption, interruptible
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
 from leapjax.extras import missing_explained
+from leapjax.running import jax_setup, startup
+from leapjax.running.interruption import Interrupted, Interruption, interruptible
 from leapjax.training import NonFiniteLoss
 
+T = TypeVar("T")
 FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can be said in one line
 
 
@@ -48,10 +48,18 @@ def check_values(arguments: Sequence[str]) -> None:
             raise UserError(f"{option} is empty: give it a value, or leave it out")
 
 
-def renamed(arguments: Sequence[str], names: Mapping[str, str]) -> list[str]:
-    """A command line whose options have other names, by those that they have."""
-    parts = [argument.partition("=") for argument in arguments]
-    return [f"{names.get(name, name)}{equals}{value}" for name, equals, value in parts]
+def parse(kind: type[T], module: str, arguments: Sequence[str], **options: Any) -> T:
+    """The options of a command line; exits after --help, and with 2 where they are wrong.
+
+    Args:
+        kind: dataclass of the options.
+        module: of the program, for usage lines.
+        arguments: of the command line.
+        options: of `tyro.cli`.
+    """
+    import tyro  # noqa: PLC0415  (`leapjax --help` needs no extra)
+
+    return tyro.cli(kind, prog=startup.command(module), args=list(arguments), **options)
 
 
 # A path that is too long, leads through a file, into a folder that may not be looked into, or into
@@ -63,7 +71,7 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
     """Does the work of a program; the exit code.
 
     Args:
-        module: what `python -m` started.
+        module: of the program.
         arguments: what it was given: an interrupted program says how to continue.
         work: all that it does.
     """
@@ -89,10 +97,6 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         )
     except KeyboardInterrupt:
         return _end("stopped by Ctrl-C", 130)
-    except BrokenPipeError:  # what read the output has ended, as in `--help | head`
-        # What is left of it has nowhere to go; the interpreter would try again at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _end("stopped: nobody reads the output any more", 1)
     except OSError as error:
         if error.errno not in NAMED_WRONGLY:
             raise
@@ -117,12 +121,12 @@ def stoppable(module: str, arguments: Sequence[str], work: Callable[[Interruptio
 
 def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoReturn:
     """Ends an interrupted program, and says how to continue it."""
-    command = shlex.join(["python", "-m", module, *arguments])
+    command = " ".join([startup.command(module), *map(shlex.quote, arguments)])
     print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
     # At once: threads that still compile or write would crash in the interpreter's own end.
-    runtime.exit_at_once(stopped.exit_code)
+    jax_setup.exit_at_once(stopped.exit_code)
 
 
 def _end(message: str, code: int) -> int:
     print(message, file=sys.stderr)
-    return runtime.leave(code)
+    return jax_setup.leave(code)

@@ -3,7 +3,9 @@
 import contextlib
 import datetime
 import json
+import math
 import platform
+import statistics
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
@@ -14,8 +16,13 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from experiments.common import runtime
-from experiments.common.schema import (
+from leapjax import compilation, scores
+from leapjax.checks import LARGEST_SEED
+from leapjax.errors import UserError, first_line
+from leapjax.files import only_process_in, read_text, whole, write_text
+from leapjax.rollouts import Episodes
+from leapjax.running import jax_setup
+from leapjax.running.schema import (
     AMOUNT,
     COUNT,
     POSITIVE,
@@ -27,12 +34,8 @@ from experiments.common.schema import (
     loads,
     problem,
 )
-from leapjax import scores
-from leapjax.checkpoints import read_json
-from leapjax.checks import LARGEST_SEED
-from leapjax.errors import UserError, first_line
-from leapjax.files import only_process_in, read_text, whole, write_text
-from leapjax.rollouts import Episodes
+from leapjax.serialization import read_json
+from leapjax.version import find_version
 
 Row = dict[str, Any]
 EPISODE = np.dtype([("seed", "<i8"), ("success", "?"), ("return", "<f8"), ("length", "<i4")])
@@ -54,6 +57,7 @@ ROW: dict[str, Schema] = {
     "eval_seconds": AMOUNT,
     "plans_per_second": POSITIVE,
     # What only some rows have, and a terminal shows.
+    "success": Absent(Number(0, 1)),
     "demos_seconds": Absent(AMOUNT),
     "mean_return": Absent(float),
     "paper_success": Absent(Nullable(Number(0, 100))),
@@ -108,6 +112,7 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
         wrong = problem(row, schema) or _contradiction(row)
         if wrong:
             raise UserError(f"{path}, line {number}: {wrong}")
+        row["success"] = success(row)  # rows of an earlier version have counts alone
         first = line_of.setdefault(row["hash"], number)
         if first != number:
             raise UserError(
@@ -123,7 +128,14 @@ def _contradiction(row: Row) -> str | None:
     for name in ("successes", "first_pass_successes"):
         if (row.get(name) or 0) > row["episodes"]:
             return f"{row[name]} {name} of {row['episodes']} episodes"
+    if not math.isclose(row.get("success", success(row)), success(row), abs_tol=1e-9):
+        return f"success is {row['success']}, of {row['successes']} of {row['episodes']} episodes"
     return None
+
+
+def success(row: Row) -> float:
+    """The success rate of a row, as a fraction."""
+    return row["successes"] / row["episodes"]
 
 
 def folder(recorded: bool, runs: Path) -> Path:
@@ -230,12 +242,12 @@ def find(path: Path, configuration: str) -> Row | None:
 
 def versions() -> dict[str, str]:
     """What a result was made with; starts JAX, if it was not."""
-    names = ("leapjax", "jax", "flax", "optax", "minigrid", "numpy")
+    names = ("jax", "flax", "optax", "minigrid", "numpy")
     found = {name: metadata.version(name) for name in names}
     with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
         found["ale-py"] = metadata.version("ale-py")
-    found["leapjax"] += code_version(Path(__file__).parent.parent.parent)
-    machine = f"{runtime.processor()}, cores: {runtime.cores()}"
+    found["leapjax"] = find_version() + code_version(Path(__file__).parent.parent.parent)
+    machine = f"{compilation.name_processor()}, cores: {jax_setup.cores()}"
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         machine += f", {len(devices)} {devices[0].device_kind}"
@@ -270,9 +282,31 @@ def today() -> str:
 
 def percent(row: Row) -> str:
     """A success rate with its 95% interval."""
-    low, high = scores.wilson_interval(row["successes"], row["episodes"])
-    rate = row["successes"] / row["episodes"]
-    return f"{rate:.1%} [{low:.1%}, {high:.1%}]"
+    return _rate(success(row), scores.wilson_interval(row["successes"], row["episodes"]))
+
+
+def percent_over_seeds(rows: Sequence[Row]) -> str:
+    """The mean success rate of rows of several training seeds with its 95% interval."""
+    counts = [row["successes"] for row in rows], [row["episodes"] for row in rows]
+    mean = statistics.fmean(map(success, rows))
+    return _rate(mean, scores.interval_over_seeds(*counts))
+
+
+def _rate(rate: float, interval: tuple[float, float]) -> str:
+    return f"{rate:.1%} [{interval[0]:.1%}, {interval[1]:.1%}]"
+
+
+def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    """The rows that differ in their training seed alone, where there are several.
+
+    Args:
+        rows: of any seeds.
+        key: all that tells rows apart but the seed.
+    """
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return [group for group in groups.values() if len(group) > 1]
 
 
 def summarize(row: Row) -> str:
@@ -320,11 +354,14 @@ def planner_name(row: Row) -> str:
 
 
 def success_table(rows: Sequence[Row]) -> Table:
-    """Success rates beside the paper's.
+    """Success rates beside the paper's; below, the mean over training seeds if there are several.
 
     The mean return comes first where a row's criterion of success was not given by the user.
     """
-    measures = {"success [95%]": format_success, "return": format_return}
+    measures = {
+        "success [95%]": (format_success, percent_over_seeds),
+        "return": (format_return, _mean_return),
+    }
     if any("criterion" in row and not row.get("criterion_given") for row in rows):
         measures = dict(reversed(measures.items()))
     criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})
@@ -332,18 +369,31 @@ def success_table(rows: Sequence[Row]) -> Table:
         *("level", "method", "planner", "seed", *measures, "length", "paper"),
         caption="\n".join(criteria) or None,
     )
+
+    def named(row: Row) -> tuple[str, ...]:
+        return row["level"], f"{row['method']} ({row['preset']})", planner_name(row)
+
+    def paper(row: Row) -> str:
+        found = row.get("paper_success")
+        return "-" if found is None else f"{found:.1f}%"
+
     for row in rows:
-        paper = row.get("paper_success")
-        result.add_row(
-            row["level"],
-            f"{row['method']} ({row['preset']})",
-            planner_name(row),
-            str(row["seed"]),
-            *(measure(row) for measure in measures.values()),
-            f"{row['mean_length']:.1f}",
-            "-" if paper is None else f"{paper:.1f}%",
-        )
+        said = (measure(row) for measure, _ in measures.values())
+        length = f"{row['mean_length']:.1f}"
+        result.add_row(*named(row), str(row["seed"]), *said, length, paper(row))
+    result.add_section()
+    for group in group_seeds(rows, named):
+        said = (measure(group) for _, measure in measures.values())
+        length = f"{statistics.fmean(row['mean_length'] for row in group):.1f}"
+        seeds = f"mean of {len(group)}"
+        result.add_row(*named(group[0]), seeds, *said, length, paper(group[0]))
     return result
+
+
+def _mean_return(rows: Sequence[Row]) -> str:
+    returns = [_find_number(row, "mean_return") for row in rows]
+    known = [each for each in returns if each is not None]
+    return f"{statistics.fmean(known):.2f}" if len(known) == len(rows) else "-"
 
 
 def time_table(rows: Sequence[Row]) -> Table:

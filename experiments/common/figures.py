@@ -1,4 +1,4 @@
-"""Plots of a run."""
+"""The figures of the documents, from rows and measurements."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,53 +10,11 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
-from experiments.common.results import Row
-from leapjax import files, scores
-from leapjax.errors import UserError
-
-
-def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
-    """What the method reports, each against steps: the loss first."""
-    steps = [entry["step"] for entry in metrics]
-    names = [name for name in metrics[0] if name not in ("step", "seconds")]
-    figure, axes = plt.subplots(
-        len(names), 1, figsize=(6, 2.2 * len(names)), sharex=True, layout="constrained",
-        squeeze=False,
-    )  # fmt: skip
-    for axis, name in zip(axes[:, 0], names, strict=True):
-        values = [entry[name] for entry in metrics]
-        axis.plot(steps, values)
-        axis.set(ylabel=name.replace("_", " "), yscale="log" if min(values) > 0 else "linear")
-    axes[-1, 0].set_xlabel("step")
-    save(figure, path)
-
-
-def success_by_iteration(
-    iterations: Sequence[int], outcomes: Sequence[tuple[int, int]], title: str, path: Path
-) -> None:
-    """Success rate against planning iterations (paper, figure 6, left).
-
-    Args:
-        iterations: after how many iterations plans were executed.
-        outcomes: (successes, episodes) for each.
-        title: of the plot.
-        path: to write.
-    """
-    rates = [100 * good / count for good, count in outcomes]
-    bounds = [scores.wilson_interval(good, count) for good, count in outcomes]
-    low = [max(0.0, rate - 100 * b[0]) for rate, b in zip(rates, bounds, strict=True)]
-    high = [max(0.0, 100 * b[1] - rate) for rate, b in zip(rates, bounds, strict=True)]
-    figure, axis = plt.subplots(figsize=(5, 3.5), layout="constrained")
-    axis.errorbar(iterations, rates, yerr=(low, high), marker="o", capsize=3)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axis.set(xlabel="iterations", ylabel="success (%), 95% interval", title=title)
-    axis.set_ylim(0, 101)
-    save(figure, path)
+from leapjax.running import plots
+from leapjax.running.results import Row
 
 
 def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
@@ -88,7 +46,7 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
         [drawn[label] for label in labels], [label.replace("`", "") for label in labels],
         loc="outside lower center", fontsize=8, ncols=columns,
     )  # fmt: skip
-    save(figure, path)
+    plots.save(figure, path)
 
 
 def methods_by_level(
@@ -113,7 +71,7 @@ def methods_by_level(
     if rates:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    save(figure, path)
+    plots.save(figure, path)
 
 
 def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
@@ -131,7 +89,7 @@ def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
     axis.set(xlim=(0, 102))
     axis.set_xlabel("interquartile mean of success (%), and its 95% interval", fontsize=9)
     axis.grid(axis="x", alpha=0.3)
-    save(figure, path)
+    plots.save(figure, path)
 
 
 def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -163,7 +121,7 @@ def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
         right.set(xlabel="passes N", ylabel="energy", yscale="log")
         right.set_title("of plans being refined", fontsize=9)
         right.legend(fontsize=7)
-    save(figure, path)
+    plots.save(figure, path)
 
 
 def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
@@ -186,7 +144,7 @@ def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) ->
         axis.set(xlabel="reward", xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
         axis.set_title(f"{name}: rank correlation {each['correlation']:.2f}", fontsize=9)
     axes[0][0].set_ylabel("energy")
-    save(figure, path)
+    plots.save(figure, path)
 
 
 def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
@@ -202,24 +160,3 @@ def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Ax
     for axis in axes[:, 0]:
         axis.set_ylabel("success (%)")
     return figure, list(axes.flat)
-
-
-def check_figure(path: Path) -> None:
-    """Refuses, before anything is measured, a file that no figure can be written to.
-
-    Raises:
-        UserError: it is of another kind, or its folder cannot be written to.
-    """
-    known = FigureCanvasBase.get_supported_filetypes()
-    if path.suffix.removeprefix(".").lower() not in known:
-        raise UserError(f"{path}: a figure can be {', '.join(sorted(known))}")
-    files.check_writable(path.parent)
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Writes a figure, atomically, and lets go of it."""
-    try:
-        with files.whole(path) as scratch:
-            figure.savefig(scratch, dpi=120)
-    finally:
-        plt.close(figure)

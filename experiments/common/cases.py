@@ -8,25 +8,18 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.common import config as configs
-from experiments.common import experiment, program, results, run, runtime
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.interruption import Interruption
-from experiments.common.results import Row
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.checkpoints import differences
 from leapjax.configuration import AnyConfig, configuration_hash
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
@@ -39,6 +32,16 @@ from leapjax.planners import CrossEntropyConfig, GibbsConfig, PlannerConfig, Sho
 from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
+from leapjax.running import jax_setup, limits, results, shell
+from leapjax.running.data import load_demonstrations
+from leapjax.running.interruption import Interruption
+from leapjax.running.limits import check_counts
+from leapjax.running.metrics import read_metrics
+from leapjax.running.programs import PLANS_TOGETHER
+from leapjax.running.results import Row
+from leapjax.running.run import Experiment, find_folder, open_run
+from leapjax.running.train import train
+from leapjax.serialization import differences
 from leapjax.types import Energy
 
 Change = Callable[[AnyConfig], AnyConfig]
@@ -113,30 +116,33 @@ class Analysis(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Ask what was trained for plans on levels that it was not trained for."""
+    """Train models, plan with each in several ways, and print success beside the paper's.
+
+    Attributes:
+        only: Cases to do, by name; all of them if none is given.
+        methods: Methods to do; all that a case has if none is given.
+        ways: Ways to plan, by name; all that a case has if none is given.
+        preset: Preset that models are trained with: "leapjax" for ours, "paper" for the paper's.
+        seeds: Training seeds.
+        episodes: Held-out episodes to measure success on, for each row.
+        test_seed: Level seed of the first of these episodes.
+        validation: Measure success on validation levels instead, to choose settings.
+        record: Append rows to results/, which is committed, and skip what is recorded already.
+        force: With `--record`: do again what is recorded, and replace its rows.
+        runs: Folder for trained models and unrecorded rows.
+    """
 
     only: tuple[str, ...] = ()
-    """Cases by name; none: all of them."""
     methods: tuple[str, ...] = ()
-    """Methods; none: all that a case has."""
     ways: tuple[str, ...] = ()
-    """Ways to plan, by name; none: all that a case has."""
     preset: str = "leapjax"
-    """"leapjax": ours; "paper": the paper's. Of what is trained."""
     seeds: tuple[int, ...] = (0,)
-    """Training seeds."""
     episodes: int = 200
-    """Held-out episodes to measure success on, for each row."""
     test_seed: int = UNSEEN
-    """Level seed of the first of them."""
     validation: bool = False
-    """Measure on validation levels instead: for choosing settings."""
     record: bool = False
-    """Append rows to results/, which is committed, and skip what is recorded already."""
     force: bool = False
-    """With --record: do again what is recorded, and replace its rows."""
     runs: Path = Path("runs")
-    """Where what is trained, and unrecorded rows, go."""
 
     @property
     def played(self) -> range:
@@ -147,10 +153,13 @@ class Options:
 
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given, description=f"The cases: {_names(analysis.cases)}.")
-    return program.stoppable(
-        f"experiments.{analysis.name}",
+    given = shell.arguments_of(arguments)
+    module = f"experiments.{analysis.name}"
+    about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
+    about += f"\n\nThe cases: {_names(analysis.cases)}."
+    options = shell.parse(Options, module, given, description=about)
+    return shell.stoppable(
+        module,
         given,
         lambda interruption: run_all(analysis, options, interruption),
     )
@@ -175,7 +184,7 @@ class Work(NamedTuple):
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
     """Every case, method and seed asked for, and their table."""
     wanted = check(analysis, options)
-    runtime.start()
+    jax_setup.start()
     versions = results.versions()
     work = Work(analysis, options, versions, Console(markup=False), interruption)
     for where in (work.rows.parent, options.runs):  # not after hours of work
@@ -196,7 +205,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
     """
     check_counts(options, "episodes")
     len(options.played)  # raises where their seeds leave their range
-    configs.check_seeds(options.seeds)
+    limits.check_seeds(options.seeds)
     known = [case.name for case in analysis.cases]
     for name in options.only:
         if name not in known:
@@ -219,7 +228,7 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
         for method in methods_of(case):
             for seed in options.seeds:
                 for config in configurations(analysis, case, method, seed, options):
-                    configs.check(config)
+                    limits.check(config)
     return wanted
 
 
@@ -349,12 +358,12 @@ def training_of(config: AnyConfig) -> Experiment:
 
 def run_folder(config: AnyConfig, seed: int) -> Path:
     """Where a model is, or will be."""
-    return experiment.run_folder(training_of(config), config, seed)
+    return find_folder(training_of(config), config, seed)
 
 
 def training_seconds(folder: Path) -> float:
     """How long the training of a run has taken, stops and continuations included."""
-    metrics = run.read_metrics(folder)
+    metrics = read_metrics(folder)
     return metrics[-1]["seconds"] if metrics else 0.0
 
 
@@ -364,11 +373,13 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
         with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
-            return pretrained.load(folder, chunk_sizes=run.CHUNK_SIZES, finished=True)
+            return pretrained.load(folder, chunk_sizes=(PLANS_TOGETHER,), finished=True)
     work.console.print(f"training {folder}", highlight=False)
-    this = experiment.make_run(training, config, seed, work.console, work.interruption)
-    with contextlib.ExitStack() as stack:
-        return experiment.train(this, work.options.played, stack, plays=False)[0]
+    opened = open_run(
+        training, config, seed, work.console, work.interruption, work.options.played, plays=False
+    )
+    with opened as run:
+        return train(run, load_demonstrations(run))
 
 
 def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
@@ -391,8 +402,8 @@ def asked(
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
     # What weighs many plans of a context at once has a full batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
-    plan = compile_planner(energy, search, (1, 2) if weighs_many else run.CHUNK_SIZES)
-    return Pretrained(specification, energy, params, plan)
+    plan = compile_planner(energy, search, (1, 2) if weighs_many else (PLANS_TOGETHER,))
+    return Pretrained(specification, energy, params, plan, domain)
 
 
 def play(
@@ -418,7 +429,7 @@ def play(
         nonlocal compile_seconds
         planner = asked(domain, way, models, config)
         begun = time.perf_counter()
-        run.warm_up(planner, domain, options.episodes, way.executed)
+        planner.compile(options.episodes, way.executed)
         compile_seconds += time.perf_counter() - begun
         adapters.clear()
         return rollouts.evaluate(
@@ -446,6 +457,7 @@ def play(
         "first_episode_seed": options.played[0],
         "validation": options.validation,
         "successes": int(found.successes.sum()),
+        "success": float(found.successes.mean()),
         "first_pass_successes": first_pass,
         "violations": sum(violations) if violations else None,
         "mean_length": float(found.lengths.mean()),
@@ -478,18 +490,28 @@ def rows_of_way(
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """The rows for a terminal; below, the mean over training seeds if there are several."""
     shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
+
+    def named(row: Row) -> tuple[str, ...]:
+        return row["case"], row["way"], f"{row['method']} ({row['preset']})"
+
+    def paper(row: Row) -> str:
+        found = row["paper_success"]
+        return "-" if found is None else f"{found:.1f}%"
+
     for row in rows:
-        paper, first = row["paper_success"], row["first_pass_successes"]
+        first = row["first_pass_successes"]
         shown.add_row(
-            row["case"],
-            row["way"],
-            f"{row['method']} ({row['preset']})",
+            *named(row),
             str(row["seed"]),
             "" if first is None else f"{first / row['episodes']:.1%}",
             results.percent(row),
             f"{1e3 / row['plans_per_second']:.2f}",
-            "-" if paper is None else f"{paper:.1f}%",
+            paper(row),
         )
+    shown.add_section()
+    for group in results.group_seeds(rows, named):
+        mean = results.percent_over_seeds(group)
+        shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", paper(group[0]))
     return shown

@@ -1,4 +1,4 @@
-"""What a program does before it imports JAX: signals, output, JAX's own settings.
+"""What a program does before it imports JAX: signals, output, --version, JAX's own settings.
 
 Imports only the standard library: importing JAX takes seconds.
 """
@@ -10,10 +10,13 @@ import signal
 import sys
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import NoReturn, TextIO
 
-from experiments.common.interruption import SIGNALS, Interrupted
+from leapjax.running.interruption import SIGNALS, Interrupted
+from leapjax.version import find_version
 
 COMMAND = "leapjax"  # the installed script
+UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
 # The extra of the package that a program needs, where it is not `babyai`.
 EXTRAS = {
     "atari": "atari",
@@ -30,20 +33,26 @@ def is_program() -> bool:
     While `python -m` looks for a module, and imports the packages that hold it, its name for the
     program is "-m".
     """
-    program = next(iter(getattr(sys, "argv", ())), "")
-    return program == "-m" or Path(program).stem == COMMAND
+    return str(started()) == "-m" or started().stem == COMMAND
+
+
+def started() -> Path:
+    """What the interpreter runs, as `sys.argv` says it."""
+    return Path(next(iter(getattr(sys, "argv", ())), ""))
 
 
 def prepare() -> None:
     """Lets signals end the program at once, makes every text printable, and imports JAX.
 
-    Exits with 2, and one line, if JAX cannot be imported: it reads its settings then.
+    Exits with 0 after --version, which needs no JAX. Exits with 2, and one line, if JAX cannot be
+    imported: it reads its settings then.
     """
     for number in SIGNALS:
         signal.signal(number, end)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+    sys.stdout, sys.stderr = make_output(sys.stdout), make_output(sys.stderr)
+    if "--version" in sys.argv[1:]:
+        print(COMMAND, find_version())
+        sys.exit(0)
     sys.unraisablehook = print_unraisable
     sys.excepthook = print_uncaught
     # Figures go to files. Matplotlib refuses an unknown backend with a traceback.
@@ -54,6 +63,67 @@ def prepare() -> None:
         message = f"error: cannot import JAX{settings_of_jax()}: {error or type(error).__name__}"
         print(" ".join(message.split()), file=sys.stderr)
         sys.exit(2)
+
+
+class Output(io.TextIOWrapper):
+    """A stream that ends the program once nobody reads it any more, as in `--help | head`.
+
+    Other programs are ended by SIGPIPE. That signal would also end this one where a worker process
+    or a logger has gone, which are failures that can be reported.
+    """
+
+    def write(self, text: str) -> int:
+        """Writes a text."""
+        try:
+            return super().write(text)
+        except BrokenPipeError:
+            end_unread()
+
+    def flush(self) -> None:
+        """Passes on what is buffered; the interpreter does so at its end."""
+        try:
+            super().flush()
+        except BrokenPipeError:
+            end_unread()
+
+
+def make_output(stream: TextIO) -> TextIO:
+    """A standard stream as an `Output` that replaces what its encoding does not have."""
+    if not isinstance(stream, io.TextIOWrapper):  # there is none, or another program's
+        return stream
+    return Output(
+        stream.buffer, stream.encoding, "replace",
+        line_buffering=stream.line_buffering, write_through=stream.write_through,
+    )  # fmt: skip
+
+
+def end_unread() -> NoReturn:
+    """Ends the program without a word: what is left to print has nowhere to go."""
+    os._exit(UNREAD)
+
+
+def command(module: str) -> str:
+    """How a program was started: `leapjax babyai`, or `python -m experiments.babyai`.
+
+    Args:
+        module: of the program, such as "experiments.babyai".
+    """
+    package, _, name = module.partition(".")
+    if started().stem == COMMAND:
+        return f"{COMMAND} {name}"
+    if started().parts[-2:] == (package, "__main__.py"):
+        return f"python -m {package} {name}"
+    return f"python -m {module}"
+
+
+def find_modules_here() -> None:
+    """Lets the installed command import from the working folder, as `python -m` does.
+
+    Called once `leapjax` is imported: it is the installed one, whatever is in that folder.
+    """
+    if started().stem == COMMAND and not sys.flags.safe_path:
+        with contextlib.suppress(OSError):  # the working folder was removed
+            sys.path.insert(0, str(Path.cwd()))
 
 
 def end(number: int, _: FrameType | None = None) -> None:
