@@ -41,10 +41,8 @@ def quality(rows: Sequence[Row]) -> str:
         return f"{rate:.1%}, {row['mean_length']:.1f}, {milliseconds:.2f}"
 
     found = {(row["variant"], f"{row['level']}, `{row['preset']}`"): cell(row) for row in rows}
-    variants, planners = (dict.fromkeys(names) for names in zip(*found, strict=True))
-    lines = [
-        [name, *(found.get((name, planner), "-") for planner in planners)] for name in variants
-    ]
+    variants, planners = (dict.fromkeys(key[i] for key in found) for i in (0, 1))
+    lines = [[name, *(found.get((name, of), "-") for of in planners)] for name in variants]
     return table(" | ".join(["search", *planners]), lines)
 
 
