@@ -166,8 +166,10 @@ def test_episodes_are_kept_with_their_rows(tmp_path):
     results.record(path, {**ROW, "hash": "a"}, played(7))
     results.record(path, {**ROW, "hash": "b"})  # another outcome, of which no episodes are known
     assert kept() == {"a": [7]}
+    results.record(path, {**ROW, "hash": "a"})
+    assert kept() == {}
     archive = tmp_path / "episodes" / "babyai.npz"
-    for damage in (lambda: archive.write_bytes(archive.read_bytes()[:100]),
+    for damage in (lambda: archive.write_bytes(archive.read_bytes()[:10]),
                    lambda: np.savez(archive, a=np.zeros(3))):  # fmt: skip
         damage()
         with pytest.raises(UserError, match=r"babyai\.npz"):

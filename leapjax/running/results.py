@@ -163,11 +163,11 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         # First, so that a process killed in between leaves episodes without a row, which the next
         # one drops, and no row without its episodes.
-        hashes = {other["hash"] for other in rows}
-        tables = {name: each for name, each in read_episodes(path).items() if name in hashes}
+        known, hashes = read_episodes(path), {other["hash"] for other in rows}
+        tables = {name: each for name, each in known.items() if name in hashes}
         if episodes is not None:
             tables[row["hash"]] = as_table(episodes)
-        if tables:
+        if tables or known:
             _write_episodes(_episodes_path(path), tables)
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
         write_text(path, "".join(f"{line}\n" for line in lines))
