@@ -1,6 +1,7 @@
-"""Planners: `(energy, params, key, context, config) -> Plan`, pure, for one context.
+"""Planners: `(energy, params, key, memory, config) -> Plan`, pure, for one context.
 
-They know only `Energy`. `leapjax.batching` makes one of them plan for any number of contexts.
+They know only `Energy`; `memory` is what its `encode` made of the context. `leapjax.batching` makes
+one of them plan for any number of contexts.
 """
 
 import dataclasses
@@ -136,7 +137,7 @@ PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
 
 
 def gibbs(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: GibbsConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: GibbsConfig
 ) -> Plan:
     """Gibbs sampling over action tokens (paper, algorithm 1): N passes in all.
 
@@ -157,7 +158,6 @@ def gibbs(
             f"fill {config.fill!r} chooses actions while others are MASK, and this energy scores "
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
-    memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
         actions, trace, valid = chain(key)
@@ -345,10 +345,9 @@ def _random_plans(key: jax.Array, choices: jax.Array, count: int) -> jax.Array:
 
 
 def random_shooting(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: ShootingConfig
 ) -> Plan:
     """The random plan of least energy (paper, appendix, ablation), of those that can be."""
-    memory = energy.encode(params, context)
     choices = _choices(energy, params, memory, config.horizon)
     plans = _random_plans(key, choices, config.candidates)
     energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
@@ -363,14 +362,13 @@ def random_shooting(
 
 
 def cross_entropy_method(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: CrossEntropyConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: CrossEntropyConfig
 ) -> Plan:
     """Keep the elites, change one token in each child (paper, appendix, ablation).
 
     The plan returned is the best of the last round, as in the paper; with `keep_elites`
     that is also the best ever seen.
     """
-    memory = energy.encode(params, context)
     count, horizon = config.candidates, config.horizon
     choices = _choices(energy, params, memory, horizon)
 
@@ -422,7 +420,7 @@ class _Beams(NamedTuple):
 
 
 def beam_search(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: BeamConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: BeamConfig
 ) -> Plan:
     """The plan of least summed conditional energy among W that began well, T passes in all.
 
@@ -442,7 +440,6 @@ def beam_search(
             "beam search begins plans that it ends later, and this energy scores complete plans "
             "only (accepts_mask is False): use another planner"
         )
-    memory = energy.encode(params, context)
     actions = energy.num_actions
 
     def extend(
@@ -507,12 +504,11 @@ def _drawn(
     return after(likelihoods), after(ranks)
 
 
-def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
-    """`(params, key, context) -> Plan`: the planner that a configuration belongs to.
+def find_planner(config: PlannerConfig) -> Callable[..., Plan]:
+    """Returns the planner that takes a configuration: `gibbs`, `beam_search` and so on.
 
     Raises:
-        UserError: the energy is no `Energy`.
-        TypeError: the configuration belongs to no planner.
+        TypeError: no planner takes such a configuration.
     """
     planners: dict[type, Callable[..., Plan]] = {
         GibbsConfig: gibbs,
@@ -520,15 +516,25 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
         CrossEntropyConfig: cross_entropy_method,
         BeamConfig: beam_search,
     }
-    check_kind(energy, Energy)
     if type(config) not in planners:
         known = ", ".join(kind.__name__ for kind in planners)
         raise TypeError(f"no planner takes a {type(config).__name__}: expected one of {known}")
-    planner = planners[type(config)]
+    return planners[type(config)]
+
+
+def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
+    """Returns `(params, key, context) -> Plan`, which encodes the context and plans.
+
+    Raises:
+        UserError: the energy is no `Energy`.
+        TypeError: no planner takes such a configuration.
+    """
+    check_kind(energy, Energy)
+    planner = find_planner(config)
 
     def plan(params: Params, key: jax.Array, context: PyTree) -> Plan:
         memory = energy.encode(params, context)
-        known = energy._replace(encode=lambda params, context: memory)
-        return planner(known, params, key, context, config)._replace(encoded=energy.encoded(memory))
+        plan = planner(energy, params, key, memory, config)
+        return plan._replace(encoded=energy.encoded(memory))
 
     return plan

@@ -381,7 +381,9 @@ def test_a_plan_that_breaks_a_constraint_of_weight_0_is_not_satisfied():
     tilt[0, 0] = 9.0
     forbidding = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 0))
     energy = compose([ENUMERABLE, forbidding], [1, 0])
-    plan = gibbs(energy, (TABLE, TABLE), jax.random.key(0), tilt, GibbsConfig(HORIZON, 1))
+    params = TABLE, TABLE
+    memory = energy.encode(params, tilt)
+    plan = gibbs(energy, params, jax.random.key(0), memory, GibbsConfig(HORIZON, 1))
     assert plan.actions[0] == 0 and not plan.satisfied
 
 
@@ -499,7 +501,8 @@ def test_a_partial_penalty_judges_what_is_certain_already():
         conditionals(judges, TABLE, tilted), conditionals(waits, TABLE, tilted)
     )
     config = GibbsConfig(HORIZON, HORIZON, fill="sequential")
-    first = [gibbs(e, TABLE, jax.random.key(0), tilted, config).actions[0] for e in (waits, judges)]
+    plans = [bind(e, config)(TABLE, jax.random.key(0), tilted) for e in (waits, judges)]
+    first = [plan.actions[0] for plan in plans]
     assert first[0] == 0 and first[1] != 0
 
 

@@ -20,7 +20,6 @@ from leapjax.planners import (
     GibbsConfig,
     ShootingConfig,
     bind,
-    gibbs,
 )
 from leapjax.types import Energy
 from tests.enumerable import (
@@ -162,7 +161,7 @@ def greedy_traces(order, fill="together"):
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(200)])
     config = GibbsConfig(HORIZON, iterations=16, order=order, fill=fill)
     keys = jax.random.split(jax.random.key(1), len(tables))
-    plan = quick_jit(jax.vmap(lambda p, k: gibbs(ENUMERABLE, p, k, NO_TILT, config)))(tables, keys)
+    plan = quick_jit(jax.vmap(lambda p, k: bind(ENUMERABLE, config)(p, k, NO_TILT)))(tables, keys)
     return np.asarray(plan.trace), [joint_probabilities(table) for table in tables]
 
 
@@ -231,7 +230,7 @@ def test_the_most_certain_position_is_filled_first(fill):
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(100)])
     config = GibbsConfig(HORIZON, iterations=HORIZON, fill=fill)
     plan = quick_jit(
-        jax.vmap(lambda params: gibbs(ENUMERABLE, params, jax.random.key(0), NO_TILT, config))
+        jax.vmap(lambda params: bind(ENUMERABLE, config)(params, jax.random.key(0), NO_TILT))
     )
     firsts = set()
     for table, trace in zip(tables, np.asarray(plan(tables).trace), strict=True):
