@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import flax.linen as nn
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ import numpy as np
 
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
 
@@ -119,9 +119,7 @@ class Domain(NamedTuple):
     actions: tuple[str, ...]  # names; the last is the end action
     max_steps: int  # of the longest episode
     blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
-    encoders: Mapping[str, Callable[[ModelConfig, int], nn.Module]]
-    # by architecture, (model, K) -> module; see leapjax.models.trajectory. One of `paper` may have
-    # `of_all` as well, (B contexts) -> tokens [B, K + 1, D], where training is faster with it
+    encoders: Mapping[str, Callable[[ModelConfig, int], Encoder]]  # by architecture, of (model, K)
     augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
     measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
     # what encoders must know of the training data
@@ -196,12 +194,6 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
         UserError: says what has which shape.
     """
     blank = blank_context(domain, length)
-    if context.encoded is not None and context.encoded.shape[0] != length:
-        raise UserError(
-            f"a context in which {context.encoded.shape[0]} past states are encoded, but this "
-            f"network was made for {length}"
-        )
-    context = context._replace(encoded=None)
     structures = [str(jax.tree.structure(tree)) for tree in (context, blank)]
     if structures[0] != structures[1]:
         raise UserError(

@@ -533,8 +533,6 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
     planner = find_planner(config)
 
     def plan(params: Params, key: jax.Array, context: PyTree) -> Plan:
-        memory = energy.encode(params, context)
-        plan = planner(energy, params, key, memory, config)
-        return plan._replace(encoded=energy.encoded(memory))
+        return planner(energy, params, key, energy.encode(params, context), config)
 
     return plan

@@ -327,5 +327,7 @@ def load(
     specification = dataclasses.replace(
         specification, planner=planner or specification.planner, level=level or specification.level
     )
-    plan = compile_planner(agent.energy, specification.planner, chunk_sizes)
+    plan = compile_planner(
+        agent.energy, specification.planner, chunk_sizes, encode_next=agent.encode_next
+    )
     return Pretrained(specification, agent.energy, params, plan)

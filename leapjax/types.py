@@ -36,8 +36,6 @@ class Context(NamedTuple):
     rewards: Array  # [K] float32: what each of them gave; 0 before the start
     step: Array  # [] int32: environment steps since the episode began
     return_so_far: Array  # [] float32: the sum of all rewards since then
-    encoded: Array | None = None  # [K, D] what a network has made of each past state, where that is
-    # kept from one decision to the next; None: it has to read them all
 
 
 class Demonstration(NamedTuple):
@@ -78,12 +76,6 @@ class Plan(NamedTuple):
     valid: jax.Array  # [] bool: no energy met on the way was NaN
     energy: jax.Array | None = None  # [] float32, only if asked for: it costs T passes
     trace_energies: jax.Array | None = None  # [N] float32, only if asked for: N * T passes
-    encoded: jax.Array | None = None  # [K + 1, D] see `Energy.encoded`
-
-
-def nothing_encoded(memory: PyTree) -> None:
-    """What an energy can tell of states if it reads each context as a whole."""
-    del memory
 
 
 def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -110,9 +102,6 @@ class Energy(NamedTuple):
     accepts_mask: bool = True  # False: planning starts from uniform actions, not from MASK
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
     # (params, memory, actions [T]) -> []: 0 where every constraint holds, else positive
-    encoded: Callable[[PyTree], jax.Array | None] = nothing_encoded
-    # (memory) -> [K + 1, D]: what `encode` made of each state, for the `encoded` of later contexts;
-    # None: there is nothing that could be kept
 
 
 def mask_token(num_actions: int) -> int:
@@ -143,6 +132,11 @@ class TrainState(NamedTuple):
     extra: PyTree = ()  # what no gradient touches: target networks, running statistics
 
 
+EncodeNext = Callable[[Params, Context, PyTree], tuple[PyTree, PyTree]]
+# (params, context, cache) -> (memory, cache): as an energy's `encode`, for consecutive states of an
+# episode. The cache is what the network keeps from plan to plan; None at the first
+
+
 class Agent(NamedTuple):
     """What every method has in common, so that one training and one rollout serve all."""
 
@@ -154,3 +148,5 @@ class Agent(NamedTuple):
     # (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself
     energy: Energy
     # what is minimised to act; a method that chooses one action at a time has plans of one
+    encode_next: EncodeNext | None = None
+    # `energy.encode` with a cache, for `compile_planner`; None: a cache would save nothing

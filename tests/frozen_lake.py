@@ -11,6 +11,7 @@ import numpy as np
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
+from leapjax.models.encoder import Encoder
 
 LEVEL = "FrozenLake-v1"
 CELLS, GOAL = 16, 15
@@ -21,7 +22,7 @@ class Settings:
     """FrozenLake has no options."""
 
 
-class Cell(nn.Module):
+class Cell(Encoder):
     """The cell that the agent is in, as one token."""
 
     width: int

@@ -32,7 +32,7 @@ from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.checkpoints import Checkpoints, read_json
 from leapjax.data import storage, windows
 from leapjax.data.storage import reasons
-from leapjax.domain import Domain, Source, apply_statistics, blank_context
+from leapjax.domain import Domain, Source, apply_statistics
 from leapjax.energy import compose
 from leapjax.environments import judge_episode
 from leapjax.errors import UserError, first_line
@@ -110,7 +110,9 @@ def compile_ahead(run: Run, mesh: Mesh, plays: bool = True) -> Callable[[], Prog
     config, domain = run.config, run.domain
     plays = plays and not config.rules  # with rules another planner plays: see `with_rules`
     agent = pretrained.make_agent(run.specification, domain, mesh)
-    plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
+    plan = compile_planner(
+        agent.energy, config.planner, chunk_sizes(config), encode_next=agent.encode_next
+    )
     like = learning.blank_steps(domain) if config.demos else ()
     state = jax.eval_shape(agent.init, jax.random.key(0))
     memory.check_state(state)
@@ -474,13 +476,13 @@ def warm_up(planner: Pretrained, domain: Domain, batch: int, executed: int | Non
         batch: episodes that are played together, at most.
         executed: actions of each plan; None for all.
     """
-    context = blank_context(domain, planner.specification.context)
+    blank = rollouts.History(domain.blank, planner.specification.context, domain.num_actions)
     for size in planner.plan.sizes_up_to(batch):
-        contexts = jax.tree.map(lambda x, n=size: np.stack([x] * n), context)
-        keys = jax.random.split(jax.random.key(0), size)
-        encoded = rollouts.kept(planner(keys, contexts), executed)
-        if encoded is not None:  # as it is after the first plan
-            planner(keys, contexts._replace(encoded=encoded))
+        keys, caches = jax.random.split(jax.random.key(0), size), [None] * size
+        for _ in range(2):  # the first plans of episodes, and the next
+            _, caches = rollouts.plan_episodes(
+                planner.plan, planner.params, keys, [blank] * size, caches, executed
+            )
 
 
 def draw(planner: Pretrained, run: Run, episode_seeds: range | None, metrics: Metrics) -> None:

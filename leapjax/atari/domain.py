@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import flax.linen as nn
 import numpy as np
 
 from leapjax.atari import replay
@@ -19,6 +18,7 @@ from leapjax.data.seeds import MAX_TRAINING_SEED
 from leapjax.domain import Collection, Domain, DomainType, Source
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
@@ -65,11 +65,11 @@ def make(name: str, settings: Settings) -> Domain:
 
         return AtariAdapter(game, settings.sticky, settings.max_steps)
 
-    def state_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def state_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return StateTokens(model.width, settings.features, model.dtype)
 
-    def current_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def current_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 

@@ -14,6 +14,7 @@ from flax.typing import Dtype
 from leapjax.checks import check_types
 from leapjax.domain import Augmentation, Domain, DomainType
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.models.transformer import dense
 from leapjax.stars import graphs
@@ -34,7 +35,7 @@ class Settings:
         check_types(self)
 
 
-class GraphTokens(nn.Module):
+class GraphTokens(Encoder):
     """A token for each edge, and one for where the agent is and where it should be."""
 
     labels: int
@@ -73,7 +74,7 @@ def make(name: str, settings: Settings) -> Domain:
         np.zeros((star.nodes - 1, 2), np.int32), np.zeros((), np.int32), np.zeros((), np.int32)
     )
 
-    def tokens(model: ModelConfig, context: int) -> nn.Module:
+    def tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return GraphTokens(labels, model.width, model.dtype)
 

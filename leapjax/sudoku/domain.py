@@ -5,7 +5,6 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from leapjax.checks import check_types
 from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import embed
 from leapjax.sudoku import boards
 from leapjax.sudoku.boards import Board, SudokuAdapter
@@ -30,11 +30,11 @@ class Settings:
         check_types(self)
 
 
-class BoardTokens(nn.Module):
+class BoardTokens(Encoder):
     """A token for each cell, and one for the cell that is written next.
 
-    It says of which cell an action of the plan is (`places`), so that which cells share a row, a
-    column or a box with it need not be learned for each of them.
+    It says of which cell an action of the plan is (`encode_positions`), so that which cells share
+    a row, a column or a box with it need not be learned for each of them.
     """
 
     side: int
@@ -53,7 +53,7 @@ class BoardTokens(nn.Module):
         task = self.task(jnp.zeros(1, jnp.int32))
         return jnp.concatenate([self._cells(context), task + here])
 
-    def places(self, context: Context, horizon: int) -> jax.Array:
+    def encode_positions(self, context: Context, horizon: int) -> jax.Array:
         """`[T, D]`: the cells that a plan fills, and what is in them."""
         ahead = context.observation.cell + jnp.arange(horizon)
         return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]
