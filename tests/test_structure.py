@@ -63,13 +63,14 @@ def test_the_core_imports_only_what_is_below_it():
     may_import("leapjax/models/linear.py")
     may_import("leapjax/models/dropout.py")
     may_import("leapjax/models/transformer.py", "models.dropout", "models.linear")
+    may_import("leapjax/models/encoder.py", "types", "errors")
     may_import(
         "leapjax/models/trajectory.py",
-        *("types", "checks", "errors", "models.dropout", "models.transformer"),
+        *("types", "checks", "models.dropout", "models.encoder", "models.transformer"),
     )
     may_import(
         "leapjax/domain.py",
-        *("types", "checks", "errors", "environments", "models.trajectory"),
+        *("types", "checks", "errors", "environments", "models.encoder", "models.trajectory"),
     )
 
 
