@@ -16,7 +16,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import tyro
 from jax.sharding import NamedSharding
 from rich.console import Console
 from rich.table import Table
@@ -25,14 +24,15 @@ from benchmarks import training
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
-from experiments.common import program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from experiments.tables.atari import encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
+from leapjax.configuration import AnyConfig, change, make_domain, specify
 from leapjax.domain import Domain
 from leapjax.environments import Eager, closing
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
+from leapjax.running import jax_setup, shell
 from leapjax.types import Context, Params, PyTree
 
 GAMES_PLAYED = (1, 16, 64)  # together
@@ -63,9 +63,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints tables, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.atari", given, lambda: run(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.atari", given)
+    return shell.guarded("benchmarks.atari", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -80,16 +80,16 @@ def run(options: Options) -> None:
     if options.training_json and not options.training:
         raise UserError("--training-json with --no-training: there are no rows to write; drop one")
     check_writable(options.json, options.training_json)
-    runtime.start(cache=False)  # compile times are real
+    jax_setup.start(cache=False)  # compile times are real
     # The longest game only sizes a table of the paper's network.
     configs = [
-        with_options(preset("atari", game, "leap", name), {"max_steps": 1000})
+        change(find_preset("atari", game, "leap", name), domain_settings={"max_steps": 1000})
         for game in options.games
         for name in options.presets
     ]
     papers = [config for config in configs if config.model.architecture == "paper"]
     try:
-        in_runs = [with_options(config, {"run": options.run}) for config in papers]
+        in_runs = [change(config, training={"run": options.run}) for config in papers]
     except ValueError as error:
         raise UserError(f"--run {options.run}: {error}") from None
     console = Console()

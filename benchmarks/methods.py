@@ -12,17 +12,17 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.planning import random_contexts, untrained
 from benchmarks.timing import Row, check_writable, fastest, write_rows
-from experiments.common import program, runtime
-from experiments.common.config import check_counts, preset
 from experiments.tables.babyai import COMPARED
-from leapjax.babyai import levels
 from leapjax.batching import compile_planner
+from leapjax.domains.babyai import levels
+from leapjax.presets import find_preset
+from leapjax.running import jax_setup, shell
+from leapjax.running.limits import check_counts
 
 METHODS = tuple(name for name in COMPARED if name != "random")
 
@@ -45,9 +45,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.methods", given, lambda: run(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.methods", given)
+    return shell.guarded("benchmarks.methods", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -59,7 +59,7 @@ def run(options: Options) -> None:
     check_counts(options, "batch", "rounds")
     level = levels.find_level(options.level)
     check_writable(options.json)
-    runtime.start(cache=False)
+    jax_setup.start(cache=False)
     calls = {method: make_call(level.name, method, options.batch) for method in METHODS}
     best = dict.fromkeys(METHODS, float("inf"))
     for _ in range(options.rounds):
@@ -81,7 +81,7 @@ def run(options: Options) -> None:
 
 def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
     """A compiled call that makes plans for as many contexts as `batch` says."""
-    config = preset("babyai", level, method, "leapjax")
+    config = find_preset("babyai", level, method, "leapjax")
     energy, params, domain = untrained(config)
     planner = compile_planner(energy, config.planner)
     contexts = jax.device_put(random_contexts(domain, config.context, batch))

@@ -18,21 +18,21 @@ from typing import Any
 import jax
 import matplotlib
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.flops import matmul_flops
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
-from experiments.common import plots, program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from leapjax import pretrained
-from leapjax.babyai import levels
-from leapjax.babyai.levels import Level
 from leapjax.batching import CHUNK_SIZES, compile_planner, plan_keys, split_batch
+from leapjax.configuration import AnyConfig, change, make_domain, specify
 from leapjax.domain import Domain, blank_context
+from leapjax.domains.babyai import levels
+from leapjax.domains.babyai.levels import Level
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig, bind
+from leapjax.presets import find_preset
+from leapjax.running import jax_setup, plots, shell
 from leapjax.types import Energy, Params
 
 matplotlib.use("Agg")
@@ -66,9 +66,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.planning", given, lambda: run(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.planning", given)
+    return shell.guarded("benchmarks.planning", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -85,7 +85,7 @@ def run(options: Options) -> None:
         if not sizes or min(sizes) < 1:
             raise UserError(f"--{name} {' '.join(map(str, sizes))}: expected positive numbers")
     check_writable(options.json)
-    runtime.start(cache=False)  # compile times are real
+    jax_setup.start(cache=False)  # compile times are real
     chosen = [levels.find_level(name) for name in (LEVELS[:1] if options.quick else LEVELS)]
     batches = (1, 256) if options.quick else options.batches
     console = Console()
@@ -112,7 +112,7 @@ def measure(
     chunks: Sequence[int],
 ) -> list[Row]:
     """One preset and level at every batch size."""
-    model, horizon = preset("babyai", level.name, "leap", name).model, level.horizon
+    model, horizon = find_preset("babyai", level.name, "leap", name).model, level.horizon
     search = GibbsConfig(horizon, level.iterations)
     energy, params, domain = make_energy(name, level)
     planner = compile_planner(energy, search, chunks)
@@ -165,8 +165,8 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
 
 def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
     """A preset's energy with random parameters, with the horizon of the appendix."""
-    default = preset("babyai", level.name, "leap", name)
-    return untrained(with_options(default, {"horizon": level.horizon}))
+    default = find_preset("babyai", level.name, "leap", name)
+    return untrained(change(default, planner={"horizon": level.horizon}))
 
 
 def untrained(config: AnyConfig) -> tuple[Energy, Params, Domain]:

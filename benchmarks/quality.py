@@ -19,14 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.timing import Row, check_writable, fastest, write_rows
-from experiments.common import plots, program, runtime
 from leapjax import pretrained, rollouts
-from leapjax.babyai import levels
 from leapjax.batching import plan_keys
 from leapjax.data import seeds
+from leapjax.domains.babyai import levels
 from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import FILLS, GibbsConfig
+from leapjax.running import jax_setup, plots, shell
 from leapjax.scores import wilson_interval
 
 matplotlib.use("Agg")
@@ -56,9 +56,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.quality", given, lambda: run(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.quality", given)
+    return shell.guarded("benchmarks.quality", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -84,7 +84,7 @@ def run(options: Options) -> None:
             for name, search in variants(specification.planner, most).items()
             if accepts_mask or search.fill == "together"
         }
-    runtime.start()
+    jax_setup.start()
     rows = [
         measure(options, folder, name, config)
         for folder, configs in searches.items()

@@ -24,11 +24,11 @@ from rich.table import Table
 
 from benchmarks.timing import Row, check_writable, fastest, write_rows
 from benchmarks.training import Stepper
-from experiments.common import program, runtime
-from experiments.common.config import preset
-from experiments.common.runtime import Cluster
 from leapjax import processes, sharding
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
+from leapjax.running import jax_setup, shell
+from leapjax.running.jax_setup import Cluster
 
 # (processes, devices of each, devices that share parameters)
 SETTINGS = ((1, 1, 1), (1, 2, 1), (2, 1, 1), (1, 2, 2), (1, 4, 1), (1, 8, 1), (1, 8, 8))
@@ -53,17 +53,17 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.scaling", given, lambda: run(options, given))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.scaling", given)
+    return shell.guarded("benchmarks.scaling", given, lambda: run(options, given))
 
 
 def run(options: Options, arguments: list[str]) -> None:
     """Measures every setting, or the one of this process."""
-    preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
+    find_preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
     check_writable(options.json)
     if options.worker:
-        runtime.start(options.cluster, cache=False)
+        jax_setup.start(options.cluster, cache=False)
         row = measure(options)
         if processes.is_first():
             print(json.dumps(row), flush=True)
@@ -108,7 +108,7 @@ def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
 
 def measure(options: Options) -> Row:
     """One setting, on all devices of all processes."""
-    config = preset("babyai", options.level, "leap", "leapjax")
+    config = find_preset("babyai", options.level, "leap", "leapjax")
     batch = options.per_device * jax.device_count()
     chosen = dataclasses.replace(config.training, batch=batch)
     mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)

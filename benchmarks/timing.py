@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import NamedSharding
 
-from experiments.common import results
 from leapjax import files, sharding
+from leapjax.running import results
 
 Row = dict[str, Any]  # one measurement, as JSON values
 

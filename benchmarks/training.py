@@ -17,7 +17,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jax.sharding import Mesh, NamedSharding
 from rich.console import Console
 from rich.table import Table
@@ -25,13 +24,14 @@ from rich.table import Table
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
-from experiments.common import program, runtime
-from experiments.common.config import AnyConfig, make_domain, preset, specify, with_options
 from leapjax import pretrained, sharding, training
 from leapjax.agents import learning
+from leapjax.configuration import AnyConfig, change, make_domain, specify
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
+from leapjax.running import jax_setup, shell
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
@@ -57,9 +57,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("benchmarks.training", given, lambda: run(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "benchmarks.training", given)
+    return shell.guarded("benchmarks.training", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -69,16 +69,16 @@ def run(options: Options) -> None:
         UserError: an unknown level or preset, or a microbatch that cannot be.
     """
     check_writable(options.json)
-    runtime.start(cache=False)  # compile times are real
+    jax_setup.start(cache=False)  # compile times are real
     configs = [
-        preset("babyai", level, "leap", name)
+        find_preset("babyai", level, "leap", name)
         for level in options.levels
         for name in options.presets
     ]
     if options.microbatch is not None:
         changed = {"microbatch": options.microbatch}
         try:
-            configs = [with_options(config, changed) for config in configs]
+            configs = [change(config, training=changed) for config in configs]
         except ValueError as error:
             raise UserError(f"--microbatch {options.microbatch}: {error}") from None
     rows = [measure(config, options.seconds) for config in configs]

@@ -5,8 +5,8 @@ import sys
 import jax.numpy as jnp
 
 import leapjax as leap
-from leapjax.babyai.adapter import ACTIONS, END, BabyAIAdapter
-from leapjax.babyai.levels import find_level
+from leapjax.domains.babyai.adapter import ACTIONS, END, BabyAIAdapter
+from leapjax.domains.babyai.levels import find_level
 
 LEVEL, EPISODES = "GoToLocalS7N5", int(sys.argv[1]) if len(sys.argv) > 1 else 100
 LEFT = ACTIONS.index("left")

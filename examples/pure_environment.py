@@ -1,6 +1,6 @@
 """A thousand mazes of Jumanji in one call: environment, energy and planner in one program.
 
-Needs `pip install 'leapjax[jumanji]'`.
+Needs `pip install jumanji`.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Programs that reproduce the paper, and its tables; to import them changes nothing."""
 
-from experiments.common import startup
+from leapjax.running import startup
 
 if startup.is_program():
     startup.prepare()

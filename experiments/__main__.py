@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.common import program
 from leapjax.errors import did_you_mean
+from leapjax.running import shell, startup
 
 # In the order in which someone new meets them; what they do is the first line of each.
 PROGRAMS = (
@@ -18,9 +18,12 @@ PROGRAMS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the program that comes first with all that follows it; the exit code."""
-    name, *rest = program.arguments_of(arguments) or ["--help"]
+    startup.find_modules_here()
+    name, *rest = shell.arguments_of(arguments) or ["--help"]
     if name in ("-h", "--help"):
-        print("usage: leapjax NAME [OPTIONS]; leapjax NAME --help says which\n")
+        command = startup.command("experiments.NAME")
+        print(f"usage: {command} [OPTIONS]\n")
+        print(f"{command} --help lists the options of a program; --version prints the version.\n")
         for each in PROGRAMS:
             # Read, not imported: all of them would take seconds.
             source = Path(__file__).with_name(f"{each}.py").read_text(encoding="utf-8")
@@ -31,7 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         expected = f"expected one of {', '.join(PROGRAMS)}{did_you_mean(name, PROGRAMS)}"
         print(f"error: unknown program {name!r}: {expected}", file=sys.stderr)
         return 2
-    return importlib.import_module(f"experiments.{name}").main(rest)
+    module = f"experiments.{name}"
+    # An extra that is missing ends this import.
+    failed = shell.guarded(module, rest, lambda: importlib.import_module(module))
+    return failed or importlib.import_module(module).main(rest)
 
 
 if __name__ == "__main__":

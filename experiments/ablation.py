@@ -9,8 +9,8 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 
-from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way
+from experiments.common import cases
+from experiments.common.cases import Analysis, Case, Model, Way
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 
 LEVEL = "GoToObjMazeS4"
@@ -68,7 +68,7 @@ ANALYSIS = Analysis(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Every case asked for; the exit code."""
-    return analysis.main(ANALYSIS, arguments)
+    return cases.main(ANALYSIS, arguments)
 
 
 if __name__ == "__main__":

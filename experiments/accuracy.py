@@ -20,14 +20,14 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.common import program, runtime
-from experiments.common.config import check_counts
 from leapjax import pretrained
 from leapjax.data import seeds, storage, windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.pretrained import Origin, Pretrained
+from leapjax.running import jax_setup, shell
+from leapjax.running.limits import check_counts
 from leapjax.types import Demonstration, Energy, Params, Window, mask_token
 
 TOGETHER = 64  # windows scored in one go
@@ -35,21 +35,24 @@ TOGETHER = 64  # windows scored in one go
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say what models know of demonstrations that they have, and have not, learned from."""
+    """Say what models know of demonstrations that they have, and have not, learned from.
+
+    Attributes:
+        runs: Folders of runs.
+        demos: Demonstrations of each kind, learned from or not.
+        samples: Steps of the demonstrations to predict the actions of, at most.
+    """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs."""
     demos: int = 200
-    """Demonstrations of each kind."""
     samples: int = 2000
-    """Steps of them to predict from, at most."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("experiments.accuracy", given, lambda: report(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.accuracy", given)
+    return shell.guarded("experiments.accuracy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
@@ -66,7 +69,7 @@ def report(options: Options) -> None:
                 f"{run} is of {specification.level}, which nobody here demonstrates: there are no "
                 "other demonstrations to compare with"
             )
-    runtime.start()
+    jax_setup.start()
     for run in options.runs:
         Console(markup=False).print(describe(pretrained.load(run), options, run.name))
 

@@ -11,53 +11,60 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments.atari_animation import animate
-from experiments.common import experiment, memory, program, results
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.progress import Meter
-from leapjax.atari.domain import FOLDER, LONGEST, Settings, data_name, make, preset
-from leapjax.atari.games import find_game
+from leapjax.domains.atari.domain import FOLDER, LONGEST, Settings, make
+from leapjax.domains.atari.games import find_game
 from leapjax.errors import UserError
+from leapjax.presets import atari as presets
+from leapjax.running import main as running
+from leapjax.running import memory, results, shell
+from leapjax.running.limits import check_counts
+from leapjax.running.progress import Meter
+from leapjax.running.run import Experiment
+from leapjax.running.spelling import AtariConfig
 
 RECORDED = Path("results/atari-data.json")
-EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False)
 SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
-NAMES = {"--game": "--level"}  # what its users call the options of every experiment
+
+
+EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=AtariConfig)
 
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Play games with built-in demonstrators; writes what DQN-Replay's files hold."""
+    """Play games with built-in demonstrators; writes what DQN-Replay's files hold.
+
+    Attributes:
+        game: Game: Breakout, Qbert, Pong or Seaquest.
+        transitions: Transitions to make at least, in whole games; None for as many as preset
+            leapjax learns from.
+        folder: Folder for the data; if games were begun there, they are continued.
+        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
+            own.
+        longest: Decisions after which a game is cut off, because a ball can fly on for ever.
+        workers: Processes; None for one on each core.
+        record: Write the scores of the demonstrators to results/, which is committed.
+    """
 
     game: str
-    """Breakout, Qbert, Pong or Seaquest."""
     transitions: int | None = None
-    """At least so many, in whole games; None: as many as preset leapjax learns from."""
     folder: Path = Path(FOLDER)
-    """Where to; a game that was begun there goes on."""
     replay_run: int = 1
-    """Number of the run, as DQN-Replay has five of each game: each has games of its own."""
     longest: int = LONGEST
-    """Decisions of a game, which is cut off then: a ball can fly on for ever."""
     workers: int | None = None
-    """Processes; None: one on each core."""
     record: bool = False
-    """Write what demonstrators have reached to results/, which is committed, beside data of
-    another size."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
-    given = program.arguments_of(arguments)
+    given = shell.arguments_of(arguments)
     if given[:1] == ["collect"]:
-        options = tyro.cli(Collect, prog="experiments.atari collect", args=given[1:])
-        return program.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
-    return experiment.main(EXPERIMENT, program.renamed(given, NAMES))
+        options = shell.parse(Collect, "experiments.atari collect", given[1:])
+        return shell.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+    return running.main(EXPERIMENT, given)
 
 
 def run(options: Collect) -> None:
@@ -76,10 +83,10 @@ def run(options: Collect) -> None:
             f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
         )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
-    from leapjax.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
+    from leapjax.domains.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console(markup=False)
-    transitions = options.transitions or preset(options.game, "leapjax")["transitions"]
+    transitions = options.transitions or presets.transitions(options.game)
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
             options.folder, find_game(options.game), transitions, options.replay_run,
@@ -89,6 +96,17 @@ def run(options: Collect) -> None:
     console.print(scores_table(games))
     if options.record:
         results.add(RECORDED, data_name(options.game, transitions), games)
+
+
+def data_name(game: str, transitions: int) -> str:
+    """Returns what data of a game are recorded as: its name, where there are as many as usual."""
+    usual = transitions == presets.transitions(game)
+    return game if usual else f"{game}, {transitions:,} transitions"
+
+
+def game_of(name: str) -> str:
+    """Returns the game of data that `data_name` calls so."""
+    return name.partition(",")[0]
 
 
 def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:

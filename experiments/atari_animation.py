@@ -8,9 +8,9 @@ from PIL import Image, ImageDraw
 
 from experiments.common.episodes import watched
 from experiments.common.pictures import Frame, save_animation
-from experiments.common.run import Run
 from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
+from leapjax.running.run import Run
 from leapjax.types import Plan
 
 SIDE, MARGIN, LINE = 252, 150, 18  # pixels: of the game, of the plan beside it, of one action
@@ -21,7 +21,7 @@ WHITE, BLACK, GREY, BLUE = (255, 255, 255), (0, 0, 0), (150, 150, 150), (40, 110
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws the beginning of one game, every second decision of it."""
-    from leapjax.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
+    from leapjax.domains.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
 
     actions, title = run.domain.actions, run.domain.level
     frames: list[Frame] = []

@@ -14,17 +14,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from scipy import stats
 
 from experiments.accuracy import learned
-from experiments.common import memory, plots, program, results, runtime
-from experiments.common.config import check_counts, layer_bytes
+from experiments.common import figures
 from leapjax import pretrained
 from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
+from leapjax.running import jax_setup, memory, results, shell
+from leapjax.running.limits import check_counts, layer_bytes
 from leapjax.types import Demonstration
 
 RESULTS = Path("atari-energy.json")
@@ -32,23 +32,26 @@ RESULTS = Path("atari-energy.json")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Compare the energies of trajectories with their rewards."""
+    """Compare the energies of trajectories with their rewards.
+
+    Attributes:
+        checkpoint: Folders of runs of LEAP on Atari, one for each game.
+        windows: Random windows of each trajectory to compute the energy of.
+        record: Write the result to results/, which is committed.
+        runs: Folder for a result that is not recorded.
+    """
 
     checkpoint: tuple[Path, ...]
-    """Folders of runs of LEAP on Atari, one for each game."""
     windows: int = 64
-    """Random windows of each trajectory to take the energy of."""
     record: bool = False
-    """Write what was found to results/, which is committed."""
     runs: Path = Path("runs")
-    """Where what is not recorded goes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Says how energy and reward are correlated; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("experiments.atari_energy", given, lambda: report(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.atari_energy", given)
+    return shell.guarded("experiments.atari_energy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
@@ -66,7 +69,7 @@ def report(options: Options) -> None:
         horizon, model = specification.planner.horizon, specification.model
         layer = layer_bytes(model, specification.context + horizon)
         memory.check({"--windows": options.windows * horizon * layer})
-    runtime.start()
+    jax_setup.start()
     path = results.folder(options.record, options.runs) / RESULTS
     console = Console(markup=False)
     for checkpoint in options.checkpoint:
@@ -80,7 +83,7 @@ def report(options: Options) -> None:
             f"and reward (p = {each['p_value']:.2g}, {len(each['energies'])} trajectories)"
         )
     picture = options.runs / "atari-energy.png"
-    plots.energy_against_reward(found, picture)
+    figures.energy_against_reward(found, picture)
     console.print(f"picture: {picture}", highlight=False)
 
 

@@ -8,15 +8,16 @@ import sys
 from collections.abc import Sequence
 
 from experiments.babyai_animation import animate
-from experiments.common import experiment
-from experiments.common.experiment import Experiment
+from experiments.paper import find_success
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
 
-EXPERIMENT = Experiment("babyai", "babyai", animate=animate)
+EXPERIMENT = Experiment("babyai", "babyai", animate=animate, paper=find_success)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
-    return experiment.main(EXPERIMENT, arguments)
+    return running.main(EXPERIMENT, arguments)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,12 @@ import numpy as np
 from experiments.babyai_drawing import picture, spelled, way_of
 from experiments.common.episodes import watched
 from experiments.common.pictures import Frame, save_animation
-from experiments.common.run import Run
-from leapjax.babyai import levels
-from leapjax.babyai.adapter import ACTIONS, BabyAIAdapter
-from leapjax.babyai.levels import Level
+from leapjax.domains.babyai import levels
+from leapjax.domains.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.domains.babyai.levels import Level
 from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
+from leapjax.running.run import Run
 from leapjax.types import Plan
 
 REFINE_MS, STEP_MS, PAUSE_MS = 250, 220, 900

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-from leapjax.babyai.adapter import END, BabyAIAdapter
-from leapjax.babyai.observations import Cell, agent_cell
+from leapjax.domains.babyai.adapter import END, BabyAIAdapter
+from leapjax.domains.babyai.observations import Cell, agent_cell
 
 SIDE = 336  # pixels of a level, about
 CAPTION = 34  # pixels of text below the level

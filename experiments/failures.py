@@ -20,18 +20,18 @@ from rich.progress import track
 from rich.table import Table
 
 from experiments.babyai_drawing import picture
-from experiments.common import program, runtime
-from experiments.common.config import check_counts, check_executed
 from experiments.common.pictures import check_picture, save_sheet
 from leapjax import pretrained, rollouts
-from leapjax.babyai import levels, observations
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.levels import Level
-from leapjax.babyai.observations import Cell, Observation
 from leapjax.checks import check_integer
 from leapjax.data import seeds
+from leapjax.domains.babyai import levels, observations
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.levels import Level
+from leapjax.domains.babyai.observations import Cell, Observation
 from leapjax.environments import Transition
 from leapjax.errors import UserError
+from leapjax.running import jax_setup, shell
+from leapjax.running.limits import check_counts, check_executed
 
 FEW_CELLS = 6  # that an agent which goes in circles stays within
 COLUMNS = 4  # of the gallery
@@ -49,18 +49,21 @@ class Cause(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say why episodes fail."""
+    """Say why episodes fail.
+
+    Attributes:
+        runs: Folders of runs of one level, for instance of several seeds.
+        episodes: Validation episodes for each run.
+        executed: Actions to execute before replanning; None for the whole plan.
+        gallery: Path of the picture of failures; None for failures.png in the first run's folder.
+        drawn: Failures in the picture, at most.
+    """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs of one level, for instance of several seeds."""
     episodes: int = 500
-    """Validation episodes for each."""
     executed: int | None = None
-    """Actions to execute before replanning; None: the whole plan."""
     gallery: Path | None = None
-    """The picture to draw; None: failures.png in the first run's folder."""
     drawn: int = 8
-    """Failures in it, at most."""
 
 
 class Recorder(BabyAIAdapter):
@@ -93,9 +96,9 @@ class Recorder(BabyAIAdapter):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plays, counts, draws; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("experiments.failures", given, lambda: report(options))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.failures", given)
+    return shell.guarded("experiments.failures", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
@@ -107,7 +110,7 @@ def report(options: Options) -> None:
     if options.gallery is not None:
         check_picture(options.gallery)
     level = only_level(options.runs, options.executed)
-    runtime.start()
+    jax_setup.start()
     recorders: list[Recorder] = []
     successes: list[bool] = []
     for run in track(options.runs, "playing", console=console):

@@ -6,18 +6,16 @@ Trains a method on a Minari data set of an environment with discrete actions, an
 import sys
 from collections.abc import Sequence
 
-from experiments.common import experiment, program
-from experiments.common.experiment import Experiment
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
+from leapjax.running.spelling import GymnasiumConfig
 
-EXPERIMENT = Experiment("gymnasium", "gymnasium")
-# What its users call the options of every experiment.
-NAMES = {"--env": "--level", "--dataset": "--demonstrations"}
+EXPERIMENT = Experiment("gymnasium", "gymnasium", config=GymnasiumConfig)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every environment and seed asked for; the exit code."""
-    given = program.renamed(program.arguments_of(arguments), NAMES)
-    return experiment.main(EXPERIMENT, given)
+    return running.main(EXPERIMENT, arguments)
 
 
 if __name__ == "__main__":

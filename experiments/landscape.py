@@ -5,7 +5,6 @@ demonstrations that were never learned from, as they are and with a share of the
 at random, over training. Beside it, the energy of plans over the iterations that refine them.
 """
 
-import contextlib
 import dataclasses
 import functools
 import sys
@@ -16,23 +15,27 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments import accuracy
-from experiments.common import config as configs
-from experiments.common import experiment, plots, program, results, run, runtime
-from experiments.common.config import check_counts
-from experiments.common.experiment import Experiment
-from experiments.common.interruption import Interruption
-from experiments.common.run import Run
+from experiments.common import figures
 from leapjax import files
 from leapjax.batching import compile_planner
+from leapjax.configuration import change
 from leapjax.data import seeds, windows
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
+from leapjax.presets import find_preset
 from leapjax.pretrained import Pretrained
+from leapjax.running import jax_setup, limits, results, shell
+from leapjax.running.data import load_demonstrations
+from leapjax.running.interruption import Interruption
+from leapjax.running.limits import check_counts
+from leapjax.running.metrics import read_metrics
+from leapjax.running.programs import PLANS_TOGETHER
+from leapjax.running.run import Experiment, Run, open_run
+from leapjax.running.train import train
 from leapjax.types import Context, Energy, Params, Window
 
 CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
@@ -42,29 +45,32 @@ RESULTS = Path("landscape.json")
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train, and watch the energies of good and bad plans."""
+    """Train, and watch the energies of good and bad plans.
+
+    Attributes:
+        level: Level of BabyAI; the paper's is the default.
+        presets: Presets to train with, "paper" or "leapjax" or both.
+        seed: Training seed.
+        trajectories: Demonstrations to compute the energy of, and contexts to plan for.
+        steps: Training steps; None for as many as the preset has.
+        record: Write the result to results/, which is committed.
+        runs: Folder for trained models, and for a result that is not recorded.
+    """
 
     level: str = "GoToLocalS7N5"
-    """A level of BabyAI; the paper's is this one."""
     presets: tuple[str, ...] = ("paper", "leapjax")
-    """What is trained."""
     seed: int = 0
-    """Training seed."""
     trajectories: int = 200
-    """Demonstrations to take the energy of, and contexts to plan for."""
     steps: int | None = None
-    """Train for so many steps; None: as long as the preset says."""
     record: bool = False
-    """Write what was found to results/, which is committed."""
     runs: Path = Path("runs")
-    """Where what is trained, and what is not recorded, goes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains with each preset and says what was found; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.stoppable(
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.landscape", given)
+    return shell.stoppable(
         "experiments.landscape", given, lambda interruption: report(options, interruption)
     )
 
@@ -83,22 +89,26 @@ def report(options: Options, interruption: Interruption) -> None:
     console = Console(markup=False)
     wanted = []
     for preset in options.presets:
-        config = configs.preset("babyai", options.level, "leap", preset)
+        config = find_preset("babyai", options.level, "leap", preset)
         if options.steps is not None:
-            config = configs.with_options(config, {"steps": options.steps})
+            config = change(config, training={"steps": options.steps})
         # What is watched is part of a run: one of another count is another run.
         runs = options.runs / f"landscape-{options.trajectories}"
         config = dataclasses.replace(config, seeds=(options.seed,), runs=runs)
-        configs.check(config)
+        limits.check(config)
         wanted.append(config)
-    runtime.start()
+    jax_setup.start()
     found = []
     for config in wanted:
-        this = experiment.make_run(EXPERIMENT, config, options.seed, console, interruption)
-        found.append(landscape(this, options.trajectories))
+        played = seeds.validation_seeds(0, options.trajectories)
+        opened = open_run(
+            EXPERIMENT, config, options.seed, console, interruption, played, plays=False
+        )
+        with opened as this:
+            found.append(landscape(this, options.trajectories))
     console.print(table(found))
     keep(folder / RESULTS, found)
-    plots.landscape(found, options.runs / "landscape.png")
+    figures.landscape(found, options.runs / "landscape.png")
     console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False)
 
 
@@ -123,11 +133,10 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
         found = {n: mean_energy(energy, params, firsts, n / 100, end) for n in CORRUPTED}
         return {f"random_{share}": float(mean) for share, mean in found.items()}
 
-    with contextlib.ExitStack() as stack:
-        played = seeds.validation_seeds(0, count)
-        planner, metrics = experiment.train(this, played, stack, measure, plays=False)
+    planner = train(this, load_demonstrations(this), measure)
     last = measure(planner.energy, planner.params)
-    watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in metrics]
+    curve = read_metrics(this.folder)
+    watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in curve]
     if not watched:  # trained before, and its curve is gone
         watched = [{"step": this.config.training.steps, **last}]
     return {
@@ -197,7 +206,7 @@ def refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
     trained = planner.specification.planner
     assert isinstance(trained, GibbsConfig)  # as of every energy over plans of several actions
     config = dataclasses.replace(trained, iterations=max(10, trained.iterations), score_trace=True)
-    plan = compile_planner(planner.energy, config, run.CHUNK_SIZES)
+    plan = compile_planner(planner.energy, config, (PLANS_TOGETHER,))
     keys = jax.random.split(jax.random.key(0), len(jax.tree.leaves(contexts)[0]))
     plans = plan(planner.params, keys, contexts)
     energies = np.asarray(plans.trace_energies)  # [B, N]

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 from minigrid.core.world_object import WorldObj
 
-from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case, Model, Way, alone, drawn_at
-from leapjax.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import (
+from experiments.common import cases
+from experiments.common.cases import Analysis, Case, Model, Way, alone, drawn_at
+from leapjax.configuration import AnyConfig, change
+from leapjax.domains.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
+from leapjax.domains.babyai.constraints import (
     goal_before_visit,
     half_of_obstacles,
     immediate_lava,
@@ -31,9 +32,9 @@ from leapjax.babyai.constraints import (
     without_marks,
     without_open_doors,
 )
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.symmetries import LEFT
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.symmetries import LEFT
 from leapjax.energy import compose, constrain, neutral, view
 from leapjax.environments import Transition
 from leapjax.planners import BeamConfig, GibbsConfig
@@ -48,15 +49,57 @@ WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any deto
 LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
 AGAIN = 16.0  # nats for each time that the agent was before where it comes to
 PICKUP = ACTIONS.index("pickup")
-# A plan under a constraint may begin as no demonstration does: show where such beginnings lead.
-# (A plan of one action has no beginning that others could follow.)
-FALSE_STARTS = {"leap": {"false_starts": 0.6}}
-# Demonstrations of empty rooms never go around things. (IQL learns from transitions, one step at
-# a time, in which nobody goes around anything.)
-_DETOURS = {"detours": 0.5, "lookalikes": True}
-DETOURS = {"leap": _DETOURS, "dt": _DETOURS}
-BOTH = {"leap": {**_DETOURS, **FALSE_STARTS["leap"]}, "dt": _DETOURS}
-LONG = {"steps": 3000}  # of every method, where one of them has more to learn
+
+
+def longer(config: AnyConfig) -> AnyConfig:
+    """Trains every method longer, where one of them has more to learn."""
+    return change(config, training={"steps": 3000})
+
+
+def with_false_starts(config: AnyConfig) -> AnyConfig:
+    """Shows LEAP where beginnings lead that no demonstration has: a constraint asks for such ones.
+
+    A plan of one action has no beginning that others could follow.
+    """
+    return change(config, domain_settings={"false_starts": 0.6} if config.method == "leap" else {})
+
+
+def with_detours(config: AnyConfig) -> AnyConfig:
+    """Shows ways around things, which demonstrations of empty rooms never have.
+
+    IQL learns from transitions: nobody goes around anything in one step.
+    """
+    detours = {"detours": 0.5, "lookalikes": True}
+    return change(config, domain_settings=detours if config.method in ("leap", "dt") else {})
+
+
+def in_room(config: AnyConfig) -> AnyConfig:
+    """Learns in an empty room for levels with obstacles and constraints."""
+    return longer(with_detours(with_false_starts(config)))
+
+
+def in_maze(config: AnyConfig) -> AnyConfig:
+    """Learns in a maze for levels with constraints."""
+    return longer(with_false_starts(config))
+
+
+def among_objects(config: AnyConfig) -> AnyConfig:
+    """Plans ten actions: a detour around objects is longer than plans in an empty room."""
+    found = in_maze(config)
+    if config.method != "leap":
+        return found
+    return change(found, planner={"horizon": 10, "iterations": 10})
+
+
+def for_maze(config: AnyConfig, sweeps: int) -> AnyConfig:
+    """Learns in a room for a maze, whose ways are as long as so many sweeps reach."""
+    changed = change(config, domain_settings={"sweeps": sweeps}, training={"steps": 2000})
+    return with_detours(changed)
+
+
+def far_sighted(config: AnyConfig) -> AnyConfig:
+    """Learns distances as long as the ways in a maze."""
+    return change(config, domain_settings={"sweeps": 40})
 
 
 class Watched(BabyAIAdapter):
@@ -329,10 +372,8 @@ def _composed(
 
 
 MAZE, OBSTACLES = "GoToObjMazeS4", "GoToBehindObstacles"
-ROOM, OPEN_MAZE = Model("GoToLocalS8N1", LONG, BOTH), Model(MAZE, LONG, FALSE_STARTS)
-# A detour around objects is longer than the plans that are learned there.
-LONGER = {"horizon": 10, "iterations": 10}
-OBJECTS = Model("GoToLocalS8N7", LONG, {"leap": {**LONGER, **FALSE_STARTS["leap"]}})
+ROOM, OPEN_MAZE = Model("GoToLocalS8N1", in_room), Model(MAZE, in_maze)
+OBJECTS = Model("GoToLocalS8N7", among_objects)
 CASES = (
     _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
     _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
@@ -340,15 +381,17 @@ CASES = (
     Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
-        "generalization-medium", [Model("GoToLocalS7N1", {"sweeps": 28, "steps": 2000}, DETOURS)],
+        "generalization-medium",
+        [Model("GoToLocalS7N1", functools.partial(for_maze, sweeps=28))],
         "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
     ),
     Case(
-        "generalization-hard", [Model("GoToLocalS10N1", {"sweeps": 40, "steps": 2000}, DETOURS)],
+        "generalization-hard",
+        [Model("GoToLocalS10N1", functools.partial(for_maze, sweeps=40))],
         MAZE, _without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
-        "composition-easy", [Model(OBSTACLES, LONG, BOTH)] * 2, OBSTACLES,
+        "composition-easy", [Model(OBSTACLES, in_room)] * 2, OBSTACLES,
         [
             *_composed(halves, (83.5, 58.0, 42.5)),
             Way("one half alone", minimise=one_half, search=noisily),
@@ -361,7 +404,7 @@ CASES = (
         ],
     ),
     Case(
-        "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", {"sweeps": 40})],
+        "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", far_sighted)],
         "PickUpObjMazeS4",
         [
             *_composed(fetch, (43.0, 15.5, 11.5)),
@@ -379,7 +422,7 @@ ANALYSIS = Analysis("properties", CASES)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Every case asked for; the exit code."""
-    return analysis.main(ANALYSIS, arguments)
+    return cases.main(ANALYSIS, arguments)
 
 
 if __name__ == "__main__":

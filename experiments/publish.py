@@ -11,8 +11,8 @@ from typing import Annotated
 
 import tyro
 
-from experiments.common import program, runtime
 from leapjax import pretrained
+from leapjax.running import jax_setup, shell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Publishes every run that is named."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.guarded("experiments.publish", given, lambda: publish(options.runs))
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.publish", given)
+    return shell.guarded("experiments.publish", given, lambda: publish(options.runs))
 
 
 def publish(runs: Sequence[Path]) -> None:
     """Publishes runs, the later one where two are of one level."""
     targets = [pretrained.PUBLISHED / pretrained.read_specification(run).level for run in runs]
-    runtime.start()
+    jax_setup.start()
     for folder, target in zip(runs, targets, strict=True):
         pretrained.publish(folder, target)
         size = sum(path.stat().st_size for path in target.iterdir())

@@ -14,27 +14,27 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import tyro
 from PIL import Image
 from rich.console import Console
 
 from experiments import properties
 from experiments.babyai_drawing import Colour, picture, spelled, way_of
-from experiments.common import analysis, program, results, runtime
-from experiments.common.analysis import Way, Work
+from experiments.common import cases
+from experiments.common.cases import Way, Work
 from experiments.common.episodes import watched
-from experiments.common.interruption import Interruption
 from experiments.common.pictures import save_sheet
 from leapjax import files, pretrained
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.constraints import in_half
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.observations import Cell, agent_cell
 from leapjax.data import seeds
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.constraints import in_half
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.observations import Cell, agent_cell
 from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import Pretrained
+from leapjax.running import jax_setup, results, shell
+from leapjax.running.interruption import Interruption
 from leapjax.types import Plan
 
 FIGURES = ("plans", "properties")
@@ -54,16 +54,20 @@ ASKED = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw plans, and what comes of them."""
+    """Draw plans, and what comes of them.
+
+    Attributes:
+        seed: Training seed of models that are not trained yet.
+        test_seed: Level seed to search from for episodes to draw; the first that are long enough
+            are drawn.
+        record: Write the figures to docs/, which is committed.
+        runs: Folder for trained models, and for figures that are not recorded.
+    """
 
     seed: int = 0
-    """Training seed, of what must be trained."""
     test_seed: int = seeds.UNSEEN
-    """Level seed to look from for episodes to draw: the first that are long enough are taken."""
     record: bool = False
-    """Write the figures of docs/, which are committed."""
     runs: Path = Path("runs")
-    """Where what is trained, and figures that are not recorded, go."""
 
 
 class Drawn(NamedTuple):
@@ -79,9 +83,9 @@ class Drawn(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draws both figures; the exit code."""
-    given = program.arguments_of(arguments)
-    options = tyro.cli(Options, args=given)
-    return program.stoppable(
+    given = shell.arguments_of(arguments)
+    options = shell.parse(Options, "experiments.qualitative", given)
+    return shell.stoppable(
         "experiments.qualitative", given, lambda interruption: draw(options, interruption)
     )
 
@@ -90,10 +94,10 @@ def draw(options: Options, interruption: Interruption) -> None:
     """Both figures."""
     seeds.test_seeds(options.test_seed, MOST_LEVELS)
     seeds.training_seeds(options.seed)
-    runtime.start()
+    jax_setup.start()
     work = Work(
         properties.ANALYSIS,
-        analysis.Options(runs=options.runs),
+        cases.Options(runs=options.runs),
         results.versions(),
         Console(markup=False),
         interruption,
@@ -126,8 +130,8 @@ def refinement(level: str, first: int) -> list[Image.Image]:
     def refined(found: Drawn) -> bool:
         return all(before != after for before, after in pairwise(plans_of(found)[1]))
 
-    domain = analysis.domain_of(level, [planner])
-    asked = analysis.asked(domain, Way("refined"), [planner], search)
+    domain = cases.domain_of(level, [planner])
+    asked = cases.asked(domain, Way("refined"), [planner], search)
     found = episode(level, asked, None, first, refined)
     start, ways = plans_of(found)
     plans = [
@@ -141,9 +145,9 @@ def unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Im
     """What models do in a world that they were not trained in."""
     (case,) = (case for case in properties.CASES if case.name == case_name)
     (way,) = (way for way in case.ways if way.name == way_name)
-    models = analysis.models_of(work, case, way.method, options.seed)
+    models = cases.models_of(work, case, way.method, options.seed)
     search = way.search(models[0].specification.planner)
-    planner = analysis.asked(analysis.domain_of(case.level, models), way, models, search)
+    planner = cases.asked(cases.domain_of(case.level, models), way, models, search)
     found = episode(case.level, planner, way.executed, options.test_seed)
     halves: list[tuple[list[Cell], Colour]] = []
     if case_name.startswith("composition"):  # who sees which obstacles

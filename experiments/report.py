@@ -10,13 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import plots, program, results
-from experiments.common.results import Row
+from experiments.common import figures
 from experiments.tables import analyses, atari, babyai, measured, puzzles, speed
 from experiments.tables.analyses import ANALYSES
 from experiments.tables.measured import MEASURED
 from leapjax.errors import UserError
 from leapjax.files import read_text, write_text
+from leapjax.running import results, shell, startup
+from leapjax.running.results import Row
 
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
@@ -26,10 +27,11 @@ PROPERTIES = ("adaptation", "generalization", "composition", "constraints")  # a
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Rewrites every table here; the exit code."""
-    given = program.arguments_of(arguments)
+    given = shell.arguments_of(arguments)
     about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
-    argparse.ArgumentParser("experiments.report", description=about).parse_args(given)
-    return program.guarded("experiments.report", given, rewrite)
+    command = startup.command("experiments.report")
+    argparse.ArgumentParser(command, description=about).parse_args(given)
+    return shell.guarded("experiments.report", given, rewrite)
 
 
 def rewrite() -> None:
@@ -38,16 +40,18 @@ def rewrite() -> None:
         write_text(path, text)
     rows, folder = rows_of(Path(), "babyai"), Path("docs")
     by_passes = puzzles.success_by_passes(rows_of(Path(), *PUZZLES))
-    plots.iterations_by_level(babyai.success_by_iterations(rows), folder / "iterations.png")
-    plots.iterations_by_level(by_passes, folder / "searches.png")
-    plots.methods_by_level(babyai.success_by_method(rows), babyai.COMPARED, folder / "methods.png")
-    plots.intervals(babyai.aggregates(rows), folder / "aggregate.png")
-    plots.landscape(_measured(Path(), "landscape"), folder / "landscape.png")
-    plots.energy_against_reward(_measured(Path(), "atari-energy"), folder / "atari-energy.png")
+    figures.iterations_by_level(babyai.success_by_iterations(rows), folder / "iterations.png")
+    figures.iterations_by_level(by_passes, folder / "searches.png")
+    figures.methods_by_level(
+        babyai.success_by_method(rows), babyai.COMPARED, folder / "methods.png"
+    )
+    figures.intervals(babyai.aggregates(rows), folder / "aggregate.png")
+    figures.landscape(_measured(Path(), "landscape"), folder / "landscape.png")
+    figures.energy_against_reward(_measured(Path(), "atari-energy"), folder / "atari-energy.png")
 
 
 def rows_of(root: Path, *names: str) -> list[Row]:
-    """The rows of some experiments.
+    """Reads the rows of some experiments, each with its episodes where they are recorded.
 
     Raises:
         UserError: a row that tables could not be made from, or of another experiment.
@@ -56,13 +60,14 @@ def rows_of(root: Path, *names: str) -> list[Row]:
     for name in names:
         path = root / "results" / f"{name}.jsonl"
         schema = results.OF_ANALYSIS if name in ANALYSES else results.OF_EXPERIMENT
+        recorded = results.read_episodes(path)
         for row in results.read(path, schema):
             if row["experiment"] != name:
                 raise UserError(
                     f"{path}: a row of {row['experiment'][:40]}, hash {row['hash'][:20]}: move it "
                     "to the file of its experiment"
                 )
-            found.append(row)
+            found.append({**row, "recorded": recorded.get(row["hash"])})
     return found
 
 

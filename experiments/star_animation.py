@@ -10,12 +10,12 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from experiments.common.pictures import Frame, save_animation
-from experiments.common.run import Run
 from experiments.common.searches import SEARCHES, searches
 from leapjax import rollouts
 from leapjax.batching import compile_planner, plan_keys
+from leapjax.domains.puzzles.stars.graphs import Graph, Star, StarAdapter, find_level
 from leapjax.pretrained import Pretrained
-from leapjax.stars.graphs import Graph, Star, StarAdapter, find_level
+from leapjax.running.run import Run
 
 SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels, as are the next two
 SPACING, MOST = 28, 1000  # from node to node; of a side

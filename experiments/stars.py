@@ -8,17 +8,17 @@ each takes.
 import sys
 from collections.abc import Sequence
 
-from experiments.common import experiment
-from experiments.common.experiment import Experiment
 from experiments.common.searches import searches
 from experiments.star_animation import animate
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
 
 EXPERIMENT = Experiment("stars", "stars", searches, animate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
-    return experiment.main(EXPERIMENT, arguments)
+    return running.main(EXPERIMENT, arguments)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ A turn becomes one of the five other actions with probability 0.2, in demonstrat
 import sys
 from collections.abc import Sequence
 
-from experiments.common import analysis
-from experiments.common.analysis import NOISE, Analysis, Case, Model, Way
+from experiments.common import cases
+from experiments.common.cases import NOISE, Analysis, Case, Model, Way
 
 
 def _case(level: str, leap: float, dt: float) -> Case:
@@ -31,7 +31,7 @@ ANALYSIS = Analysis(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Every case asked for; the exit code."""
-    return analysis.main(ANALYSIS, arguments)
+    return cases.main(ANALYSIS, arguments)
 
 
 if __name__ == "__main__":

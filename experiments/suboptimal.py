@@ -8,8 +8,8 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 
-from experiments.common import analysis
-from experiments.common.analysis import NOISE, Analysis, Case, Model, Way
+from experiments.common import cases
+from experiments.common.cases import NOISE, Analysis, Case, Model, Way
 from leapjax.planners import GibbsConfig
 
 # The paper's success of LEAP and DT, from optimal demonstrations and from others.
@@ -47,7 +47,7 @@ ANALYSIS = Analysis(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Every case asked for; the exit code."""
-    return analysis.main(ANALYSIS, arguments)
+    return cases.main(ANALYSIS, arguments)
 
 
 if __name__ == "__main__":

@@ -7,16 +7,16 @@ way that there is, and reports success against the passes of the model that each
 import sys
 from collections.abc import Sequence
 
-from experiments.common import experiment
-from experiments.common.experiment import Experiment
 from experiments.common.searches import searches
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
 
 EXPERIMENT = Experiment("sudoku", "sudoku", searches)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
-    return experiment.main(EXPERIMENT, arguments)
+    return running.main(EXPERIMENT, arguments)
 
 
 if __name__ == "__main__":

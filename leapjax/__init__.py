@@ -4,35 +4,46 @@ An `Energy` is a few pure functions of one trajectory; a planner finds a plan of
 energy; `compile_planner` makes it plan for any number of contexts at once.
 """
 
-from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
-from leapjax.domain import Domain
-from leapjax.energy import (
-    autoregressive,
-    classifier,
-    compose,
-    constrain,
-    from_total,
-    neutral,
-    pseudo_likelihood,
-    single_action,
-    view,
-)
-from leapjax.errors import UserError
-from leapjax.planners import (
-    BeamConfig,
-    CrossEntropyConfig,
-    GibbsConfig,
-    ShootingConfig,
-    beam_search,
-    cross_entropy_method,
-    gibbs,
-    random_shooting,
-)
-from leapjax.pretrained import Pretrained, load
-from leapjax.pure import PureEnvironment, compile_rollout
-from leapjax.rollouts import Episodes, evaluate
-from leapjax.scores import interval_over_seeds, wilson_interval
-from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
+    from leapjax.domain import Domain
+    from leapjax.energy import (
+        autoregressive,
+        classifier,
+        compose,
+        constrain,
+        from_total,
+        neutral,
+        pseudo_likelihood,
+        single_action,
+        view,
+    )
+    from leapjax.errors import UserError
+    from leapjax.fitting import fit, make_domain
+    from leapjax.planners import (
+        BeamConfig,
+        CrossEntropyConfig,
+        GibbsConfig,
+        ShootingConfig,
+        beam_search,
+        cross_entropy_method,
+        gibbs,
+        random_shooting,
+    )
+    from leapjax.pretrained import Pretrained, load
+    from leapjax.pure import PureEnvironment, compile_rollout
+    from leapjax.rollouts import Episodes, evaluate
+    from leapjax.scores import (
+        aggregate,
+        interval_of_episodes,
+        interval_over_seeds,
+        wilson_interval,
+    )
+    from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+    from leapjax.version import __version__ as __version__
 
 __all__ = [
     "Agent",
@@ -51,6 +62,7 @@ __all__ = [
     "ShootingConfig",
     "TrainState",
     "UserError",
+    "aggregate",
     "autoregressive",
     "beam_search",
     "classifier",
@@ -60,10 +72,13 @@ __all__ = [
     "constrain",
     "cross_entropy_method",
     "evaluate",
+    "fit",
     "from_total",
     "gibbs",
+    "interval_of_episodes",
     "interval_over_seeds",
     "load",
+    "make_domain",
     "neutral",
     "plan_keys",
     "pseudo_likelihood",
@@ -72,3 +87,62 @@ __all__ = [
     "view",
     "wilson_interval",
 ]
+
+# By module, the names that it defines: it is imported when one of them is first used.
+_DEFINED = {
+    "leapjax.batching": ("CompiledPlanner", "compile_planner", "plan_keys"),
+    "leapjax.domain": ("Domain",),
+    "leapjax.energy": (
+        "autoregressive",
+        "classifier",
+        "compose",
+        "constrain",
+        "from_total",
+        "neutral",
+        "pseudo_likelihood",
+        "single_action",
+        "view",
+    ),
+    "leapjax.errors": ("UserError",),
+    "leapjax.fitting": ("fit", "make_domain"),
+    "leapjax.planners": (
+        "BeamConfig",
+        "CrossEntropyConfig",
+        "GibbsConfig",
+        "ShootingConfig",
+        "beam_search",
+        "cross_entropy_method",
+        "gibbs",
+        "random_shooting",
+    ),
+    "leapjax.pretrained": ("Pretrained", "load"),
+    "leapjax.pure": ("PureEnvironment", "compile_rollout"),
+    "leapjax.rollouts": ("Episodes", "evaluate"),
+    "leapjax.scores": (
+        "aggregate",
+        "interval_of_episodes",
+        "interval_over_seeds",
+        "wilson_interval",
+    ),
+    "leapjax.types": ("Agent", "Context", "Demonstration", "Energy", "Plan", "TrainState"),
+    "leapjax.version": ("__version__",),
+}
+_PLACES = {name: module for module, names in _DEFINED.items() for name in names}
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that exists
+
+    def __getattr__(name: str) -> Any:
+        """Imports a public name when it is first used (PEP 562)."""
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from leapjax.extras import missing_explained  # noqa: PLC0415  (only then)
+
+        with missing_explained():
+            value = getattr(importlib.import_module(_PLACES[name]), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """Lists the names that are imported later, too."""
+    return sorted({*globals(), *_PLACES})

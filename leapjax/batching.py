@@ -1,5 +1,6 @@
 """Planners for batches: jitted once, cut into chunks of a few sizes, split over devices."""
 
+import contextlib
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -9,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from leapjax import sharding
-from leapjax.checks import check_counts, check_kind, check_seed, check_seeds
+from leapjax import compilation, sharding
+from leapjax.checks import check_counts, check_integer, check_kind, check_seed, check_seeds
 from leapjax.errors import UserError
 from leapjax.planners import PlannerConfig, find_planner
 from leapjax.types import Array, EncodeNext, Energy, Params, Plan, PyTree
@@ -34,6 +35,10 @@ class CompiledPlanner:
     """A jitted planner for batches of any size; made by `compile_planner`.
 
     It keeps a reference to the parameters of its last call.
+
+    Attributes:
+        chunk_sizes: allowed numbers of plans per call of the compiled function, ascending.
+        num_actions: A of the energy, the end action included.
     """
 
     def __init__(
@@ -86,7 +91,8 @@ class CompiledPlanner:
 
         Raises:
             ValueError: no contexts, or not as many as keys; contexts that are not numbers; numbers
-                of 64 bits, in contexts or parameters, that do not fit 32.
+                of 64 bits, in contexts or parameters, that do not fit 32; or a call inside of
+                `jit`, `vmap` or `grad`.
             NotANumber: the energy of some action was NaN or -inf; it holds the plans.
         """
         return self.plan_next(params, keys, contexts, None)[0]
@@ -111,6 +117,13 @@ class CompiledPlanner:
             ValueError: as in a call.
             NotANumber: as in a call.
         """
+        leaves = jax.tree.leaves((params, keys, contexts))
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            raise UserError(
+                "a compiled planner was called inside of jit, vmap or grad, where it sees no "
+                "numbers: call it outside, or use leap.gibbs (or the planner of its "
+                "configuration) there, with jax.vmap over keys and contexts"
+            )
         if not hasattr(keys, "dtype"):
             if not isinstance(keys, Sequence) or isinstance(keys, str):
                 raise UserError(f"keys must be an array, one for each context, got {keys!r}")
@@ -188,6 +201,29 @@ class CompiledPlanner:
             self._last = leaves, structure, placed  # at once: another thread sees all or nothing
         return placed
 
+    def compile(self, params: Params, context: PyTree, batch: int = 1, again: bool = True) -> None:
+        """Compiles what batches of at most `batch` plans need, so that later calls start at once.
+
+        It plans once for each chunk size, and drops the plans.
+
+        Args:
+            params: of the energy; their shapes and types count.
+            context: of one plan, without a leading `[B]`; its shapes and types count.
+            batch: B, the largest number of contexts in a call.
+            again: also compile plans after the first of an episode, which use a cache if there is
+                one (see `plan_next`).
+
+        Raises:
+            ValueError: see `__call__`; or `batch` is not positive.
+        """
+        for size in self.sizes_up_to(check_integer("batch", batch, 1)):
+            contexts = jax.tree.map(lambda leaf, n=size: np.stack([np.asarray(leaf)] * n), context)
+            keys = plan_keys(0, np.arange(size), np.zeros(size, int))
+            with contextlib.suppress(NotANumber):  # these numbers are nobody's
+                _, cache = self.plan_next(params, keys, contexts, None)
+                if again and cache is not None:
+                    self.plan_next(params, keys, contexts, cache)
+
     def sizes_up_to(self, batch: int) -> list[int]:
         """The chunk sizes that batches of at most so many plans can need."""
         batches = range(1, min(batch, 2 * self.chunk_sizes[-1]) + 1)
@@ -205,7 +241,11 @@ def compile_planner(
 
     A batch is split into chunks of a few fixed sizes, so that 7, 300 or 10,000 contexts
     just work: each chunk size compiles at its first use, a chunk fits the cache, only the
-    last chunk is ever padded, and all are dispatched before any is waited for.
+    last chunk is ever padded, and all are dispatched before any is waited for. (`compile` on what
+    is returned compiles ahead.)
+
+    Compiled programs are kept on disk, in the user's cache folder, unless JAX has a cache already
+    (`jax_compilation_cache_dir`); `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
 
     Args:
         energy: what to minimise.
@@ -221,6 +261,7 @@ def compile_planner(
         TypeError: a `config` that is of no planner.
         ValueError: chunk sizes that are not positive.
     """
+    compilation.use_disk_cache()
     return CompiledPlanner(energy, config, chunk_sizes, devices, encode_next)
 
 

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from leapjax.errors import UserError
+from leapjax.errors import UserError, first_line
 
 T = TypeVar("T")
 MOST = 2**31 - 1  # the largest int32, the integers that JAX computes with
@@ -202,6 +203,32 @@ def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
             f"{name}: numbers that do not fit {dtype}, or are not finite, such as {array[wrong][0]}"
         )
     return narrow
+
+
+def check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
+    """Returns real numbers as JAX's array of floats: unsigned integers have no negatives.
+
+    Args:
+        name: of the numbers, for the message.
+        values: an array, or what JAX makes one of.
+        shape: that they must have.
+
+    Raises:
+        UserError: another shape, or no real numbers.
+    """
+    try:
+        # Python's integers may be larger than those of JAX.
+        array = jnp.asarray(float(values) if isinstance(values, int) else values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"{name} must be numbers: {first_line(error)}") from error
+    if array.shape != shape:
+        expected = f"{name} must be of shape {shape}" if shape else f"{name} must be one number"
+        raise UserError(f"{expected}, got shape {array.shape}")
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if not (jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == bool):
+        raise UserError(f"{name} must be real numbers, got {array.dtype}")
+    return array.astype(jnp.float32)
 
 
 def check_types(config: Any, *unlimited: str) -> None:

@@ -7,18 +7,21 @@ of each, in a folder of its own, and a line in `leapjax.domains`.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError, did_you_mean
-from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from leapjax.models.encoder import Encoder
+    from leapjax.models.trajectory import ModelConfig
 
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # what a network must know of its training data, kept with its checkpoint: by array of an
@@ -28,45 +31,72 @@ Augmentation = Callable[[jax.Array, Window], Window]
 
 
 class Collection(NamedTuple):
-    """Demonstrations, and what was dropped on the way to them."""
+    """Demonstrations, and what was dropped on the way to them.
+
+    Attributes:
+        demonstrations: those that can be used.
+        dropped: how many were dropped, by the reason.
+    """
 
     demonstrations: list[Demonstration]
-    dropped: Mapping[str, int]  # how many, by the reason
+    dropped: Mapping[str, int]
 
 
 class Recording(NamedTuple):
-    """An episode of n steps as somebody else recorded it, with observations of their own."""
+    """An episode of n steps as somebody else recorded it, with observations of their own.
 
-    observations: Any  # [n + 1, ...]
-    actions: np.ndarray  # [n] int64
-    rewards: np.ndarray  # [n] float32
-    seed: int  # with which the environment was reset; negative where nobody knows
+    Attributes:
+        observations: `[n + 1, ...]`.
+        actions: `[n]` int64.
+        rewards: `[n]` float32.
+        seed: with which the environment was reset; negative where nobody knows.
+    """
+
+    observations: Any
+    actions: np.ndarray
+    rewards: np.ndarray
+    seed: int
 
 
 class Described(NamedTuple):
-    """What a data set says of itself; what is wrong with that is said when it is loaded."""
+    """What a data set says of itself; what is wrong with that is said when it is loaded.
 
-    level: str | None = None  # the id of the environment that it was recorded in
+    Attributes:
+        level: the id of the environment that it was recorded in.
+        episodes: how many it holds.
+        arguments: of that environment.
+        wrappers: around it, the innermost first, each with `name`, `entry_point` and `kwargs`;
+            None: the data set does not say.
+        max_steps: of an episode, by that environment.
+        spaces: of each "observation" and "action", where it says more than shapes and types.
+    """
+
+    level: str | None = None
     episodes: int | None = None
-    arguments: Mapping[str, Any] | None = None  # of that environment
-    wrappers: Sequence[Mapping[str, Any]] | None = None  # around it, the innermost first, each with
-    # `name`, `entry_point` and `kwargs`; None: it does not say
-    max_steps: int | None = None  # of an episode, by that environment
-    spaces: Mapping[str, gym.Space] = {}  # of each "observation" and "action", where it says more
-    # than shapes and types
+    arguments: Mapping[str, Any] | None = None
+    wrappers: Sequence[Mapping[str, Any]] | None = None
+    max_steps: int | None = None
+    spaces: Mapping[str, "gym.Space"] = {}
 
 
 class Source(NamedTuple):
-    """Where demonstrations are kept, and how: as Minari data sets, or in a format of their own."""
+    """Where demonstrations are kept, and how: as Minari data sets, or in a format of their own.
 
-    default: str  # where they are, if nobody says
+    Attributes:
+        default: where they are, if nobody says.
+        exists: (where) -> whether they are there.
+        make: (where, progress) -> what was made, in words; writes them.
+        load: (where, training seed) -> as many as are asked for; UserError if there are fewer.
+        amount: how many `make` makes, and tells the progress of.
+        unit: of the amount, such as "demonstrations".
+    """
+
+    default: str
     exists: Callable[[str], bool]
     make: Callable[[str, Callable[[int], None]], str]
-    # (where, progress) -> writes them; what was made, in words
     load: Callable[[str, int], Collection]
-    # (where, training seed) -> as many as are asked for; UserError if there are fewer
-    amount: int  # that `make` makes, and tells the progress of
-    unit: str  # of the amount, such as "demonstrations"
+    amount: int
+    unit: str
 
 
 def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
@@ -109,41 +139,62 @@ def _no_extras(demonstration: Demonstration) -> PyTree:
 
 
 class Domain(NamedTuple):
-    """One level of a domain. Functions are pure, but for the first two."""
+    """One level of a domain. Functions are pure, except `make_adapter` and `collect`.
 
-    level: str  # its name
+    Attributes:
+        level: its name.
+        make_adapter: makes an environment.
+        collect: (count, training seed, progress) -> so many demonstrations, or UserError if there
+            are none; None: nobody here demonstrates it.
+        actions: names; the last is the end action.
+        max_steps: of the longest episode.
+        blank: an observation of zeros, as NumPy arrays: shapes and types.
+        encoders: by architecture, (model, K) -> encoder.
+        augmentations: each (key, window) -> window; (f, g) makes f(g(window)) of a window.
+        measure: (demonstrations) -> what encoders must know of the training data.
+        with_statistics: (what was measured) -> the same level with encoders that know it; None:
+            theirs need to know nothing.
+        extras: (demonstration) -> what augmentations must know of each step, `[n, ...]`; no model
+            sees it.
+        check: (observations `[n + 1, ...]`, where) -> UserError if a value is out of range.
+        replay: makes a demonstration of an episode of other observations, or says why it is none;
+            None where nothing is known of such observations.
+        source: of demonstrations; None: `collect`, kept by `leapjax.data.storage`.
+        arguments: JSON values that its environment is made with, and that of data must agree with;
+            None: theirs do not matter.
+        check_recorded: (what a data set says of itself, its name) -> UserError if it contradicts
+            the environment in more than `arguments`.
+        criterion: when an episode succeeds; None: the environment says so.
+        rules: an energy of what is known without learning; it has no parameters, ().
+        shortest_limit: steps that every episode may last, if that is known.
+        signature: JSON values that a checkpoint must agree on.
+        return_scale: what returns are divided by before a network sees them.
+        made_from: its domain's name in `leapjax.domains` and the settings that `make_domain` made
+            it with; None: it is of no such domain, and no planner of it can be saved.
+    """
+
+    level: str
     make_adapter: Callable[[], Adapter]
     collect: Callable[[int, int, Callable[[int], None]], Collection] | None
-    # (count, training seed, progress) -> so many demonstrations; UserError if there are none. None:
-    # nobody here demonstrates it
-    actions: tuple[str, ...]  # names; the last is the end action
-    max_steps: int  # of the longest episode
-    blank: PyTree  # an observation of zeros, as NumPy arrays: shapes and types
-    encoders: Mapping[str, Callable[[ModelConfig, int], Encoder]]  # by architecture, of (model, K)
-    augmentations: Sequence[Augmentation] = ()  # (f, g) makes f(g(window)) of a window
+    actions: tuple[str, ...]
+    max_steps: int
+    blank: PyTree
+    encoders: Mapping[str, Callable[["ModelConfig", int], "Encoder"]]
+    augmentations: Sequence[Augmentation] = ()
     measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
-    # what encoders must know of the training data
     with_statistics: Callable[[Statistics], "Domain"] | None = None
-    # the same level, with encoders that know so much; None: theirs need to know nothing
     extras: Callable[[Demonstration], PyTree] = _no_extras
-    # what augmentations must know of each step, [n, ...]; no model sees it
     check: Callable[[PyTree, str], None] = _nothing_to_check
-    # (observations [n + 1, ...], where) -> UserError if a value is out of range
     replay: Callable[[Recording], Demonstration | str | None] | None = None
-    # what an episode of other observations is as a demonstration; or why it is none; or None,
-    # where nothing is known of such observations
-    source: Source | None = None  # of demonstrations; None: `collect`, kept by leapjax.data.storage
-    arguments: Mapping[str, Any] | None = None  # JSON values that its environment is made with, and
-    # that of data must agree with; None: theirs do not matter
+    source: Source | None = None
+    arguments: Mapping[str, Any] | None = None
     check_recorded: Callable[[Described, str], None] = _nothing_to_compare
-    # (what a data set says of itself, its name) -> UserError if it contradicts the environment in
-    # more than `arguments`
-    criterion: Criterion | None = None  # when an episode succeeds; None: the environment says so
-    rules: Energy | None = None  # what is known without learning; it has no parameters, ()
-    shortest_limit: int | None = None  # steps that every episode may last, if that is known
-    signature: Mapping[str, Any] = {}  # JSON values that a checkpoint must agree on
-    return_scale: float = 1.0  # what returns are divided by before a network sees them
-    paper_success: Mapping[str, float] = {}  # the paper's results by method, in percent
+    criterion: Criterion | None = None
+    rules: Energy | None = None
+    shortest_limit: int | None = None
+    signature: Mapping[str, Any] = {}
+    return_scale: float = 1.0
+    made_from: tuple[str, Any] | None = None
 
     @property
     def num_actions(self) -> int:
@@ -152,16 +203,17 @@ class Domain(NamedTuple):
 
 
 class DomainType(NamedTuple):
-    """A family of levels."""
+    """A family of levels.
 
-    settings: type  # a frozen dataclass: options of encoder and augmentation
+    Attributes:
+        settings: a frozen dataclass: options of encoder and augmentation.
+        make: (level, settings) -> domain; UserError for an unknown level.
+        levels: the paper's.
+    """
+
+    settings: type
     make: Callable[[str, Any], Domain]
-    # (level, settings) -> domain; UserError for an unknown level
-    levels: tuple[str, ...]  # the paper's
-    preset: Callable[[str, str], Mapping[str, Any]]
-    # (level, preset) -> options by name, whatever the method; the method's own come after
-    tuned: Callable[[str, str, str], Mapping[str, Any]] = lambda level, method, preset: {}
-    # (level, method, preset) -> options that a level changes of the method's own
+    levels: tuple[str, ...]
 
 
 def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:

@@ -7,14 +7,13 @@ that are out of range, and energies that are NaN; inside, a plan says whether it
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.checks import check_indices, check_kind, check_numbers
-from leapjax.errors import UserError, first_line
+from leapjax.checks import check_floats, check_indices, check_kind, check_numbers
+from leapjax.errors import UserError
 from leapjax.types import (
     Energy,
     Params,
@@ -53,7 +52,7 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
         actions, positions = _check_query(actions, positions, num_actions)
         tokens = actions.at[positions].set(mask)
         scores = logits(params, memory, tokens, positions)
-        scores = _check_floats("logits", scores, (positions.shape[0], num_actions))
+        scores = check_floats("logits", scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     total = _sum_of_conditionals(conditional, num_actions)
@@ -80,7 +79,7 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, num_actions)
         scores = logits(params, memory, actions, positions)
-        scores = _check_floats("logits", scores, (positions.shape[0], num_actions))
+        scores = check_floats("logits", scores, (positions.shape[0], num_actions))
         return _check_energies(-jax.nn.log_softmax(scores, axis=-1), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -107,7 +106,7 @@ def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
 
     def guarded_total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
-        energy = _check_floats("a total", total(params, memory, actions), ())
+        energy = check_floats("a total", total(params, memory, actions), ())
         energy = jnp.asarray(energy, jnp.float32)
         return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
@@ -140,7 +139,7 @@ def single_action(
     """
 
     def energies(params: Params, memory: PyTree) -> jax.Array:
-        found = _check_floats("scores", scores(params, memory), (num_actions - 1,))
+        found = check_floats("scores", scores(params, memory), (num_actions - 1,))
         return jnp.append(-found, jnp.inf)
 
     def conditional(
@@ -276,7 +275,7 @@ def constrain(
     complete = check_kind(energy, Energy).num_actions - 1  # the last action
 
     def judge(context: PyTree, plan: jax.Array) -> jax.Array:
-        return _check_floats("a penalty", penalty(context, plan), ())
+        return check_floats("a penalty", penalty(context, plan), ())
 
     def known(context: PyTree, plan: jax.Array) -> jax.Array:
         """The penalty of what a plan says so far."""
@@ -438,27 +437,6 @@ def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> ja
         if int(seen.min()) < 0 or int(seen.max()) >= end:
             raise ValueError(f"{name} {seen} are not all in {expected}")
     return jnp.asarray(values, jnp.int32)
-
-
-def _check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Real numbers of a shape as JAX's array of floats: unsigned integers have no negatives.
-
-    Raises:
-        UserError: another shape, or no real numbers.
-    """
-    try:
-        # Python's integers may be larger than those of JAX.
-        array = jnp.asarray(float(values) if isinstance(values, int) else values)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise UserError(f"{name} must be numbers: {first_line(error)}") from error
-    if array.shape != shape:
-        expected = f"{name} must be of shape {shape}" if shape else f"{name} must be one number"
-        raise UserError(f"{expected}, got shape {array.shape}")
-    if jnp.issubdtype(array.dtype, jnp.floating):
-        return array
-    if not (jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == bool):
-        raise UserError(f"{name} must be real numbers, got {array.dtype}")
-    return array.astype(jnp.float32)
 
 
 def _check_energies(energies: jax.Array, positions: jax.Array) -> jax.Array:

@@ -2,17 +2,18 @@
 
 import contextlib
 import inspect
+import sys
 from collections.abc import Iterator
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
-
-import gymnasium as gym
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from leapjax.checks import check_number
 from leapjax.errors import UserError
 from leapjax.types import Array, PyTree, to_plain_dicts
 
+if TYPE_CHECKING:
+    import gymnasium as gym
+
 A = TypeVar("A", bound="Adapter")
-_ENVIRONMENTS = (gym.Env, gym.vector.VectorEnv)
 
 
 class Transition(NamedTuple):
@@ -86,7 +87,7 @@ class Criterion(NamedTuple):
         return f"a return of at least {self.least_return:g} ({origin})"
 
 
-def find_criterion(env: gym.Env, success_return: float | None = None) -> Criterion:
+def find_criterion(env: "gym.Env", success_return: float | None = None) -> Criterion:
     """Chooses when an episode of an environment succeeds.
 
     Args:
@@ -154,11 +155,15 @@ def environments_of(adapter: Adapter) -> list[object]:
     Finds attributes of the adapter, of its class, and of other adapters inside it. Lists are not
     searched: a list of environments that all adapters know says nothing of which one is stepped.
     """
+    gymnasium = sys.modules.get("gymnasium")
+    if gymnasium is None:  # not imported, so nothing can be one of its environments
+        return []
+    kinds = (gymnasium.Env, gymnasium.vector.VectorEnv)
     found: list[object] = []
     owners: list[Any] = [adapter]
     for owner in owners:
         for part in _list_attributes(owner):
-            if isinstance(part, _ENVIRONMENTS):
+            if isinstance(part, kinds):
                 found.append(part.unwrapped)
             elif callable(getattr(part, "step", None)) and id(part) not in map(id, owners):
                 owners.append(part)
@@ -186,13 +191,14 @@ class GymnasiumAdapter:
     terminates with a positive reward.
     """
 
-    def __init__(self, env: gym.Env, success_return: float | None = None) -> None:
+    def __init__(self, env: "gym.Env", success_return: float | None = None) -> None:
         actions = getattr(env, "action_space", None)
         if actions is None:
             raise UserError(
                 f"expected a Gymnasium environment, such as gymnasium.make returns, got {env!r}"
             )
-        if not isinstance(actions, gym.spaces.Discrete):
+        gymnasium = sys.modules.get("gymnasium")  # imported, if this is one of its environments
+        if gymnasium is None or not isinstance(actions, gymnasium.spaces.Discrete):
             raise ValueError(f"a Discrete action space is needed, got {actions}")
         self.env = env
         self.num_actions = int(actions.n) + 1

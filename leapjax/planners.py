@@ -9,11 +9,10 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 
-from leapjax.checks import check_at_least, check_kind, check_number, check_types
+from leapjax.checks import check_at_least, check_floats, check_kind, check_number, check_types
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 HOTTEST = 1e30  # so that noise times temperature is a number
@@ -34,24 +33,32 @@ def check_temperature(temperature: float) -> None:
 class GibbsConfig:
     """Iterative planning through energy minimisation (paper, algorithm 1).
 
-    `fill` says how the first plan is made: "together", all positions in one pass, as in the
-    paper; or P positions in each pass, while the others stay MASK: those that are most certain
-    ("confident": by the probability of the likeliest action, "margin": by its lead over the
-    second), or from left to right ("sequential"), or in "random" order. `order` says which P
-    positions every later iteration resamples: "random" ones, the next from left to right
-    ("sequential"), or those that were least certain when they were chosen ("uncertain", each
-    once before any is again).
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, passes of the model, those that fill the plan included.
+        resampled: P, positions chosen together in a pass, except where a pass fills all.
+        fill: How the first plan is made. "together": all positions in one pass, as in the paper.
+            Otherwise P positions in each pass, while the others stay MASK: the most certain ones by
+            the probability of the likeliest action ("confident") or by its lead over the
+            second ("margin"), those from left to right ("sequential"), or those in "random" order.
+        order: Which P positions every later iteration resamples: "random" ones, the next from left
+            to right ("sequential"), or those that were least certain when they were chosen, each
+            once before any is again ("uncertain").
+        temperature: Temperature at which actions are drawn; 0 takes the most likely action.
+        restarts: R, independent plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, for T more passes.
+        score_trace: Also return the energy after every iteration, for N * T more passes.
     """
 
-    horizon: int = 5  # T, planned actions
-    iterations: int = 10  # N, passes of the model, those that fill the plan included
-    resampled: int = 1  # P, positions chosen together in a pass, but where all are
-    fill: str = "together"  # or "confident", "margin", "sequential", "random"
-    order: str = "random"  # or "sequential", "uncertain"
-    temperature: float = 0.0  # 0 takes the most likely action
-    restarts: int = 1  # R independent plans, of which the one of least energy is kept
-    score: bool = False  # also return the energy of the plan (T more passes)
-    score_trace: bool = False  # also return the energy after every iteration (N * T passes)
+    horizon: int = 5
+    iterations: int = 10
+    resampled: int = 1
+    fill: str = "together"
+    order: str = "random"
+    temperature: float = 0.0
+    restarts: int = 1
+    score: bool = False
+    score_trace: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -79,11 +86,17 @@ class GibbsConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ShootingConfig:
-    """Random shooting (paper, appendix, ablation): the best of random plans."""
+    """Random shooting (paper, appendix, ablation): the best of random plans.
 
-    horizon: int = 5  # T
-    candidates: int = 30  # uniform action sequences
-    score: bool = False  # also return the energy of the plan (known anyway)
+    Attributes:
+        horizon: T, planned actions.
+        candidates: Uniformly drawn plans, of which the one of least energy is kept.
+        score: Also return the energy of the plan, which is known anyway.
+    """
+
+    horizon: int = 5
+    candidates: int = 30
+    score: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -92,13 +105,23 @@ class ShootingConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropyConfig:
-    """The cross-entropy method as the paper's appendix describes it."""
+    """The cross-entropy method as the paper's appendix describes it.
 
-    horizon: int = 5  # T
-    iterations: int = 10  # N, rounds; the first draws uniform sequences
-    candidates: int = 30  # sequences per round
-    elites: int = 3  # kept as parents of the next round, each child with one token changed
-    keep_elites: bool = True  # elites survive unchanged, so the best energy never rises
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, rounds; the first draws uniform plans.
+        candidates: Plans in each round.
+        elites: Plans of least energy that are the parents of the next round, each child with one
+            action changed.
+        keep_elites: Elites survive unchanged, so that the least energy never rises.
+        score: Also return the energy of the plan.
+    """
+
+    horizon: int = 5
+    iterations: int = 10
+    candidates: int = 30
+    elites: int = 3
+    keep_elites: bool = True
     score: bool = False
 
     def __post_init__(self) -> None:
@@ -110,12 +133,19 @@ class CrossEntropyConfig:
 
 @dataclasses.dataclass(frozen=True)
 class BeamConfig:
-    """Beam search, from left to right: the best of the plans that began well."""
+    """Beam search, from left to right: the best of the plans that began well.
 
-    horizon: int = 5  # T
-    beams: int = 10  # W, partial plans that are kept
-    temperature: float = 0.0  # 0 keeps the best; above it beams are drawn, all different
-    score: bool = False  # also return the energy of the plan
+    Attributes:
+        horizon: T, planned actions.
+        beams: W, partial plans that are kept.
+        temperature: 0 keeps the best beams; above it beams are drawn, all different.
+        score: Also return the energy of the plan.
+    """
+
+    horizon: int = 5
+    beams: int = 10
+    temperature: float = 0.0
+    score: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -134,6 +164,33 @@ def undefined(energies: jax.Array) -> jax.Array:
 
 
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
+
+
+def guard_shapes(energy: Energy) -> Energy:
+    """Returns an energy that refuses results of wrong shapes, or that are not real numbers.
+
+    Raises:
+        UserError: it is no `Energy`.
+    """
+    check_kind(energy, Energy)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        energies = energy.conditional(params, memory, actions, positions)
+        return check_floats(
+            "conditional of the energy", energies, (positions.shape[0], energy.num_actions)
+        )
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        found = energy.total(params, memory, actions)
+        return check_floats("total of the energy", found, ())
+
+    def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        found = energy.violation(params, memory, actions)
+        return check_floats("violation of the energy", found, ())
+
+    return energy._replace(conditional=conditional, total=total, violation=violation)
 
 
 def gibbs(
@@ -158,6 +215,7 @@ def gibbs(
             f"fill {config.fill!r} chooses actions while others are MASK, and this energy scores "
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
+    energy = guard_shapes(energy)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
         actions, trace, valid = chain(key)
@@ -203,9 +261,7 @@ def _gibbs_chain(
         return jnp.zeros((*shape, 1))
 
     def energies_at(tokens: jax.Array, where: jax.Array) -> jax.Array:
-        energies = energy.conditional(params, memory, tokens, where)
-        chex.assert_shape(energies, (where.shape[0], energy.num_actions))
-        return energies
+        return energy.conditional(params, memory, tokens, where)
 
     def draw(
         chain: _Chain, where: jax.Array, energies: jax.Array, gumbel: jax.Array
@@ -348,6 +404,7 @@ def random_shooting(
     energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: ShootingConfig
 ) -> Plan:
     """The random plan of least energy (paper, appendix, ablation), of those that can be."""
+    energy = guard_shapes(energy)
     choices = _choices(energy, params, memory, config.horizon)
     plans = _random_plans(key, choices, config.candidates)
     energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
@@ -369,6 +426,7 @@ def cross_entropy_method(
     The plan returned is the best of the last round, as in the paper; with `keep_elites`
     that is also the best ever seen.
     """
+    energy = guard_shapes(energy)
     count, horizon = config.candidates, config.horizon
     choices = _choices(energy, params, memory, horizon)
 
@@ -440,6 +498,7 @@ def beam_search(
             "beam search begins plans that it ends later, and this energy scores complete plans "
             "only (accepts_mask is False): use another planner"
         )
+    energy = guard_shapes(energy)
     actions = energy.num_actions
 
     def extend(

@@ -1,23 +1,28 @@
 """Trained planners on disk: what `leapjax.load` reads and every run writes."""
 
 import dataclasses
+import importlib
 import json
 import os
+import types
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
-from leapjax import checkpoints, weights
+from leapjax import domains, rollouts, serialization, weights
 from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
-from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner
-from leapjax.checks import check_at_least, check_types
-from leapjax.domain import Domain, Statistics, apply_statistics
+from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
+from leapjax.checks import check_at_least, check_seed, check_types
+from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
 from leapjax.domains import check_imported, find_domain
+from leapjax.environments import Adapter
 from leapjax.errors import UserError, first_line
+from leapjax.extras import missing_explained
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -34,7 +39,15 @@ GROUPS = ("model", "training", "planner", "method_settings", "domain_settings") 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What a planner was trained on, and by which preset: nothing that rebuilding it needs."""
+    """What a planner was trained on, and by which preset: nothing that rebuilding it needs.
+
+    Attributes:
+        preset: by name.
+        seed: of training.
+        demos: how many demonstrations.
+        demonstrations: the data set that they are of; None: the domain made them, or they were in
+            memory.
+    """
 
     preset: str
     seed: int
@@ -47,38 +60,140 @@ class Origin:
 
 @dataclasses.dataclass(frozen=True)
 class Specification:
-    """All that is needed to rebuild a planner around its parameters."""
+    """All that is needed to rebuild a planner around its parameters.
+
+    Attributes:
+        domain: its name in `leapjax.domains`.
+        level: that it was trained for.
+        method: its name in `leapjax.methods`.
+        context: K, past steps that the network sees.
+        model: the size of the network.
+        training: how it was trained.
+        planner: how it searches; its horizon is the network's too.
+        method_settings: options of the method alone.
+        domain_settings: options of encoder and augmentation.
+        signature: of the domain, when it was trained.
+        origin: what it was trained on.
+        statistics: of what it learned from, as far as its network needs them.
+    """
 
     domain: str
     level: str
     method: str
-    context: int  # K
+    context: int
     model: ModelConfig
     training: TrainingConfig
-    planner: PlannerConfig  # its horizon is the network's too
+    planner: PlannerConfig
     method_settings: Any
     domain_settings: Any
-    signature: dict  # of the domain, when it was trained
+    signature: dict
     origin: Origin
-    statistics: Statistics = ()  # of what it learned from, as far as its network needs them
+    statistics: Statistics = ()
 
     def __post_init__(self) -> None:
         check_types(self)
         check_at_least(self, 0, "context")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Pretrained:
-    """A ready planner: `pretrained(keys, contexts)` plans for any number of contexts."""
+    """A ready planner: `pretrained(keys, contexts)` plans for any number of contexts.
+
+    Attributes:
+        specification: all that it is rebuilt from, but the parameters.
+        energy: what it minimises.
+        params: of the energy.
+        plan: the compiled planner: `(params, keys, contexts) -> Plan`.
+        domain: the level that it plays; `domain.make_adapter()` is an environment of it.
+    """
 
     specification: Specification
     energy: Energy
     params: Params
     plan: CompiledPlanner
+    domain: Domain
 
     def __call__(self, keys: Array, contexts: Context) -> Plan:
         """Plans for B contexts (see `leapjax.rollouts.stack_contexts`)."""
         return self.plan(self.params, keys, contexts)
+
+    def plan_for(self, adapter: Adapter, seed: int = 0) -> Plan:
+        """Resets an environment and makes one plan for its first state.
+
+        The plan is the first one of `leapjax.evaluate` for the same level seed.
+
+        Args:
+            adapter: an environment, such as `domain.make_adapter()` gives.
+            seed: level seed, in 0 .. 2^32 - 1.
+
+        Returns:
+            A `Plan` of NumPy arrays, without a leading `[B]`: `actions` is `[T]`.
+
+        Raises:
+            UserError: no adapter, other actions than the planner's, or another observation.
+        """
+        seed = check_seed(seed)
+        rollouts.check_adapter(adapter)
+        rollouts.check_actions("planner", self.plan.num_actions, adapter.num_actions)
+        history = rollouts.History(
+            adapter.reset(seed), self.specification.context, adapter.num_actions, seed
+        )
+        keys = plan_keys(0, np.array([seed]), np.array([0]))
+        plans = self(keys, rollouts.stack_contexts([history]))
+        return jax.tree.map(lambda leaf: leaf[0], plans)
+
+    def compile(self, batch: int = 1, executed: int | None = None) -> None:
+        """Compiles what batches of at most `batch` plans need, so that later calls start at once.
+
+        Args:
+            batch: B, the largest number of contexts in a call.
+            executed: actions of each plan in `leapjax.evaluate`; None for all. If it is 1, plans
+                after the first use a cache.
+
+        Raises:
+            UserError: a number that is not a positive integer.
+        """
+        context = blank_context(self.domain, self.specification.context)
+        executed, _ = rollouts.check_limits(executed, None)
+        again = 1 in (executed, self.specification.planner.horizon)
+        self.plan.compile(self.params, context, batch, again)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Writes a folder that `leapjax.load` reads: a specification, and the parameters.
+
+        Args:
+            folder: to make.
+
+        Raises:
+            UserError: it is there already, or cannot be written; or `leapjax.make_domain` did not
+                make the domain, so that nothing on disk would say how to make its network.
+        """
+        if self.domain.made_from is None:
+            raise UserError(
+                f"a planner of {self.domain.level} cannot be saved: its domain is not made by "
+                "leap.make_domain; keep planner.params, and fit with the same domain and steps=0"
+            )
+        checkpoints = _import_checkpoints()
+        folder, specification = check_path(folder), self.specification
+        if folder.exists():
+            raise UserError(f"{folder} is there already: name a new folder")
+        checkpoints.save_params(
+            folder / CHECKPOINTS, self.params, identity(specification), specification.training.steps
+        )
+        save_specification(folder, specification)
+
+    def __repr__(self) -> str:
+        known = self.specification
+        model, origin, leaves = known.model, known.origin, jax.tree.leaves(self.params)
+        data = f"{origin.demos} demonstrations"
+        data += f" of {origin.demonstrations}" if origin.demonstrations else ""
+        return "\n".join([
+            f"Pretrained: {known.method} on {known.level}, trained on {data}, preset "
+            f"{origin.preset}, seed {origin.seed}",
+            f"  network: {model.architecture}, {model.layers} layers of width {model.width}, "
+            f"{sum(leaf.size for leaf in leaves):,} parameters",
+            f"  planner: {known.planner}",
+        ])  # fmt: skip
 
 
 def make_domain(specification: Specification, level: str | None = None) -> Domain:
@@ -91,8 +206,7 @@ def make_domain(specification: Specification, level: str | None = None) -> Domai
     if level is None:
         level = specification.level
         check_imported(level, f"the specification of a {specification.method} planner")
-    kind = find_domain(specification.domain)
-    domain = kind.make(level, specification.domain_settings)
+    domain = domains.make_level(specification.domain, level, specification.domain_settings)
     return apply_statistics(domain, specification.statistics)
 
 
@@ -114,7 +228,7 @@ def identity(specification: Specification) -> str:
     defaults = {name: type(getattr(specification, name))() for name in GROUPS}
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
-    changed = {name: checkpoints.differences(values[name], plain[name]) for name in GROUPS}
+    changed = {name: serialization.differences(values[name], plain[name]) for name in GROUPS}
     changed["training"] = without_unnamed(changed["training"])
     if not specification.statistics:  # as before there were any
         del values["statistics"]
@@ -149,7 +263,17 @@ def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
     whose = identity(specification)
     if (folder / WEIGHTS).exists():
         return specification, weights.check_identity(folder / WEIGHTS, whose)
-    return specification, checkpoints.check_identity(folder / CHECKPOINTS, whose)
+    return specification, _import_checkpoints().check_identity(folder / CHECKPOINTS, whose)
+
+
+def _import_checkpoints() -> types.ModuleType:
+    """Imports Orbax, which takes a while, and which published planners do not need.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    with missing_explained():
+        return importlib.import_module("leapjax.checkpoints")
 
 
 def parse_specification(folder: Path) -> Specification:
@@ -163,12 +287,12 @@ def parse_specification(folder: Path) -> Specification:
         raise UserError(
             f"{folder} is not a checkpoint: expected the folder of a run, with {SPECIFICATION}"
         )
-    values = checkpoints.read_json(path, LARGEST_SPECIFICATION)
+    values = serialization.read_json(path, LARGEST_SPECIFICATION)
     try:
         if not isinstance(values, dict):
             raise UserError(f"a Specification must be a JSON object, got {type(values).__name__}")
         method = find_method(str(values.get("method")))
-        return checkpoints.from_json(
+        return serialization.from_json(
             Specification, values,
             method_settings=method.settings, planner=method.planner,
             domain_settings=find_domain(str(values.get("domain"))).settings,
@@ -189,13 +313,19 @@ def published(name: str) -> Path:
     return PUBLISHED / name
 
 
-def publish(folder: Path, target: Path) -> None:
-    """Makes a published planner of a run: its parameters in half precision.
+def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
+    """Writes a trained planner as two small files, its parameters in half precision.
+
+    `load` reads the folder of both, `specification.json` and `weights.npz`, wherever it is.
+
+    Args:
+        folder: of a run, or of `Pretrained.save`.
+        target: the folder to write to.
 
     Raises:
         UserError: the run cannot be read, has not come to its end, or the target not be written.
     """
-    planner = load(folder, finished=True)
+    planner, target = load(folder, finished=True), check_path(target)
     weights.write(target / WEIGHTS, planner.params, identity(planner.specification))
     save_specification(target, planner.specification)
 
@@ -269,6 +399,9 @@ def load(
 ) -> Pretrained:
     """A trained planner from the folder of its run, or one that comes with the library.
 
+    Compiled programs are kept on disk, as `leapjax.compile_planner` says, so that the first plan
+    of a second process takes little more than its imports.
+
     Args:
         path: the folder that a run printed; or the name of a level, where there is no such
             folder: the published planner, trained on it with seed 0 (README, "Results").
@@ -316,6 +449,7 @@ def load(
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
+        checkpoints = _import_checkpoints()
         params = checkpoints.restore_params(
             folder / CHECKPOINTS, like, whose, specification.training.steps if finished else None
         )
@@ -330,4 +464,4 @@ def load(
     plan = compile_planner(
         agent.energy, specification.planner, chunk_sizes, encode_next=agent.encode_next
     )
-    return Pretrained(specification, agent.energy, params, plan)
+    return Pretrained(specification, agent.energy, params, plan, domain)

@@ -28,13 +28,16 @@ class PureEnvironment(NamedTuple):
 
     A step hands on what a reset began: states and observations of the same structure, shapes and
     types, numbers that are finite.
+
+    Attributes:
+        reset: (key) -> state, observation.
+        step: (state, action `[]` int32) -> state, what the step gave, as arrays.
+        num_actions: A, the end action included: the environment has A - 1.
     """
 
     reset: Callable[[jax.Array], tuple[PyTree, PyTree]]
-    # (key) -> state, observation
     step: Callable[[PyTree, jax.Array], tuple[PyTree, Transition]]
-    # (state, action [] int32) -> state, what the step gave, as arrays
-    num_actions: int  # A, the end action included: the environment has A - 1
+    num_actions: int
 
 
 class _Episode(NamedTuple):

@@ -22,15 +22,25 @@ LARGEST = float(np.finfo(np.float32).max)
 
 
 class Episodes(NamedTuple):
-    """What E episodes gave."""
+    """What E episodes gave.
 
-    seeds: np.ndarray  # [E] level seeds
-    successes: np.ndarray  # [E] bool
-    lengths: np.ndarray  # [E] int: environment steps
-    returns: np.ndarray  # [E] float: sums of rewards, or of scores where those are something else
-    plans: int  # plans made in all
-    planning_seconds: float  # of the planner alone, compilation included
-    seconds: float  # in all
+    Attributes:
+        seeds: `[E]` level seeds.
+        successes: `[E]` bool.
+        lengths: `[E]` int, environment steps.
+        returns: `[E]` float, sums of rewards, or of scores where those are something else.
+        plans: plans made in all.
+        planning_seconds: of the planner alone, compilation included.
+        seconds: in all.
+    """
+
+    seeds: np.ndarray
+    successes: np.ndarray
+    lengths: np.ndarray
+    returns: np.ndarray
+    plans: int
+    planning_seconds: float
+    seconds: float
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:

@@ -28,54 +28,95 @@ def to_plain_dicts(observation: PyTree) -> PyTree:
 
 
 class Context(NamedTuple):
-    """What a plan is conditioned on (paper, section 3: the trajectory context and s_n)."""
+    """What a plan is conditioned on (paper, section 3: the trajectory context and s_n).
 
-    observation: PyTree  # the current state s_n
-    past: PyTree  # [K, ...] the K states before it, oldest first; zeros before the start
-    actions: Array  # [K] int32: the action taken in each past state; PAD before the start
-    rewards: Array  # [K] float32: what each of them gave; 0 before the start
-    step: Array  # [] int32: environment steps since the episode began
-    return_so_far: Array  # [] float32: the sum of all rewards since then
+    Attributes:
+        observation: the current state s_n.
+        past: `[K, ...]` the K states before it, oldest first; zeros before the start.
+        actions: `[K]` int32, the action taken in each past state; PAD before the start.
+        rewards: `[K]` float32, what each of them gave; 0 before the start.
+        step: `[]` int32, environment steps since the episode began.
+        return_so_far: `[]` float32, the sum of all rewards since then.
+    """
+
+    observation: PyTree
+    past: PyTree
+    actions: Array
+    rewards: Array
+    step: Array
+    return_so_far: Array
 
 
 class Demonstration(NamedTuple):
-    """One episode of `n` steps, played by somebody."""
+    """One episode of `n` steps, played by somebody.
 
-    observations: PyTree  # [n + 1, ...] the state before each action, and the last
-    actions: Array  # [n] int32
-    rewards: Array  # [n] float32
-    terminated: bool  # it came to an end of its own
-    truncated: bool  # it was cut off, by a limit of steps for instance; what is then learned to
-    # follow is the end action, as after any other, but its last state keeps its value
-    seed: int  # with which the environment was reset
+    Attributes:
+        observations: `[n + 1, ...]` the state before each action, and the last.
+        actions: `[n]` int32.
+        rewards: `[n]` float32.
+        terminated: the episode came to an end of its own.
+        truncated: the episode was cut off, by a limit of steps for instance. The end action is
+            learned to follow, as after any other; the last state keeps its value.
+        seed: with which the environment was reset.
+    """
+
+    observations: PyTree
+    actions: Array
+    rewards: Array
+    terminated: bool
+    truncated: bool
+    seed: int
 
 
 class Window(NamedTuple):
-    """One training example: what was done from one step of a demonstration on."""
+    """One training example: what was done from one step of a demonstration on.
+
+    Attributes:
+        context: at that step.
+        actions: `[T]` int32, what was done.
+        imitated: `[T]` bool, which of them to learn; the others are only shown.
+        return_to_go: `[]` float32, the demonstration's rewards from this step on.
+        extras: what the domain's augmentation must know of this step; no model sees it.
+    """
 
     context: Context
-    actions: Array  # [T] int32: what was done
-    imitated: Array  # [T] bool: which of them to learn; the others are only shown
-    return_to_go: Array  # [] float32: the demonstration's rewards from this step on
-    extras: PyTree  # what the domain's augmentation must know of this step; no model sees it
+    actions: Array
+    imitated: Array
+    return_to_go: Array
+    extras: PyTree
 
 
 class TransitionWindow(NamedTuple):
-    """A step that was taken, and what came of it: for methods that learn from rewards."""
+    """A step that was taken, and what came of it: for methods that learn from rewards.
 
-    context: Context  # after it, one step longer than a network's: it holds the step as its last
-    terminated: Array  # [] bool: the episode came to its end with it
+    Attributes:
+        context: after the step, one step longer than a network's: its last past step is this one.
+        terminated: `[]` bool, the episode came to its end with the step.
+    """
+
+    context: Context
+    terminated: Array
 
 
 class Plan(NamedTuple):
-    """What a planner returns, for one context."""
+    """What a planner returns, for one context.
 
-    actions: jax.Array  # [T] int32
-    trace: jax.Array  # [N, T] int32: the actions after every iteration
-    satisfied: jax.Array  # [] bool: no constraint of the energy is violated
-    valid: jax.Array  # [] bool: no energy met on the way was NaN
-    energy: jax.Array | None = None  # [] float32, only if asked for: it costs T passes
-    trace_energies: jax.Array | None = None  # [N] float32, only if asked for: N * T passes
+    Attributes:
+        actions: `[T]` int32.
+        trace: `[N, T]` int32, the actions after every iteration.
+        satisfied: `[]` bool, no constraint of the energy is violated.
+        valid: `[]` bool, no energy met on the way was NaN or -inf.
+        energy: `[]` float32, of the plan; only if asked for (`score`), since it costs T passes.
+        trace_energies: `[N]` float32, after every iteration; only if asked for (`score_trace`),
+            since it costs N * T passes.
+    """
+
+    actions: jax.Array
+    trace: jax.Array
+    satisfied: jax.Array
+    valid: jax.Array
+    energy: jax.Array | None = None
+    trace_energies: jax.Array | None = None
 
 
 def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -89,19 +130,25 @@ class Energy(NamedTuple):
 
     Tokens: actions are `0 .. A-1`; `A` is MASK (see `mask_token`), legal only where
     `accepts_mask`; `A + 1` is PAD (see `pad_token`), legal only in a context.
+
+    Attributes:
+        encode: (params, context) -> memory; computed once per plan.
+        conditional: (params, memory, actions `[T]`, positions `[P]`) -> `[P, A]`, the energy of
+            each action at each position, up to a constant per position; a model masks all P
+            positions together.
+        total: (params, memory, actions `[T]`) -> `[]`, the energy of a complete plan.
+        num_actions: A, the end action included.
+        accepts_mask: whether actions may be MASK; if not, planning starts from uniform actions.
+        violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
+            positive.
     """
 
     encode: Callable[[Params, PyTree], PyTree]
-    # (params, context) -> memory; computed once per plan
     conditional: Callable[[Params, PyTree, jax.Array, jax.Array], jax.Array]
-    # (params, memory, actions [T], positions [P]) -> [P, A]: the energy of each action at
-    # each position, up to a constant per position; a model's masks all P positions together
     total: Callable[[Params, PyTree, jax.Array], jax.Array]
-    # (params, memory, actions [T]) -> []: the energy of a complete plan
-    num_actions: int  # A, the end action included
-    accepts_mask: bool = True  # False: planning starts from uniform actions, not from MASK
+    num_actions: int
+    accepts_mask: bool = True
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
-    # (params, memory, actions [T]) -> []: 0 where every constraint holds, else positive
 
 
 def mask_token(num_actions: int) -> int:
@@ -124,12 +171,19 @@ def check_num_actions(num_actions: int) -> int:
 
 
 class TrainState(NamedTuple):
-    """All that training changes."""
+    """All that training changes.
+
+    Attributes:
+        params: of the energy.
+        optimizer: the optimizer's own state.
+        step: `[]` int32, updates done.
+        extra: what no gradient touches: target networks, running statistics.
+    """
 
     params: Params
     optimizer: PyTree
-    step: jax.Array  # [] int32: updates done
-    extra: PyTree = ()  # what no gradient touches: target networks, running statistics
+    step: jax.Array
+    extra: PyTree = ()
 
 
 EncodeNext = Callable[[Params, Context, PyTree], tuple[PyTree, PyTree]]
@@ -138,15 +192,20 @@ EncodeNext = Callable[[Params, Context, PyTree], tuple[PyTree, PyTree]]
 
 
 class Agent(NamedTuple):
-    """What every method has in common, so that one training and one rollout serve all."""
+    """What every method has in common, so that one training and one rollout serve all.
+
+    Attributes:
+        init: (key) -> state.
+        batch: (key, steps) -> batch `[B, ...]`; pure; `leapjax.data.windows` makes the steps.
+        update: (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself.
+        energy: what is minimised to act; a method that chooses one action at a time has plans of
+            one.
+        encode_next: `energy.encode` with a cache, for `compile_planner`; None: a cache would save
+            nothing.
+    """
 
     init: Callable[[jax.Array], TrainState]
-    # (key) -> state
     batch: Callable[[jax.Array, PyTree], PyTree]
-    # (key, steps) -> batch [B, ...]; pure; see leapjax.data.windows for the steps
     update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
-    # (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself
     energy: Energy
-    # what is minimised to act; a method that chooses one action at a time has plans of one
     encode_next: EncodeNext | None = None
-    # `energy.encode` with a cache, for `compile_planner`; None: a cache would save nothing

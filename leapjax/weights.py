@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax import files
-from leapjax.checkpoints import IDENTITY, identity_digest
 from leapjax.errors import UserError, first_line
+from leapjax.serialization import IDENTITY, identity_digest
 from leapjax.types import Params
 
 ITEMSIZE = 2  # bytes of a number in half precision
@@ -86,7 +86,8 @@ def read(path: Path, like: Params, identity: str) -> Params:
     for name, leaf in wanted.items():
         if (arrays[name].shape, arrays[name].dtype) != (leaf.shape, np.float16):
             raise _another(path)
-    leaves = [jnp.asarray(array, jnp.float32) for array in arrays.values()]
+    # NumPy converts: JAX would compile a program for each shape.
+    leaves = [jnp.asarray(array.astype(np.float32)) for array in arrays.values()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from experiments import babyai
 from leapjax import training
-from leapjax.babyai import demonstrations, levels
+from leapjax.domains.babyai import demonstrations, levels
 from leapjax.types import Demonstration
 from tests import OURS, parameters
 from tests.programs import TOY_RUN

@@ -6,8 +6,8 @@ from minigrid.core.mission import MissionSpace
 from minigrid.core.world_object import WorldObj
 from minigrid.minigrid_env import MiniGridEnv
 
-from leapjax.babyai import observations
-from leapjax.babyai.observations import Observation
+from leapjax.domains.babyai import observations
+from leapjax.domains.babyai.observations import Observation
 
 FRONT = ((1, 0), (0, 1), (-1, 0), (0, -1))  # the cell ahead, by direction
 

@@ -17,9 +17,10 @@ from experiments import (
     stochastic,
     suboptimal,
 )
-from experiments.common import analysis
-from experiments.common.config import blank
+from experiments.common import cases
+from leapjax.configuration import blank
 from leapjax.methods import METHODS
+from leapjax.presets import find_presets
 
 LEVELS = {
     "babyai": "GoToLocalS7N5", "stars": "Star3x5", "sudoku": "Sudoku4x6",
@@ -27,10 +28,10 @@ LEVELS = {
 }  # fmt: skip
 # By name: the program, the options that it has, and what else it is given; RUN: the folder of one.
 PROGRAMS = {
-    "ablation": (ablation.main, analysis.Options, ["--only", "masked-model"]),
-    "properties": (properties.main, analysis.Options, ["--only", "generalization-easy"]),
-    "stochastic": (stochastic.main, analysis.Options, ["--only", "GoToObjMazeS4"]),
-    "suboptimal": (suboptimal.main, analysis.Options, ["--only", "GoToSeqS5R2"]),
+    "ablation": (ablation.main, cases.Options, ["--only", "masked-model"]),
+    "properties": (properties.main, cases.Options, ["--only", "generalization-easy"]),
+    "stochastic": (stochastic.main, cases.Options, ["--only", "GoToObjMazeS4"]),
+    "suboptimal": (suboptimal.main, cases.Options, ["--only", "GoToSeqS5R2"]),
     "accuracy": (accuracy.main, accuracy.Options, ["RUN"]),
     "failures": (failures.main, failures.Options, ["RUN"]),
     "landscape": (landscape.main, landscape.Options, []),
@@ -68,7 +69,7 @@ def command_lines(domain: str) -> Iterator[list[str]]:
         parts = [chosen.method_settings, chosen.planner]
         if method == "leap":
             parts += [chosen, chosen.model, chosen.training, chosen.cluster, chosen.domain_settings]
-        for name in METHODS[method].presets:
+        for name in find_presets(domain):
             for part in parts:
                 for _, given in numeric(type(part)):
                     yield [*base, "--method", method, "--preset", name, *given]

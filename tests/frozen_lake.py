@@ -8,10 +8,12 @@ import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.configuration import AnyConfig, change
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
 from leapjax.models.encoder import Encoder
+from leapjax.presets import common, environments
 
 LEVEL = "FrozenLake-v1"
 CELLS, GOAL = 16, 15
@@ -67,6 +69,10 @@ def make(level: str, settings: Settings) -> Domain:
     )
 
 
-FROZEN_LAKE = DomainType(
-    Settings, make, (LEVEL,), lambda level, preset: {"context": 1, "horizon": 4, "iterations": 4}
-)
+def preset(level: str, method: str) -> AnyConfig:
+    """As for any environment; but plans have four actions, all are executed, and K = 1."""
+    found = environments.leapjax("frozen_lake", level, method)
+    return change(found, context=1, executed=None, planner=common.search(method, 4, 4))
+
+
+FROZEN_LAKE = DomainType(Settings, make, (LEVEL,))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from leapjax.babyai.observations import Observation
+from leapjax.domains.babyai.observations import Observation
 
 
 def slow_path_lengths(

@@ -1,5 +1,6 @@
 """The real program at toy size: what it leaves behind; processes of its own, watched, compared."""
 
+import dataclasses
 import os
 import shutil
 import subprocess
@@ -12,13 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.common import config, experiment, results
-from experiments.common.experiment import Experiment
 from leapjax import checkpoints, domains, pretrained
 from leapjax.checkpoints import Checkpoints
+from leapjax.configuration import change, make_domain, specify
 from leapjax.files import only_process_in
+from leapjax.presets import PRESETS
+from leapjax.running import command_line, results
+from leapjax.running import main as running
+from leapjax.running.run import Experiment
 from leapjax.types import TrainState
-from tests.frozen_lake import FROZEN_LAKE
+from tests import frozen_lake
 from tests.parameters import random_parameters
 
 ROOT = Path(__file__).parent.parent
@@ -44,15 +48,29 @@ STEPS = 200
 
 def main():
     """An experiment in FrozenLake: `python -m tests.programs`."""
-    domains.DOMAINS[LAKE.domain] = FROZEN_LAKE
-    return experiment.main(LAKE)
+    domains.DOMAINS[LAKE.domain] = frozen_lake.FROZEN_LAKE
+    PRESETS[LAKE.domain] = {"leapjax": frozen_lake.preset}
+    return running.main(LAKE)
+
+
+def with_options(config, options):
+    """A configuration with options of the command line, whichever part of it they are of."""
+    parts = {name: dataclasses.asdict(getattr(config, name)) for name in pretrained.GROUPS}
+    changes = {}
+    for option, value in options.items():
+        part = next((name for name, fields in parts.items() if option in fields), None)
+        if part is None:
+            changes[option] = value
+        else:
+            changes.setdefault(part, {})[option] = value
+    return change(config, **changes)
 
 
 def untrained_run(folder, *options):
     """The folder of a run that has learned nothing: nothing is compiled for it."""
-    (chosen,) = config.parse("babyai", [*TOY, *options])
-    domain = config.make_domain(chosen)
-    specification = config.specify(chosen, chosen.seeds[0], domain)
+    (chosen,) = command_line.parse("babyai", [*TOY, *options])
+    domain = make_domain(chosen)
+    specification = specify(chosen, chosen.seeds[0], domain)
     pretrained.save_specification(folder, specification)
     agent = pretrained.make_agent(specification, domain)
     params = random_parameters(agent, 0.1)

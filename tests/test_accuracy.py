@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from experiments import accuracy
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.settings import Settings
 from leapjax.data import storage
 from leapjax.data.windows import Window
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
 from leapjax.pretrained import Origin
 from leapjax.types import mask_token

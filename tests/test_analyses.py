@@ -1,5 +1,6 @@
 """The programs of the paper's analyses, end to end at toy size, and what they refuse."""
 
+import functools
 import json
 
 import jax
@@ -8,15 +9,17 @@ import numpy as np
 import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
-from experiments.common import analysis, results
-from experiments.common.analysis import Analysis, Options, Way
-from experiments.common.run import write_metrics
+from experiments.common import cases
+from experiments.common.cases import Analysis, Options, Way
 from experiments.tables import analyses
 from leapjax import pretrained
-from leapjax.babyai import constraints
-from leapjax.babyai.levels import find_level
+from leapjax.domains.babyai import constraints
+from leapjax.domains.babyai.levels import find_level
 from leapjax.planners import GibbsConfig
-from tests.programs import only_long
+from leapjax.presets import find_preset
+from leapjax.running import results
+from leapjax.running.metrics import write_metrics
+from tests.programs import only_long, with_options
 
 TOY = {  # nothing is learned: gradients take long to compile
     "demos": 6, "steps": 0, "batch": 4, "width": 16, "heads": 2, "layers": 1, "channels": 4,
@@ -38,11 +41,19 @@ def rows(place, name, folder="runs"):
     return results.read(place / folder / f"{name}.jsonl")
 
 
+def toy(config, **options):
+    """A configuration at toy size."""
+    return with_options(config, {**TOY, **options})
+
+
+one_action = functools.partial(toy, horizon=1)
+
+
 def small(case, *ways):
     """An analysis of one case, at toy size, with some of its ways."""
     kept = [way for way in case.ways if way.name in ways]
     assert len(kept) == len(ways)
-    return Analysis("properties", [case._replace(ways=kept)], changes=TOY)
+    return Analysis("properties", [case._replace(ways=kept)], change=toy)
 
 
 def case_of(name):
@@ -51,15 +62,37 @@ def case_of(name):
 
 def test_a_constraint_is_asked_for_and_counted(place, capsys):
     of = small(case_of("adaptation-medium"), "whole plan")
-    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    assert cases.main(of, [*SHORT, "--record"]) == 0
     (row,) = rows(place, "properties", "results")
     assert (row["case"], row["way"], row["method"]) == ("adaptation-medium", "whole plan", "leap")
     assert row["violations"] == 0  # an untrained model, and no step onto lava all the same
     assert row["planner"]["fill"] == "sequential" and row["paper_success"] == 64.5
     assert 0 <= row["first_pass_successes"] <= row["episodes"] == 2
-    assert analysis.main(of, [*SHORT, "--record"]) == 0
+    assert cases.main(of, [*SHORT, "--record"]) == 0
     assert "recorded already" in capsys.readouterr().out
     assert rows(place, "properties", "results") == [row]
+
+
+def test_two_models_are_composed(place):
+    of = small(case_of("composition-medium"), "dt")
+    assert cases.main(of._replace(change=one_action), SHORT) == 0
+    (row,) = rows(place, "properties")
+    assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
+    assert row["train_seconds"] == 0  # for no step
+
+
+@only_long
+@pytest.mark.parametrize("program", ALL, ids=lambda program: program.ANALYSIS.name)
+def test_every_way_of_every_program_runs(place, monkeypatch, program):
+    """Of its first case; every method of its own."""
+    of = program.ANALYSIS
+    case = of.cases[0]
+    for method in cases.methods_of(case):
+        plans = {} if method in ("leap", "classifier") else {"horizon": 1}
+        small_one = of._replace(cases=[case], change=functools.partial(toy, **plans))
+        monkeypatch.setattr(program, "ANALYSIS", small_one)
+        assert program.main(["--methods", method, *SHORT]) == 0
+    assert {row["way"] for row in rows(place, of.name)} == {way.name for way in case.ways}
 
 
 @only_long
@@ -73,68 +106,38 @@ def test_constraints_remember_what_models_do_not_see(place):
     case = case_of("constraints-errand")
     way = case.ways[-1]._replace(minimise=properties.unseen(watched))
     of = small(case._replace(ways=[way]), way.name)
-    assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
+    assert cases.main(of._replace(change=one_action), SHORT) == 0
     (row,) = rows(place, "properties")
     assert set(lengths) == {64}  # as many as an episode in that room has steps
     assert row["violations"] >= 0
-
-
-def test_two_models_are_composed(place):
-    of = small(case_of("composition-medium"), "dt")
-    assert analysis.main(of._replace(changes={**TOY, "horizon": 1}), SHORT) == 0
-    (row,) = rows(place, "properties")
-    assert row["level"] == "PickUpObjMazeS4" and len(set(row["trained"])) == 2
-    assert row["train_seconds"] == 0  # for no step
-
-
-@only_long
-@pytest.mark.parametrize("program", ALL, ids=lambda program: program.ANALYSIS.name)
-def test_every_way_of_every_program_runs(place, monkeypatch, program):
-    """Of its first case; every method of its own."""
-    of = program.ANALYSIS
-    case = of.cases[0]
-    for method in analysis.methods_of(case):
-        plans = {} if method in ("leap", "classifier") else {"horizon": 1}
-        toy = of._replace(cases=[case], changes={**TOY, **plans})
-        monkeypatch.setattr(program, "ANALYSIS", toy)
-        assert program.main(["--methods", method, *SHORT]) == 0
-    assert {row["way"] for row in rows(place, of.name)} == {way.name for way in case.ways}
 
 
 @only_long
 def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):
     """Metrics are written first, and a kill may come before the checkpoint is."""
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
-    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
-    folder = analysis.run_folder(config, 0)
+    (config,) = cases.configurations(of, of.cases[0], "leap", 0, options)
+    folder = cases.run_folder(config, 0)
     folder.mkdir(parents=True)
     write_metrics(folder, [{"step": config.training.steps, "seconds": 1.0, "loss": 1.0}])
-    assert analysis.main(of, SHORT) == 0
+    assert cases.main(of, SHORT) == 0
     assert f"training {folder}" in capsys.readouterr().out.replace("\n", "")
-    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert cases.main(of, ["--episodes", "1"]) == 0
     assert "training" not in capsys.readouterr().out
 
 
 @only_long
 def test_a_damaged_end_of_training_is_learned_again(place, capsys):
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
-    assert analysis.main(of, SHORT) == 0
-    (config,) = analysis.configurations(of, of.cases[0], "leap", 0, options)
-    folder = analysis.run_folder(config, 0) / pretrained.CHECKPOINTS
+    assert cases.main(of, SHORT) == 0
+    (config,) = cases.configurations(of, of.cases[0], "leap", 0, options)
+    folder = cases.run_folder(config, 0) / pretrained.CHECKPOINTS
     for path in (folder / "0").rglob("d/*"):
         path.write_bytes(b"")
     capsys.readouterr()
-    assert analysis.main(of, ["--episodes", "1"]) == 0
+    assert cases.main(of, ["--episodes", "1"]) == 0
     assert "training" in capsys.readouterr().out and len(rows(place, "properties")) == 2
     assert (folder / "0").is_dir() and (folder / "0.damaged").is_dir()
-
-
-def test_what_training_took_is_that_of_all_its_parts(tmp_path):
-    assert analysis.training_seconds(tmp_path) == 0
-    write_metrics(
-        tmp_path, [{"step": 1, "seconds": 2.0, "loss": 1}, {"step": 2, "seconds": 5.5, "loss": 1}]
-    )
-    assert analysis.training_seconds(tmp_path) == 5.5
 
 
 def test_every_case_can_be_made():
@@ -144,7 +147,7 @@ def test_every_case_can_be_made():
         names = [case.name for case in of.cases]
         assert len(set(names)) == len(names)
         for preset in ("leapjax", "paper"):
-            wanted = analysis.check(of, Options(preset=preset))
+            wanted = cases.check(of, Options(preset=preset))
             assert [case.name for case in wanted] == names
         for case in of.cases:
             find_level(case.level)
@@ -156,7 +159,7 @@ def test_ways_and_methods_can_be_chosen():
     def chosen(**options):
         return [
             (case.name, [way.name for way in case.ways])
-            for case in analysis.check(properties.ANALYSIS, Options(**options))
+            for case in cases.check(properties.ANALYSIS, Options(**options))
             if case.ways
         ]
 
@@ -174,14 +177,14 @@ def test_rows_are_named_by_all_that_matters():
     of, options = properties.ANALYSIS, Options()
 
     def name(way=case.ways[1], seed=0, options=options, case=case):
-        settings = [analysis.training_config(of, m, way.method, seed, options) for m in case.models]
-        return analysis.row_name(of, case, way, settings, seed, options)
+        settings = [cases.training_config(of, m, way.method, seed, options) for m in case.models]
+        return cases.row_name(of, case, way, settings, seed, options)
 
     others = [
         name(case.ways[0]), name(seed=1), name(options=Options(episodes=100)),
         name(options=Options(preset="paper")), name(options=Options(validation=True)),
         name(case.ways[1]._replace(executed=1)), name(case.ways[1]._replace(search=lambda g: g)),
-        name(case.ways[1]._replace(minimise=analysis.alone)),
+        name(case.ways[1]._replace(minimise=cases.alone)),
         name(case.ways[1]._replace(minimise=properties.unseen(constraints.lava, weight=1.0))),
         name(case.ways[1]._replace(minimise=properties.unseen(constraints.left_turns))),
         name(case.ways[1]._replace(remembers=True)),
@@ -197,7 +200,7 @@ def test_rows_are_named_by_all_that_matters():
 def test_what_a_way_minimises_can_be_told_by_its_name(program):
     for case in program.ANALYSIS.cases:
         for function in (case.adapter, *(way.minimise for way in case.ways)):
-            said = json.dumps(analysis.described(function))
+            said = json.dumps(cases.described(function))
             assert "<" not in said  # a function without a name, or what it is bound to unseen
 
 
@@ -206,7 +209,7 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
 
     def settings(method, preset="leapjax"):
         options = Options(preset=preset)
-        config = analysis.training_config(properties.ANALYSIS, model, method, 0, options)
+        config = cases.training_config(properties.ANALYSIS, model, method, 0, options)
         return config.domain_settings.detours, config.domain_settings.false_starts
 
     assert settings("leap") == (0.5, 0.6)
@@ -224,8 +227,6 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
             "--ways sums: expected some of dt, dt, exploring, dt, exploring, open doors seen",
         ),
         (["--ways", "sum", "--methods", "dt"], "none of these ways is of one of these methods"),
-        (["--preset", "fast"], "unknown preset 'fast'"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
         (["--seeds"], "--seeds needs at least one seed"),
     ],
 )
@@ -238,7 +239,7 @@ def test_what_cannot_be_is_one_line(arguments, message, capsys):
 def test_tables_hold_todays_rows_beside_the_papers_numbers():
     of = ablation.ANALYSIS
     case, way = of.cases[0], of.cases[0].ways[2]
-    settings = [analysis.training_config(of, m, "leap", 0, Options()) for m in case.models]
+    settings = [cases.training_config(of, m, "leap", 0, Options()) for m in case.models]
     row = {
         "experiment": "ablation", "case": case.name, "way": way.name, "method": "leap",
         "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
@@ -246,84 +247,37 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
         "train_seconds": 300.0, "compile_seconds": 20.0, "eval_seconds": 40.0,
         "versions": {"machine": "x86_64"},
-        "hash": analysis.row_name(of, case, way, settings, 0, Options()),
+        "hash": cases.row_name(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
     table = analyses.analysed(of, [row, stale])
     (line,) = (line for line in table.splitlines() if "Gibbs" in line)
     assert "62.5%" in line and "50.0%" in line and "**75.0%" in line and "2.00" in line
     assert line.endswith("| 6.0 |")
-    on_gpu = {**row, "versions": {"machine": "x86_64, cores: 16, 1 NVIDIA H100 80GB HBM3"}}
-    assert "| 6.0* |" in analyses.analysed(of, [on_gpu])
-    assert analyses.analysed(of, [{**row, "train_seconds": 0.0}]).endswith("| - |")
     assert report.is_used(row) and not report.is_used(stale)
 
 
-def test_plans_stand_beside_single_actions():
-    of = properties.ANALYSIS
-    case = next(case for case in of.cases if case.name == "composition-medium")
+@only_long
+def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
+    def toy_preset(domain, level, method, name):
+        return toy(find_preset(domain, level, method, name), steps=40)
 
-    def row(name: str, successes: int, violations: int = 0) -> dict:
-        way = next(way for way in case.ways if way.name == name)
-        settings = analysis.configurations(of, case, way.method, 0, Options())
-        named = analysis.row_name(of, case, way, settings, 0, Options())
-        return {
-            "case": case.name, "way": name, "preset": "leapjax", "seed": 0, "hash": named,
-            "episodes": 200, "successes": successes, "violations": violations,
-        }  # fmt: skip
-
-    rows = [row("sum", 120), row("pick-up alone", 180, 11), row("dt", 130), row("iql", 140)]
-    rows.append(row("iql, exploring", 199))
-    (line,) = (line for line in analyses.compared(of, rows).splitlines() if case.name in line)
-    assert [cell.strip() for cell in line.split("|")[2:-1]] == [
-        "**43.0%**", "15.5%", "-", "-", "60.0%", "**70.0%**", "-", "-", "-", "99.5%",
-    ]  # fmt: skip
-
-
-@pytest.fixture
-def toy_landscape(place, monkeypatch):
-    """Learns the landscape of a toy; what was measured, and the arguments."""
-
-    def toy(domain, level, method, name):
-        config = analysis.configs.with_options(preset(domain, level, method, name), TOY)
-        return analysis.configs.with_options(config, {"steps": 40})
-
-    preset = landscape.configs.preset
-    monkeypatch.setattr(landscape.configs, "preset", toy)
+    monkeypatch.setattr(landscape, "find_preset", toy_preset)
     arguments = ["--presets", "leapjax", "--trajectories", "8"]
     assert landscape.main(arguments) == 0
     (found,) = json.loads((place / "runs" / "landscape.json").read_text())
-    return found, arguments
-
-
-@only_long
-def test_the_landscape_is_watched_while_it_forms(toy_landscape, place):
-    found, arguments = toy_landscape
     assert [entry["step"] for entry in found["training"]] == [20, 40]
     last = found["training"][-1]
     assert last["random_0"] > 0 and last["random_100"] > 0
     energies = found["planning"]
     assert len(energies["mean"]) == 10 and 0 < len(energies["single"]) <= 8
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
-    assert landscape.main([*arguments, "--trajectories", "0"]) == 2
-    assert landscape.main([*arguments, "--steps", "0"]) == 2
-    assert landscape.main(["--presets"]) == 2
-    assert landscape.main([*arguments, "--record", "--steps", "3"]) == 2
+    for wrong in (["--trajectories", "0"], ["--steps", "0"], ["--record", "--steps", "3"]):
+        assert landscape.main([*arguments, *wrong]) == 2
     path = place / "runs" / "landscape.json"
     assert json.loads(path.read_text()) == [found]  # still there
     landscape.keep(path, [{**found, "preset": "paper"}, found])
     assert [each["preset"] for each in json.loads(path.read_text())] == ["leapjax", "paper"]
-
-
-@only_long
-def test_a_landscape_whose_curve_is_gone_is_learned_again(toy_landscape, place, monkeypatch):
-    found, arguments = toy_landscape
-    for curve in (place / "runs").rglob("metrics.csv"):
-        curve.unlink()
-    monkeypatch.setattr(landscape, "refinement", lambda *arguments: found["planning"])
-    assert landscape.main(arguments) == 0
-    (again,) = json.loads((place / "runs" / "landscape.json").read_text())
-    assert again["training"][-1]["random_0"] == pytest.approx(found["training"][-1]["random_0"])
 
 
 def test_a_share_of_actions_is_replaced_by_any_but_the_end():

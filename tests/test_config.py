@@ -11,18 +11,20 @@ import jax.numpy as jnp
 import pytest
 
 import experiments.__main__ as programs
-from experiments.common import config, memory
-from experiments.common.config import GROUPS, configuration_hash, preset, resolved
 from experiments.common.searches import searches
-from leapjax import checkpoints, domains, files, pretrained
+from leapjax import domains, files, pretrained, serialization
 from leapjax.agents.learning import TrainingConfig
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
-from leapjax.domains import DOMAINS
+from leapjax.configuration import configuration_hash, make_domain, resolved, specify
+from leapjax.domains import DOMAINS, find_domain
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
+from leapjax.presets import babyai, find_preset
+from leapjax.running import command_line, limits, memory
+from leapjax.running.command_line import GROUPS
 from leapjax.types import TrainState
 from tests.programs import only_long
 
@@ -37,13 +39,13 @@ class Later(Settings):
 
 
 def parse(*arguments):
-    (found,) = config.parse("babyai", arguments)
+    (found,) = command_line.parse("babyai", arguments)
     return found
 
 
 @only_long
 def test_options_of_training_are_not_for_methods_that_learn_nothing():
-    found = config.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
+    found = command_line.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
     steps = {each.method: each.training.steps for each in found}
     assert steps.pop("random") == 0 and set(steps.values()) == {5}
     with pytest.raises(UserError, match="got 0: --steps 5 needs demonstrations"):
@@ -55,7 +57,7 @@ def test_options_of_training_are_not_for_methods_that_learn_nothing():
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {
-        configuration_hash(preset("babyai", level, method, name), seed)
+        configuration_hash(find_preset("babyai", level, method, name), seed)
         for level, method, name, seed in cases
     }
     assert len(hashes) == len(cases) > 80
@@ -82,12 +84,13 @@ def test_what_it_does_not_depend_on_is_not(option):
 def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
     def names(*options):
         chosen = parse(*options)
-        specification = config.specify(chosen, 0, config.make_domain(chosen))
+        specification = specify(chosen, 0, make_domain(chosen))
         return configuration_hash(chosen, 0), pretrained.identity(specification)
 
     methods = [method for method in METHODS if METHODS[method].everywhere]
     before = [names("--method", method) for method in methods]
     monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=Later))
+    monkeypatch.setattr(babyai, "Settings", Later)
     assert isinstance(parse().domain_settings, Later)
     assert [names("--method", method) for method in methods] == before
     assert names("--mood", "calm") == before[0]
@@ -99,13 +102,13 @@ def test_the_settings_of_a_row_can_be_read_back():
     row = resolved(chosen, seed=0)
     for group in GROUPS:
         settings = getattr(chosen, group)
-        assert checkpoints.from_json(type(settings), row[group]) == settings
+        assert serialization.from_json(type(settings), row[group]) == settings
         for field in dataclasses.fields(settings):
             fewer = {name: value for name, value in row[group].items() if name != field.name}
             default = dataclasses.replace(settings, **{field.name: field.default})
-            assert checkpoints.from_json(type(settings), fewer) == default
+            assert serialization.from_json(type(settings), fewer) == default
         with pytest.raises(UserError, match="missing or unknown mood"):
-            checkpoints.from_json(type(settings), {**row[group], "mood": "calm"})
+            serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
 def test_options_have_the_names_and_defaults_of_their_group():
@@ -117,28 +120,28 @@ def test_options_have_the_names_and_defaults_of_their_group():
 
 
 def test_a_level_may_change_the_preset_of_a_method():
-    temperatures = {level: preset("babyai", level, "leap", "leapjax").planner.temperature
+    temperatures = {level: find_preset("babyai", level, "leap", "leapjax").planner.temperature
                     for level in (LEVEL, "GoToSeqS5R2")}  # fmt: skip
     assert temperatures == {LEVEL: 0.5, "GoToSeqS5R2": 1.0}
-    assert preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
+    assert find_preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
 
 
 def test_preset_paper_masks_and_ends_as_the_authors_code_does():
-    learned = {level: preset("babyai", level, "leap", "paper").method_settings
+    learned = {level: find_preset("babyai", level, "leap", "paper").method_settings
                for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
     assert [each.masking for each in learned.values()] == ["each", "each", "all"]
     assert not any(each.end or each.repeat_state for each in learned.values())
     for level in ("GoToObjMazeS7", "GoToObjMazeS7Slip", "GoToObjMazeS7Mistakes"):
-        search = preset("babyai", level, "leap", "paper").planner
+        search = find_preset("babyai", level, "leap", "paper").planner
         assert (search.horizon, search.iterations) == (10, 30)
-    assert preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
+    assert find_preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
     # In star graphs there is no pose to leave out, and a plan may end.
-    stars = preset("stars", "Star3x5", "leap", "paper").method_settings
+    stars = find_preset("stars", "Star3x5", "leap", "paper").method_settings
     assert stars.repeat_state and stars.end
 
 
 def test_all_levels_are_those_of_the_paper():
-    found = config.parse("babyai", ["--level", "all", "--demos", "9"])
+    found = command_line.parse("babyai", ["--level", "all", "--demos", "9"])
     assert [each.level for each in found] == list(BABYAI.levels)
     assert {each.demos for each in found} == {9}
     assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
@@ -153,17 +156,17 @@ def test_all_levels_are_those_of_the_paper():
 )
 def test_a_method_is_not_asked_to_plan_in_a_way_that_it_cannot(method, option, value, why):
     with pytest.raises(UserError, match=f"{option} {value}.*{why}"):
-        config.parse("babyai", ["--method", method, option, value])
+        command_line.parse("babyai", ["--method", method, option, value])
 
 
 def test_every_method_can_search_stars_and_boards():
     """Whose presets fill plans one action at a time, which the classifier cannot judge."""
     for domain in ("stars", "sudoku"):
-        (found,) = config.parse(domain, ["--method", "classifier"])
+        (found,) = command_line.parse(domain, ["--method", "classifier"])
         ways = searches(found)
         assert found.planner.fill == "together" and len(ways) > 5
-        assert {way["fill"] for way in ways} == {"together"}
-        (found,) = config.parse(domain, ["--method", "leap"])
+        assert {way.planner.fill for way in ways} == {"together"}
+        (found,) = command_line.parse(domain, ["--method", "leap"])
         assert found.planner.fill == "confident"
         assert len(searches(found)) > len(ways)
 
@@ -181,7 +184,7 @@ def test_every_program_is_known_by_name(capsys):
 
 KINDS = [
     *dict.fromkeys(method.settings for method in METHODS.values()),
-    *(domain.settings for domain in DOMAINS.values()),
+    *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
 FIELDS = [
@@ -241,8 +244,8 @@ def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path
     """It was refused later on only."""
     chosen = dataclasses.replace(parse("--level", LEVEL), context=1000)
     with pytest.raises(UserError, match="--context 1000 is longer than any episode"):
-        config.check(chosen)
-    config.check(dataclasses.replace(chosen, checkpoint=tmp_path))
+        limits.check(chosen)
+    limits.check(dataclasses.replace(chosen, checkpoint=tmp_path))
 
 
 def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch, tmp_path):
@@ -282,8 +285,8 @@ def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkey
 @pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])
 def test_any_planner_is_checked_for_memory(planner):
     chosen = dataclasses.replace(parse("--level", LEVEL), planner=planner())
-    domain = config.make_domain(chosen)
-    config.check_memory(chosen, domain)
+    domain = make_domain(chosen)
+    limits.check_memory(chosen, domain)
     huge = dataclasses.replace(chosen, planner=planner(candidates=10**9))
     with pytest.raises(UserError, match="--candidates"):
-        config.check_memory(huge, domain)
+        limits.check_memory(huge, domain)

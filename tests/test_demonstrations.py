@@ -7,12 +7,12 @@ import pytest
 from minigrid.core.world_object import Door
 from minigrid.utils.baby_ai_bot import BabyAIBot
 
-from leapjax.babyai import demonstrations, levels, observations
-from leapjax.babyai.adapter import BabyAIAdapter
-from leapjax.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
-from leapjax.babyai.observations import Observation
 from leapjax.data import seeds
 from leapjax.domain import Collection
+from leapjax.domains.babyai import demonstrations, levels, observations
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
+from leapjax.domains.babyai.observations import Observation
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 from tests.oracles import assert_same_observation, slow_path_lengths
@@ -63,24 +63,23 @@ def test_a_demonstration_can_be_replayed_from_its_seed(name):
             assert np.float32(transition.reward) == demonstration.rewards[index]
             assert transition.success == transition.terminated == last
             assert not transition.truncated or last
-
-
-@pytest.mark.parametrize("name", COUNTS)
-def test_a_demonstration_is_rewarded_at_its_end_as_the_level_does(name):
-    for demonstration in collected(name).demonstrations:
-        steps, limit = len(demonstration.actions), reset(name, demonstration.seed).max_steps
+        steps, limit = len(demonstration.actions), adapter.env.max_steps
         assert demonstration.rewards.dtype == np.float32 and not demonstration.rewards[:-1].any()
         assert demonstration.rewards[-1] == pytest.approx(1 - 0.9 * steps / limit)
         assert (demonstration.terminated, demonstration.truncated) == (True, False)
-
-
-@pytest.mark.parametrize("name", [n for n in COUNTS if "Seq" not in n and "PutNext" not in n])
-def test_the_last_state_faces_the_goal(name):
-    for demonstration in collected(name).demonstrations:
-        x, y, direction = demonstration.observations.pose[-1]
-        front = np.array([x, y]) + FRONT[direction]
-        np.testing.assert_array_equal(front, demonstration.observations.goal[-1])
-        assert (demonstration.observations.goal == demonstration.observations.goal[0]).all()
+        states = demonstration.observations
+        if "Seq" not in name and "PutNext" not in name:  # it faces its goal in the end
+            x, y, direction = states.pose[-1]
+            np.testing.assert_array_equal(np.array([x, y]) + FRONT[direction], states.goal[-1])
+            assert (states.goal == states.goal[0]).all()
+        if name == "PickUpLoc":
+            assert demonstration.actions[-1] == PICKUP and states.carried[-1, 0] > 0
+            assert (states.carried[:-1] == 0).all()
+    # No level of the training range is passed over but those that are counted as dropped.
+    found = [d.seed for d in result.demonstrations]
+    first = next(seeds.training_seeds(5))
+    assert found == sorted(set(found)) and first <= found[0]
+    assert found[-1] - first + 1 == len(found) + result.dropped.total() < seeds.TRAINING_STRIDE
 
 
 @pytest.mark.parametrize("name", ["GoToObjMazeS4", "GoToObjMazeS7", "GoToObjMazeS4R2Close"])
@@ -150,19 +149,6 @@ def test_a_search_that_fails_leaves_the_doors_as_they_were():
     assert doors(env) and not any(door.is_open for door in doors(env))
 
 
-def test_a_search_goes_through_closed_doors():
-    env = reset("GoToObjMazeS4R2Close", 0)
-    start = [(*map(int, env.agent_pos), *map(int, env.dir_vec))]
-    bot = FullViewBot(env)
-    _, _, reached = bot._breadth_first_search(start, lambda *_: False, ignore_blockers=True)
-    free = {(x, y) for x in range(7) for y in range(7) if env.grid.get(x, y) is None}
-    assert free <= reached.keys()
-    closed = BabyAIBot(env)
-    closed.vis_mask[:] = True
-    _, _, fewer = closed._breadth_first_search(start, lambda *_: False, ignore_blockers=True)
-    assert not free <= fewer.keys()
-
-
 def test_locked_doors_are_left_to_the_exploring_bot():
     assert type(demonstrations.make_bot(reset("BabyAI-UnlockLocal-v0", 0))) is BabyAIBot
     assert type(demonstrations.make_bot(reset("GoToObjMazeS4R2Close", 0))) is FullViewBot
@@ -181,23 +167,6 @@ def test_demonstrations_depend_on_the_training_seed_alone():
     assert not {d.seed for d in more} & {d.seed for d in other}
 
 
-@pytest.mark.parametrize("name", COUNTS)
-def test_level_seeds_lie_in_the_training_range(name):
-    found = [d.seed for d in collected(name).demonstrations]
-    first = next(seeds.training_seeds(5))
-    assert found == sorted(set(found))
-    assert first <= found[0] and found[-1] < first + seeds.TRAINING_STRIDE
-    result = collected(name)
-    # No level is passed over but those that are counted as dropped.
-    assert found[-1] - first + 1 == len(found) + result.dropped.total()
-
-
-@pytest.mark.parametrize("count", [0, -1])
-def test_no_demonstrations_are_refused(count):
-    with pytest.raises(UserError, match="at least one demonstration"):
-        demonstrations.collect(levels.find_level("GoToLocalS7N5"), count, seed=0)
-
-
 def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
     class Lost:
         stack = ()
@@ -209,6 +178,8 @@ def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
     with pytest.raises(UserError, match="the bot cannot solve this level") as raised:
         demonstrations.collect(levels.find_level("GoToLocalS7N5"), 1, seed=0)
     assert "\n" not in str(raised.value)
+    with pytest.raises(UserError, match="at least one demonstration"):
+        demonstrations.collect(levels.find_level("GoToLocalS7N5"), 0, seed=0)
 
 
 def test_a_bot_that_gives_up_or_runs_out_of_time_has_failed(monkeypatch):
@@ -235,10 +206,3 @@ def test_an_episode_that_ends_at_another_match_is_dropped(monkeypatch):
     dropped = Counter()
     assert demonstrations.demonstrate(adapter, 0, dropped) is None
     assert dropped == {OTHER_GOAL: 1}
-
-
-def test_pickup_demonstrations_end_with_the_pickup():
-    for demonstration in collected("PickUpLoc").demonstrations:
-        assert demonstration.actions[-1] == PICKUP
-        assert (demonstration.observations.carried[:-1] == 0).all()
-        assert demonstration.observations.carried[-1, 0] > 0

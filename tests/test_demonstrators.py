@@ -8,10 +8,10 @@ pytest.importorskip("ale_py")  # an extra
 
 from ale_py.vector_env import AtariVectorEnv
 
-from leapjax.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
-from leapjax.atari.domain import LONGEST
-from leapjax.atari.emulator import Emulator
-from leapjax.atari.games import GAMES
+from leapjax.domains.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
+from leapjax.domains.atari.domain import LONGEST
+from leapjax.domains.atari.emulator import Emulator
+from leapjax.domains.atari.games import GAMES
 from tests.programs import ROOT
 
 games = pytest.mark.parametrize("name", GAMES)
@@ -76,15 +76,25 @@ def test_a_restored_game_goes_on_the_same(name):
 
 
 @games
-def test_a_game_is_complete_and_the_same_for_the_same_seed(name):
+def test_a_game_is_what_its_seed_and_noise_say_and_can_be_played_again(name):
     game = played(name, noise=0.5)
-    count = len(game.actions)
-    assert count == 12
-    assert game.frames.shape == (count, 84, 84) and game.frames.dtype == np.uint8
+    assert len(game.actions) == 12
+    assert game.frames.shape == (12, 84, 84) and game.frames.dtype == np.uint8
     assert game.actions.dtype == np.int32 and game.rewards.dtype == np.float32
     assert game.score == game.rewards.sum()
     assert same(game, play(GAMES[name], 0, 0.5, 12))
     assert not same(game, played(name, seed=1, noise=0.5))
+    noisy = played(name, noise=1.0)
+    assert len(set(noisy.actions)) >= 4 and not same(played(name), noisy)
+    levels = [noise_of(GAMES[name], number) for number in range(6)]
+    assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
+    assert levels[2] <= (0.7 if name == "Seaquest" else 0.5)
+    emulator = Emulator(GAMES[name])
+    starts = np.random.default_rng(np.random.SeedSequence(0).spawn(3)[0])
+    emulator.reset(int(starts.integers(31)))
+    for frame, action, reward in zip(game.frames, game.actions, game.rewards, strict=True):
+        np.testing.assert_array_equal(emulator.frame(), frame)
+        assert emulator.step(int(action)) == reward
 
 
 @games
@@ -94,26 +104,6 @@ def test_recorded_games_are_played_again(name):
     shortest = min(recorded, key=lambda game: game["transitions"])
     game = play(GAMES[name], shortest["seed"], shortest["noise"], LONGEST)
     assert (len(game.actions), game.score) == (shortest["transitions"], shortest["score"])
-
-
-@games
-def test_noise_replaces_actions(name):
-    levels = [noise_of(GAMES[name], number) for number in range(6)]
-    assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
-    assert levels[2] <= (0.7 if name == "Seaquest" else 0.5)
-    noisy = played(name, noise=1.0)
-    assert len(set(noisy.actions)) >= 4
-    assert not same(played(name), noisy)
-
-
-@games
-def test_what_was_recorded_is_what_was_played(name):
-    game, emulator = played(name, noise=0.5), Emulator(GAMES[name])
-    starts = np.random.default_rng(np.random.SeedSequence(0).spawn(3)[0])
-    emulator.reset(int(starts.integers(31)))
-    for frame, action, reward in zip(game.frames, game.actions, game.rewards, strict=True):
-        np.testing.assert_array_equal(emulator.frame(), frame)
-        assert emulator.step(int(action)) == reward
 
 
 def test_pong_returns_every_ball():

@@ -5,12 +5,15 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from experiments.common import experiment, results, run
-from experiments.common.experiment import Experiment
 from leapjax import domains, methods, rollouts
 from leapjax.data import storage
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
+from leapjax.presets import PRESETS
+from leapjax.running import main as running
+from leapjax.running import results
+from leapjax.running.metrics import read_metrics
+from leapjax.running.run import Experiment
 from tests import frozen_lake
 from tests.programs import LONG, only_long
 
@@ -27,11 +30,12 @@ TOY = [*EVERY, "--temperature", "0", "--fill", "confident"]
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(domains.DOMAINS, "frozen_lake", frozen_lake.FROZEN_LAKE)
+    monkeypatch.setitem(PRESETS, "frozen_lake", {"leapjax": frozen_lake.preset})
     return tmp_path
 
 
 def test_leap_learns_a_domain_of_ones_own(workplace):
-    assert experiment.main(LAKE, TOY) == 0
+    assert running.main(LAKE, TOY) == 0
     (row,) = results.read(workplace / "runs" / "lake.jsonl")
     assert (row["domain"], row["level"]) == ("frozen_lake", frozen_lake.LEVEL)
     assert row["successes"] == row["episodes"] == 5
@@ -50,7 +54,7 @@ def test_leap_learns_a_domain_of_ones_own(workplace):
 
 def test_the_floor_of_every_table(workplace):
     arguments = "--method random --episodes 3 --no-pictures".split()
-    assert experiment.main(LAKE, arguments) == 0
+    assert running.main(LAKE, arguments) == 0
     (row,) = results.read(workplace / "runs" / "lake.jsonl")
     assert (row["method"], row["demos"], row["train_steps"], row["params"]) == ("random", 0, 0, 0)
 
@@ -67,7 +71,7 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quic
         less = methods.METHODS[name]._replace(everywhere=False)  # the others are no different
         monkeypatch.setitem(methods.METHODS, name, less)
     arguments = [*EVERY, "--steps", "0", "--method", "all"]  # gradients take long to compile
-    assert experiment.main(LAKE, arguments) == 0
+    assert running.main(LAKE, arguments) == 0
     rows = results.read(workplace / "runs" / "lake.jsonl")
     assert [row["method"] for row in rows] == [
         name for name, method in methods.METHODS.items() if method.everywhere
@@ -79,7 +83,7 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quic
     # A planner that is trained already is of one method.
     (folder,) = (workplace / "runs").glob("*-dt-*")
     for others, message in (("all", "of one method"), ("iql", "method is dt, not iql")):
-        assert experiment.main(LAKE, [*arguments[:-1], others, "--checkpoint", str(folder)]) == 2
+        assert running.main(LAKE, [*arguments[:-1], others, "--checkpoint", str(folder)]) == 2
         assert message in capsys.readouterr().err
 
 
@@ -87,12 +91,12 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quic
 def test_the_classifier_has_a_row_of_its_own_beside_leaps(workplace, quick_begin):
     arguments = [*EVERY, *"--demos 2 --episodes 2 --steps 4 --method classifier".split()]
     leaps = [*EVERY, *"--demos 2 --episodes 2 --steps 0".split()]
-    assert experiment.main(LAKE, leaps) == experiment.main(LAKE, arguments) == 0
+    assert running.main(LAKE, leaps) == running.main(LAKE, arguments) == 0
     before, after = results.read(workplace / "runs" / "lake.jsonl")
     assert (before["method"], after["method"]) == ("leap", "classifier")
     assert before["hash"] != after["hash"] and after["params"] > 0
     (folder,) = (workplace / "runs").glob("*-classifier-*")
-    assert {"loss", "absolute_error"} < run.read_metrics(folder)[-1].keys()
+    assert {"loss", "absolute_error"} < read_metrics(folder)[-1].keys()
     planner = leap.load(folder)
     plan = plans_of(planner, 3)
     assert plan.actions.shape == (3, planner.specification.planner.horizon)
@@ -110,7 +114,7 @@ def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(
     arguments = [*EVERY, "--steps", "0", "--demonstrations", "mine/unrewarded-v0", "--method"]
     for method, refused in (("dt", True), ("bc", False)):
         assert methods.METHODS[method].rewards == refused
-        assert experiment.main(LAKE, [*arguments, method]) == (2 if refused else 0), method
+        assert running.main(LAKE, [*arguments, method]) == (2 if refused else 0), method
         error = capsys.readouterr().err
         assert ("holds no rewards" in error and error.count("\n") == 1) == refused
 

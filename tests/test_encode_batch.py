@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.babyai import encoders, runs
+from leapjax.domains.babyai import encoders, runs
 from leapjax.methods import find_method
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.babyai import encoders
+from leapjax.domains.babyai import encoders
 from tests.quick import quick_jit
 
 SIDE = 6

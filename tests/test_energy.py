@@ -17,8 +17,7 @@ from leapjax.energy import (
     single_action,
     view,
 )
-from leapjax.errors import UserError
-from leapjax.planners import BeamConfig, GibbsConfig, bind, gibbs
+from leapjax.planners import GibbsConfig, bind
 from leapjax.types import Energy, mask_token, no_violation, pad_token
 from tests.enumerable import (
     all_plans,
@@ -29,7 +28,6 @@ from tests.enumerable import (
     no_tilt,
     random_table,
 )
-from tests.programs import only_long
 from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
@@ -186,14 +184,6 @@ def test_an_autoregressive_energy_is_that_of_the_joint():
     assert np.isposinf(evaluate(energy, table, NO_TILT, incomplete)[1]).all()
 
 
-def test_pseudo_likelihood_conditional_masks_all_positions_together():
-    plan, positions = np.array([1, 0, 2], np.int32), np.array([2, 1])
-    masked = np.array([1, MASK, MASK])
-    energies = PAIRWISE.conditional(VOTES, BIAS["bias"], jnp.asarray(plan), jnp.asarray(positions))
-    expected = [-pairwise_log_likelihood(masked, t) for t in positions]
-    np.testing.assert_allclose(energies, expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize("energy", [PAIRWISE, from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)])
 def test_incomplete_plan_has_infinite_total(energy):
     incomplete = [[t if s != t else token for s in range(3)] for t in range(3) for token in (3, 4)]
@@ -222,23 +212,6 @@ def test_forbidden_action_is_infinite_and_not_nan():
 # An energy from its total alone.
 
 
-ADDITIVE = np.random.default_rng(4).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
-
-
-def additive_total(params, memory, actions):
-    return sum(params[t, actions[t]] for t in range(HORIZON)) + memory
-
-
-def test_conditional_of_an_additive_energy_is_its_own_table():
-    energy = from_total(lambda params, context: context, additive_total, ACTIONS)
-    assert not energy.accepts_mask
-    actual = conditionals(energy, ADDITIVE, jnp.float32(7.0))
-    expected = np.broadcast_to(ADDITIVE, actual.shape)
-    np.testing.assert_allclose(
-        actual - actual[..., :1], expected - expected[..., :1], rtol=1e-4, atol=1e-5
-    )
-
-
 def test_conditional_from_the_exact_total_is_exact():
     energy = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
     expected = exact_conditionals(joint_probabilities(TABLE))
@@ -255,16 +228,10 @@ def test_totals_may_be_counts():
     )
 
 
-def test_a_total_that_is_not_one_number_is_refused():
-    energy = from_total(lambda p, c: None, lambda p, m, actions: 1.0 * actions, ACTIONS)
-    with pytest.raises(ValueError, match=r"must be one number, got shape \(3,\)"):
-        energy.total(None, None, jnp.zeros(HORIZON, jnp.int32))
-
-
 # Sums of energies.
 
 
-@pytest.mark.parametrize("weights", [None, (1.0, 1.0), (0.5, 2.0), (3.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("weights", [None, (0.5, 2.0), (0.0, 3.0)])
 def test_composition_is_the_weighted_product_of_the_joints(weights):
     first, second = weights or (1.0, 1.0)
     composed = compose([ENUMERABLE, ENUMERABLE], weights)
@@ -280,13 +247,6 @@ def test_composition_is_the_weighted_product_of_the_joints(weights):
         exact_conditionals(product),
         atol=1e-5,
     )
-
-
-def test_a_single_weight_is_an_inverse_temperature():
-    composed = compose([ENUMERABLE], [3.0])
-    sharper = joint_probabilities(3 * np.asarray(TABLE, np.float64))
-    actual = probabilities(conditionals(composed, (TABLE,), NO_TILT))
-    np.testing.assert_allclose(actual, exact_conditionals(sharper), atol=1e-5)
 
 
 ZERO = Energy(
@@ -307,9 +267,8 @@ INFINITE = Energy(
 
 
 @pytest.mark.parametrize(
-    ("other", "weights"), [(ZERO, None), (ZERO, (1.0, 5.0)), (ENUMERABLE, (1.0, 0.0)),
-                           (INFINITE, (1.0, 0.0))],
-)  # fmt: skip
+    ("other", "weights"), [(ZERO, None), (INFINITE, (1.0, 0.0)), (INFINITE, (1.0, 1e-39))]
+)
 def test_composing_with_nothing_changes_nothing(other, weights):
     composed = compose([ENUMERABLE, other], weights)
     params = (TABLE, OTHER_TABLE)
@@ -321,30 +280,8 @@ def test_composing_with_nothing_changes_nothing(other, weights):
     )
     # A constraint counts, whatever the weight of the energy that has it.
     assert (violations(composed, params, NO_TILT) == (other is INFINITE)).all()
-    assert composed.accepts_mask
-    assert composed.num_actions == ACTIONS
-
-
-@pytest.mark.parametrize("weight", [0.0, 1e-45, 1e-39])
-def test_a_weight_that_jax_takes_for_nothing_leaves_an_energy_out(weight):
-    composed = compose([ENUMERABLE, INFINITE], [1.0, weight])
-    params = (TABLE, OTHER_TABLE)
-    np.testing.assert_array_equal(
-        totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
-    )
-
-
-def test_composition_accepts_mask_only_if_all_its_parts_do():
-    plain = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
-    assert compose([ENUMERABLE, ENUMERABLE]).accepts_mask
-    assert not compose([ENUMERABLE, plain]).accepts_mask
-
-
-def test_composition_keeps_constraints():
-    constrained = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
-    both = compose([ENUMERABLE, constrained], [1.0, 0.5])
-    violated = violations(both, (TABLE, OTHER_TABLE), NO_TILT) > 0
-    np.testing.assert_array_equal(violated, PLANS[:, 0] == 1)
+    assert composed.accepts_mask and composed.num_actions == ACTIONS
+    assert not compose([ENUMERABLE, INFINITE]).accepts_mask
 
 
 FORBIDDING = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
@@ -372,44 +309,6 @@ def test_no_operation_drops_a_constraint(case):
         assert energy.violation(params, memory, np.array(plan)) == (plan[0] == 1)
     with pytest.raises(ValueError, match="neutral comes before constrain"):
         neutral(energy, [2])
-
-
-@only_long
-def test_a_plan_that_breaks_a_constraint_of_weight_0_is_not_satisfied():
-    # The likeliest plan begins with action 0, which is forbidden.
-    tilt = NO_TILT.copy()
-    tilt[0, 0] = 9.0
-    forbidding = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 0))
-    energy = compose([ENUMERABLE, forbidding], [1, 0])
-    params = TABLE, TABLE
-    memory = energy.encode(params, tilt)
-    plan = gibbs(energy, params, jax.random.key(0), memory, GibbsConfig(HORIZON, 1))
-    assert plan.actions[0] == 0 and not plan.satisfied
-
-
-def test_compose_refuses_different_action_sets():
-    with pytest.raises(ValueError, match=r"one action set, got sizes \[3, 4\]"):
-        compose([ENUMERABLE, enumerable_energy(HORIZON, 4)])
-
-
-@pytest.mark.parametrize(
-    "weight", [-1.0, float("inf"), float("nan"), 1e39, True, "1", None, np.ones(1), 1j]
-)
-def test_compose_refuses_impossible_weights(weight):
-    with pytest.raises(ValueError, match="weights must be"):
-        compose([ENUMERABLE, ENUMERABLE], [1.0, weight])
-
-
-@pytest.mark.parametrize("weights", [[], [1.0], [1.0, 1.0, 1.0]])
-def test_compose_refuses_a_wrong_number_of_weights(weights):
-    with pytest.raises(ValueError, match="2 energies need as many weights"):
-        compose([ENUMERABLE, ENUMERABLE], weights)
-
-
-@pytest.mark.parametrize("weights", [None, []])
-def test_compose_refuses_no_energies(weights):
-    with pytest.raises(ValueError, match="at least one energy"):
-        compose([], weights)
 
 
 # Constraints and views.
@@ -458,16 +357,6 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
     np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
 
 
-def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
-    """The model's best action is taken, and the plan says that it is not as it should be."""
-    rows = jnp.array([[3.0, -jnp.inf, 1.0, -jnp.inf], [2.0, -jnp.inf, 3.0, -jnp.inf]])
-    only = pseudo_likelihood(lambda params, context: (), lambda p, m, a, at: rows[at], 4)
-    asked = constrain(only, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
-    for config in (GibbsConfig(2, 2), BeamConfig(2, beams=2)):
-        plan = compile_planner(asked, config)((), jax.random.split(jax.random.key(0), 1), {})
-        assert plan.actions.tolist() == [[0, 2]] and not plan.satisfied[0]
-
-
 def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
     plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
@@ -482,8 +371,6 @@ def test_constraint_waits_for_a_complete_plan():
 
 
 def test_a_partial_penalty_judges_what_is_certain_already():
-    """Filled from left to right, no plan begins as it may not, though the likeliest would."""
-
     def starts_with_zero(context, actions):  # known once the first action is
         return jnp.where(actions[0] == 0, 50.0, 0.0)
 
@@ -500,10 +387,6 @@ def test_a_partial_penalty_judges_what_is_certain_already():
     np.testing.assert_array_equal(
         conditionals(judges, TABLE, tilted), conditionals(waits, TABLE, tilted)
     )
-    config = GibbsConfig(HORIZON, HORIZON, fill="sequential")
-    plans = [bind(e, config)(TABLE, jax.random.key(0), tilted) for e in (waits, judges)]
-    first = [plan.actions[0] for plan in plans]
-    assert first[0] == 0 and first[1] != 0
 
 
 def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_rest():
@@ -518,23 +401,6 @@ def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_r
         np.testing.assert_allclose(total, expected[np.arange(HORIZON), plan].sum(), rtol=1e-5)
 
 
-def test_neutral_refuses_what_it_cannot_do():
-    with pytest.raises(ValueError, match="accepts MASK"):
-        neutral(from_total(lambda params, context: context, lambda p, m, a: 0.0, 3), [0])
-    for actions in ([], [0, 1, 2]):
-        with pytest.raises(ValueError, match="expected some of 3 actions"):
-            neutral(ENUMERABLE, actions)
-    with pytest.raises(ValueError, match="neutral actions must be at most 2"):
-        neutral(ENUMERABLE, [3])
-    for actions in ([1.5], [-1], [1, 1], [True, False], [0, True], ["0"], [None], 1, "1", None,
-                    np.array([0.0]), jnp.array([0.0]), jnp.array([[0]])):  # fmt: skip
-        with pytest.raises(ValueError, match="neutral actions"):
-            neutral(ENUMERABLE, actions)
-    with pytest.raises(ValueError, match="neutral comes before constrain"):
-        neutral(compose([CONSTRAINED, CONSTRAINED]), [2])
-    assert neutral(compose([ENUMERABLE, ENUMERABLE]), [2]).accepts_mask
-
-
 @pytest.mark.parametrize(
     "actions",
     [[False, False, True], np.array([False, False, True]), jnp.array([False, False, True]), {2},
@@ -546,38 +412,6 @@ def test_a_mask_and_a_number_mean_the_same_neutral_action(actions):
     np.testing.assert_array_equal(
         neutral(ENUMERABLE, actions).conditional(TABLE, memory, tokens, positions),
         neutral(ENUMERABLE, [2]).conditional(TABLE, memory, tokens, positions),
-    )
-
-
-def test_a_constrained_or_composed_energy_takes_what_others_take():
-    """Arrays of NumPy, and lists."""
-    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
-    for energy, params in (
-        (CONSTRAINED, TABLE), (compose([CONSTRAINED, CONSTRAINED]), (TABLE, TABLE))
-    ):  # fmt: skip
-        memory = energy.encode(params, context)
-        actions, positions = PLANS[5], np.arange(HORIZON)
-        expected = energy.conditional(params, memory, jnp.asarray(actions), jnp.asarray(positions))
-        for given in ((actions, positions), (actions.tolist(), positions.tolist())):
-            np.testing.assert_array_equal(energy.conditional(params, memory, *given), expected)
-
-
-def test_nothing_is_nan_where_everything_is_forbidden():
-    forbidden = constrain(ENUMERABLE, lambda context, actions: jnp.float32(jnp.inf))
-    np.testing.assert_array_equal(
-        conditionals(forbidden, TABLE, NO_TILT), conditionals(ENUMERABLE, TABLE, NO_TILT)
-    )
-    assert np.isposinf(totals(forbidden, TABLE, NO_TILT)).all()
-    assert np.isposinf(violations(forbidden, TABLE, NO_TILT)).all()
-
-
-def test_constraints_add_up():
-    twice = constrain(CONSTRAINED, lambda context, actions: 1.0 * (actions[0] == 2))
-    context = {"tilt": NO_TILT, "price": np.float32(1.0)}
-    expected = np.array([repeats_of(plan) + (plan[0] == 2) for plan in PLANS])
-    np.testing.assert_allclose(violations(twice, TABLE, context), expected)
-    np.testing.assert_allclose(
-        totals(twice, TABLE, context), totals(ENUMERABLE, TABLE, NO_TILT) + expected, rtol=1e-5
     )
 
 
@@ -613,21 +447,6 @@ def test_view_hides_the_rest_of_the_context():
     before = totals(energy, TABLE, seen)
     np.testing.assert_array_equal(totals(energy, TABLE, hidden), before)
     assert np.abs(totals(energy, TABLE, visible) - before).max() > 0.1
-
-
-def test_two_views_make_the_product_of_what_each_sees():
-    context = {
-        "left": np.random.default_rng(9).normal(size=(HORIZON, ACTIONS)).astype(np.float32),
-        "right": np.random.default_rng(10).normal(size=(HORIZON, ACTIONS)).astype(np.float32),
-    }
-    halves = compose(
-        [view(ENUMERABLE, lambda c: c["left"]), view(ENUMERABLE, lambda c: c["right"])]
-    )
-    product = joint_probabilities(TABLE, context["left"]) * joint_probabilities(
-        OTHER_TABLE, context["right"]
-    )
-    actual = probabilities(conditionals(halves, (TABLE, OTHER_TABLE), context))
-    np.testing.assert_allclose(actual, exact_conditionals(product / product.sum()), atol=1e-5)
 
 
 # Methods that choose one action at a time.
@@ -675,12 +494,6 @@ def test_one_action_at_temperature_one_is_a_sample_of_the_policy():
     np.testing.assert_allclose(energies, -(SCORES + shift)[actions], rtol=1e-6)
 
 
-def test_one_action_at_temperature_zero_is_the_best():
-    for scores in (SCORES, OTHER_SCORES, -np.abs(OTHER_SCORES) - 100):
-        actions, _ = choices(SINGLE, scores, 0.0, temperature=0.0)
-        assert (actions == scores.argmax()).all()
-
-
 def test_scores_of_composed_methods_add_up():
     both = compose([SINGLE, SINGLE], [1.0, 0.5])
     actions, _ = choices(both, (SCORES, OTHER_SCORES), np.float32(0))
@@ -688,14 +501,8 @@ def test_scores_of_composed_methods_add_up():
     assert fit_p_value(counts_of(actions), expected) > 1e-3
     for alone in (SCORES, OTHER_SCORES):
         assert fit_p_value(counts_of(actions), softmax(alone)) < 1e-9
-
-
-def test_a_constraint_removes_an_action():
-    best = int(SCORES.argmax())
-    without = constrain(SINGLE, lambda c, plan: jnp.where(plan[0] == best, jnp.inf, 0.0))
-    actions, _ = choices(without, SCORES, np.float32(0))
-    left = np.where(np.arange(CHOICES) == best, -np.inf, SCORES)
-    assert fit_p_value(counts_of(actions), softmax(left)) > 1e-3
+    actions, _ = choices(SINGLE, SCORES, 0.0, temperature=0.0)
+    assert (actions == SCORES.argmax()).all()
 
 
 def test_the_total_of_one_action_is_its_score():
@@ -704,19 +511,6 @@ def test_the_total_of_one_action_is_its_score():
         expected = -SCORES[action] if action < CHOICES else np.inf
         assert SINGLE.total(SCORES, memory, jnp.array([action])) == expected
     assert SINGLE.total(SCORES, memory, jnp.array([mask_token(CHOICES + 1)])) == np.inf
-
-
-def test_one_action_at_a_time_has_no_other_horizon():
-    with pytest.raises(ValueError, match="its horizon is 1"):
-        bind(SINGLE, GibbsConfig(2, 1))(SCORES, jax.random.key(0), np.float32(0))
-    with pytest.raises(ValueError, match="its horizon is 1"):
-        SINGLE.total(SCORES, np.float32(0), jnp.zeros(3, jnp.int32))
-
-
-def test_scores_are_one_for_each_action_but_the_end():
-    wrong = single_action(lambda params, context: (), lambda p, m: jnp.zeros(3), 3)
-    with pytest.raises(UserError, match=r"scores must be of shape \(2,\), got shape \(3,\)"):
-        wrong.total(None, (), jnp.zeros(1, jnp.int32))
 
 
 # What is refused where values can be seen.
@@ -731,26 +525,114 @@ def scoring(scores):
     )
 
 
-ENERGIES = [
-    scoring(np.zeros((HORIZON, ACTIONS))),
-    from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS),
-]
+def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
+    """The model's best action is taken, and the plan says that it is not as it should be."""
+    free = scoring(np.tile([3.0, -np.inf, 1.0], (HORIZON, 1)).astype(np.float32))
+    asked = constrain(free, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
+    start, first = jnp.zeros(HORIZON, jnp.int32), jnp.array([0])
+    found = asked.conditional(None, (None, None), start, first)
+    np.testing.assert_array_equal(found, free.conditional(None, None, start, first))
+    assert asked.violation(None, (None, None), start) > 0
 
 
-@pytest.mark.parametrize("energy", ENERGIES)
-@pytest.mark.parametrize("positions", [[HORIZON], [-1], [0, HORIZON + 3]])
-def test_a_position_out_of_range_is_refused(energy, positions):
-    actions = jnp.zeros(HORIZON, jnp.int32)
-    with pytest.raises(ValueError, match=r"positions .* are not all in 0 \.\. 2, the horizon is 3"):
-        energy.conditional(TABLE, jnp.asarray(TABLE), actions, jnp.array(positions))
+TABLED = from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)
+FREE = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
+START = jnp.zeros(HORIZON, jnp.int32)
 
 
-@pytest.mark.parametrize("energy", ENERGIES)
-@pytest.mark.parametrize("action", [-1, ACTIONS + 1])
-def test_an_action_that_there_is_not_is_refused(energy, action):
-    actions = jnp.zeros(HORIZON, jnp.int32).at[1].set(action)
-    with pytest.raises(ValueError, match=r"actions .* are not all in 0 \.\. 2, or 3 for MASK"):
-        energy.conditional(TABLE, jnp.asarray(TABLE), actions, jnp.array([0]))
+def penalised(penalty):
+    return constrain(FREE, lambda context, actions: penalty)
+
+
+def conditional_of(energy, actions=START, positions=(0, 1), params=VOTES, memory=BIAS["bias"]):
+    return energy.conditional(params, memory, actions, jnp.array(positions))
+
+
+def without_distribution(row):
+    scores = np.zeros((HORIZON, ACTIONS), np.float32)
+    scores[1] = row
+    return conditional_of(scoring(scores), positions=(2, 1))
+
+
+def with_logits(logits):
+    return pseudo_likelihood(lambda p, c: None, lambda *_: logits, ACTIONS)
+
+
+def total_of(total):
+    return from_total(lambda p, c: None, lambda p, m, a: total, ACTIONS).total(None, None, START)
+
+
+NO_PLAN = "must be a sequence of integers"
+NOT_ONE = r"must be one number, got shape \(3,\)"
+OUT_OF_RANGE = r"positions .* are not all in 0 \.\. 2, the horizon is 3"
+NO_ACTION = r"actions .* are not all in 0 \.\. 2, or 3 for MASK"
+PENALTY = "a penalty must be"
+NAN = "energy of the plan is NaN"
+WRONG = [
+    *(
+        (lambda w=weight: compose([ENUMERABLE, ENUMERABLE], [1.0, w]), "weights must be")
+        for weight in (-1.0, float("inf"), float("nan"), 1e39, True, "1", None, 1j)
+    ),
+    (lambda: compose([ENUMERABLE, ENUMERABLE], [1.0]), "2 energies need as many weights"),
+    (lambda: compose([], []), "at least one energy"),
+    (lambda: compose([FREE, enumerable_energy(3, 4)]), r"one action set, got sizes \[3, 4\]"),
+    (lambda: compose(FREE), "a sequence of energies, got one energy"),
+    (lambda: compose([FREE, None]), "expected Energy, got"),
+    (lambda: constrain(FREE.total, lambda c, a: 0), "expected Energy, got"),
+    (lambda: view(3, lambda context: context), "expected Energy, got"),
+    (lambda: neutral(None, [0]), "expected Energy, got"),
+    (lambda: compile_planner(None, GibbsConfig()), "expected Energy, got"),
+    *(
+        (lambda p=params: compose([FREE, FREE]).encode(p, None), "params of 2 composed energies")
+        for params in ((None,), {"a": 1, "b": 2}, None, "ab c")
+    ),
+    (lambda: neutral(TABLED, [0]), "accepts MASK"),
+    (lambda: neutral(ENUMERABLE, []), "expected some of 3 actions"),
+    (lambda: neutral(ENUMERABLE, [0, 1, 2]), "expected some of 3 actions"),
+    (lambda: neutral(ENUMERABLE, [3]), "neutral actions must be at most 2"),
+    *(
+        (lambda a=actions: neutral(ENUMERABLE, a), "neutral actions")
+        for actions in ([1.5], [-1], [1, 1], [0, True], ["0"], 1, "1", jnp.array([[0]]))
+    ),
+    (lambda: neutral(compose([CONSTRAINED, CONSTRAINED]), [2]), "neutral comes before constrain"),
+    (lambda: total_of(jnp.zeros(3)), NOT_ONE),
+    (lambda: total_of(jnp.float32(jnp.nan)), NAN),
+    (lambda: penalised(jnp.float32(jnp.nan)).total(None, (None, None), START), NAN),
+    (lambda: conditional_of(penalised(jnp.float32(jnp.nan)), memory=(None, None)), "are NaN"),
+    *((lambda r=row: without_distribution(r), r"energies at positions \[1\] are NaN")
+      for row in ([np.nan, 0, 0], [np.inf, 0, 0], [-np.inf] * 3)),
+    (lambda: conditional_of(with_logits(jnp.zeros((1, 2)))), r"logits must be of shape \(2, 3\)"),
+    *(
+        (lambda p=penalty: penalised(p).violation(None, (None, None), START), PENALTY)
+        for penalty in (np.ones(HORIZON), np.ones(1), None, 1j)
+    ),
+    (lambda: penalised(None).total(None, (None, None), START), PENALTY),
+    (lambda: conditional_of(penalised(None), memory=(None, None)), PENALTY),
+    *((lambda e=energy: conditional_of(e, positions=[-1]), OUT_OF_RANGE)
+      for energy in (FREE, TABLED)),
+    *((lambda e=energy: conditional_of(e, positions=[0, HORIZON]), OUT_OF_RANGE)
+      for energy in (FREE, TABLED)),
+    *((lambda e=energy, a=action: conditional_of(e, START.at[1].set(a)), NO_ACTION)
+      for energy in (FREE, TABLED) for action in (-1, ACTIONS + 1)),
+    *((lambda a=actions: FREE.total(None, None, a), NO_PLAN)
+      for actions in ([[0]], 0, "abc", None)),
+    (lambda: bind(SINGLE, GibbsConfig(2, 1))(SCORES, jax.random.key(0), np.float32(0)),
+     "its horizon is 1"),
+    (lambda: SINGLE.total(SCORES, np.float32(0), START), "its horizon is 1"),
+    (lambda: single_action(lambda p, c: (), lambda p, m: jnp.zeros(3), 3).total(None, (), [0]),
+     r"scores must be of shape \(2,\), got shape \(3,\)"),
+    *((lambda m=make, n=count: m(*[None] * 2, n), "num_actions must be")
+      for make in (pseudo_likelihood, autoregressive, from_total, single_action, classifier)
+      for count in (0, 3.0, True)),
+    *((lambda t=token, n=count: t(n), "num_actions must be")
+      for token in (mask_token, pad_token) for count in (-1, "3", None, 2**31 - 1, [3])),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG)
+def test_mistakes_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def energies_of_everyone():
@@ -774,8 +656,7 @@ def energies_of_everyone():
 
 NO_TOKENS = {
     "floats": np.zeros(HORIZON), "booleans": np.zeros(HORIZON, bool), "texts": ["0", "1", "2"],
-    "wide": np.array([0, 2**32, 1]), "negative": np.array([0, -(2**32), 1]), "JAX": jnp.zeros(3),
-    "too many": np.array([2**63, 0, 1], np.uint64), "lists": [0.0, 1.0, 2.0],
+    "wide": np.array([0, 2**32, 1]), "JAX": jnp.zeros(3),
 }  # fmt: skip
 
 
@@ -796,7 +677,7 @@ def test_actions_and_positions_are_integers(name, wrong):
 
 
 @pytest.mark.parametrize("name", energies_of_everyone())
-@pytest.mark.parametrize("kind", [jnp.float32, jnp.bfloat16, bool])
+@pytest.mark.parametrize("kind", [jnp.float32, bool])
 def test_a_program_refuses_other_types_while_it_is_traced(name, kind):
     energy, params, memory = energies_of_everyone()[name]
     given, fine = jax.ShapeDtypeStruct((3,), kind), jax.ShapeDtypeStruct((3,), jnp.int32)
@@ -820,46 +701,6 @@ def test_small_integers_hold_every_token():
     assert seen[0].tolist() == [256, 0]
 
 
-@pytest.mark.parametrize("count", [0, -1, 3.0, True, "3", None, 2**31 - 1, 2**64, [3]])
-def test_a_number_of_actions_is_a_positive_integer(count):
-    def nothing(*given):
-        return jnp.zeros(())
-
-    for make in (pseudo_likelihood, autoregressive, from_total, single_action, classifier):
-        with pytest.raises(ValueError, match="num_actions must be"):
-            make(nothing, nothing, count)
-    for token in (mask_token, pad_token):
-        with pytest.raises(ValueError, match="num_actions must be"):
-            token(count)
-
-
-@pytest.mark.parametrize("row", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf] * 3])
-def test_scores_without_a_distribution_are_refused(row):
-    scores = np.zeros((HORIZON, ACTIONS), np.float32)
-    scores[1] = row
-    energy = scoring(scores)
-    actions = jnp.zeros(HORIZON, jnp.int32)
-    assert np.isfinite(energy.conditional(None, None, actions, jnp.array([0, 2]))).all()
-    with pytest.raises(ValueError, match=r"energies at positions \[1\] are NaN"):
-        energy.conditional(None, None, actions, jnp.array([2, 1]))
-    with pytest.raises(UserError, match=r"logits must be of shape \(1, 3\)"):
-        wrong = pseudo_likelihood(lambda p, c: None, lambda *_: jnp.zeros((1, 2)), ACTIONS)
-        jax.jit(wrong.conditional)(None, None, actions, jnp.array([0]))
-
-
-def test_totals_and_penalties_that_are_nan_are_refused():
-    nothing = jnp.zeros(HORIZON, jnp.int32)
-    nan = from_total(lambda p, c: None, lambda p, m, a: jnp.float32(jnp.nan), ACTIONS)
-    with pytest.raises(ValueError, match="energy of the plan is NaN"):
-        nan.total(None, None, nothing)
-    fine = scoring(np.zeros((HORIZON, ACTIONS)))
-    penalised = constrain(fine, lambda context, actions: jnp.float32(jnp.nan))
-    with pytest.raises(ValueError, match="are NaN"):
-        penalised.conditional(None, (None, None), nothing, jnp.array([0]))
-    with pytest.raises(ValueError, match="energy of the plan is NaN"):
-        penalised.total(None, (None, None), nothing)
-
-
 @pytest.mark.parametrize("kind", [np.uint8, np.uint32, np.int32, bool, jnp.bfloat16])
 def test_scores_of_any_real_type_are_the_numbers_that_they_say(kind):
     scores = jnp.array([1, 0], kind)  # an unsigned -1 would be 2^32 - 1
@@ -869,48 +710,3 @@ def test_scores_of_any_real_type_are_the_numbers_that_they_say(kind):
     logits = jnp.array([0, 1, 0], kind)
     model = pseudo_likelihood(lambda *_: None, lambda p, m, t, q: logits[None], 3)
     assert jnp.argmin(model.conditional(None, None, jnp.zeros(1, int), jnp.zeros(1, int))) == 1
-
-
-@pytest.mark.parametrize("penalty", [np.ones(HORIZON), np.ones(1), None, 1j])
-def test_a_penalty_is_one_real_number(penalty):
-    energy = constrain(scoring(np.zeros((HORIZON, ACTIONS), np.float32)), lambda c, a: penalty)
-    actions = jnp.zeros(HORIZON, jnp.int32)
-    for judge in (energy.total, energy.violation):
-        with pytest.raises(UserError, match="a penalty must be"):
-            judge(None, (None, None), actions)
-    with pytest.raises(UserError, match="a penalty must be"):
-        energy.conditional(None, (None, None), actions, jnp.array([0]))
-
-
-@pytest.mark.parametrize("penalty", [0, 10**12, True, np.float64(1), np.uint8(2)])
-def test_a_penalty_may_be_a_number_of_any_real_type(penalty):
-    energy = constrain(scoring(np.zeros((HORIZON, ACTIONS), np.float32)), lambda c, a: penalty)
-    assert energy.violation(None, (None, None), jnp.zeros(HORIZON, jnp.int32)) == float(penalty)
-
-
-def test_what_is_no_energy_is_refused():
-    energy = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
-    with pytest.raises(UserError, match="a sequence of energies, got one energy"):
-        compose(energy)
-    for make in (
-        lambda: compose([energy, None]),
-        lambda: constrain(energy.total, lambda c, a: 0),
-        lambda: view(3, lambda context: context),
-        lambda: neutral(None, [0]),
-        lambda: compile_planner(None, GibbsConfig()),
-    ):
-        with pytest.raises(UserError, match="expected Energy, got"):
-            make()
-
-
-@pytest.mark.parametrize("params", [(None,), (None,) * 3, {"a": 1, "b": 2}, None, "ab c"])
-def test_composed_energies_need_as_many_parameters(params):
-    energy = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
-    with pytest.raises(UserError, match="params of 2 composed energies must be a tuple"):
-        compose([energy, energy]).encode(params, None)
-
-
-@pytest.mark.parametrize("actions", [[[0]], 0, "abc", None])
-def test_a_plan_is_a_sequence_of_actions(actions):
-    with pytest.raises(UserError, match="must be a sequence of integers"):
-        scoring(np.zeros((HORIZON, ACTIONS), np.float32)).total(None, None, actions)

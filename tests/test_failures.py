@@ -5,9 +5,9 @@ from PIL import Image
 
 from experiments import failures
 from experiments.failures import Cause
-from leapjax.babyai.adapter import END
-from leapjax.babyai.demonstrations import make_bot
-from leapjax.babyai.levels import find_level
+from leapjax.domains.babyai.adapter import END
+from leapjax.domains.babyai.demonstrations import make_bot
+from leapjax.domains.babyai.levels import find_level
 from tests.programs import only_long, untrained_run
 
 LEFT, FORWARD, PICKUP = 0, 2, 3

@@ -1,7 +1,7 @@
 """What an observation space declares reaches the network, or is refused by name."""
 
 import dataclasses
-import json
+import itertools
 from typing import ClassVar
 
 import gymnasium as gym
@@ -12,13 +12,12 @@ import pytest
 from gymnasium import spaces
 
 from experiments import gymnasium as program
-from experiments.common import config, results
 from leapjax import pretrained
+from leapjax.configuration import specify
 from leapjax.data import storage
 from leapjax.domain import apply_statistics, blank_context
-from leapjax.errors import UserError
-from leapjax.gymnasium.domain import Settings, make
-from leapjax.gymnasium.observations import (
+from leapjax.domains.gymnasium.domain import Settings, make
+from leapjax.domains.gymnasium.observations import (
     MOST_INPUTS,
     Part,
     StateTokens,
@@ -28,7 +27,15 @@ from leapjax.gymnasium.observations import (
     measure_parts,
     parts_of,
 )
-from leapjax.gymnasium.scaling import BINS, UNMEASURED, count_bins, find_knots, scale_numbers
+from leapjax.domains.gymnasium.scaling import (
+    BINS,
+    UNMEASURED,
+    count_bins,
+    find_knots,
+    scale_numbers,
+)
+from leapjax.errors import UserError
+from leapjax.running import command_line, results
 from leapjax.types import Demonstration
 from tests.parameters import random_like
 from tests.programs import SMALL, only_long
@@ -118,12 +125,11 @@ FEW = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("states", "dtype"), FEW)
-def test_states_of_any_size_and_type_are_far_apart(states, dtype):
-    found = features_of(np.array(states, dtype))
-    assert np.isfinite(found).all()
-    for index, one in enumerate(found):
-        for other in found[:index]:
+def test_states_of_any_size_and_type_are_far_apart():
+    for states, dtype in FEW:
+        found = features_of(np.array(states, dtype))
+        assert np.isfinite(found).all()
+        for one, other in itertools.combinations(found, 2):
             assert np.abs(one - other).max() == 2  # from one end of an interval to the other
 
 
@@ -177,14 +183,10 @@ def test_beyond_the_training_data_features_go_on_and_stay_small():
     [
         (spaces.Box(-1, 1, (2,), np.float64), "vector", np.float32),
         (spaces.Box(-1, 1, (2,), np.float16), "vector", np.float32),
-        (spaces.Box(-1, 1, (), np.longdouble), "vector", np.float32),
         (spaces.Box(0, 2**64 - 1, (2,), np.uint64), "vector", np.uint32),
-        (spaces.Box(-9, 9, (2,), np.int64), "vector", np.int32),
         (spaces.Box(0, 1, (2,), bool), "vector", bool),
         (spaces.Box(0, 1, (4, 7, 5, 3)), "vector", np.float32),
-        (spaces.Box(0, 1, (5, 5)), "vector", np.float32),
         (spaces.Box(0, 255, (84, 84), np.uint8), "picture", np.uint8),
-        (spaces.Box(0, 1, (10, 10, 4), bool), "picture", bool),
         (spaces.Box(0, 1, (3, 64, 64)), "picture", np.float32),
         (spaces.MultiBinary([2, 3]), "vector", np.int8),
         (spaces.Discrete(3, dtype=np.uint8), "choices", np.int32),
@@ -203,20 +205,13 @@ def test_arrays_have_types_that_jax_computes_with(space, part, dtype):
     [
         (spaces.Text(5), "it is a Text: expected Box"),
         (spaces.Tuple([spaces.Discrete(2)]), "it is a Tuple: .*FlattenObservation"),
-        (spaces.Sequence(spaces.Discrete(2)), "it is a Sequence"),
-        (spaces.Graph(spaces.Discrete(2), None), "it is a Graph"),
-        (spaces.OneOf([spaces.Discrete(2)]), "it is a OneOf"),
         (spaces.Dict(), "expected a Dict with names"),
-        (spaces.Dict(inner=spaces.Dict()), r"it\['inner'\] is Dict"),
         (spaces.Dict({1: spaces.Discrete(2), "a": spaces.Discrete(2)}), "a Dict with names"),
         (spaces.Box(0, 1, (0,)), r"it is of shape \(0,\): it holds no numbers"),
-        (spaces.Box(0, 1, (5, 0, 3), np.uint8), "holds no numbers"),
         (spaces.Discrete(10**9), "one-hot code of 1000000000 numbers: .*TransformObservation"),
         (spaces.Dict(at=spaces.MultiDiscrete([2, 10**6])), r"it\['at'\] is MultiDiscrete"),
-        (spaces.MultiDiscrete([500] * 1000), "one-hot code of 500000 numbers"),
         (spaces.Discrete(3, start=2**40), "do not fit int32"),
         (spaces.Box(0, 1, (70_000,)), "70000 numbers: expected at most 65536"),
-        (spaces.MultiBinary(10**6), "1000000 numbers: expected at most 65536"),
         (spaces.Box(0, 255, (2000, 1000, 3), np.uint8), "at most 1048576; .*ResizeObservation"),
     ],
     ids=str,
@@ -306,8 +301,10 @@ def test_statistics_are_of_the_training_data_and_only_of_numbers():
 def test_statistics_are_kept_with_the_specification(tmp_path):
     domain = make("Sign-v0", Settings())
     data = [demonstration(np.array([[100], [200], [200]], np.float32))]
-    (chosen,) = config.parse("gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"])
-    before = config.specify(chosen, 0, domain)
+    (chosen,) = command_line.parse(
+        "gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"]
+    )
+    before = specify(chosen, 0, domain)
     after = dataclasses.replace(before, statistics=domain.measure(data))
     assert after.statistics == (((100.0, 200.0),),)
     assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before
@@ -363,11 +360,3 @@ def test_states_of_any_size_are_learned_from(level, tmp_path, monkeypatch, capsy
     assert program.main(again) == 0  # rebuilt with the statistics that it was trained with
     both = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert [row["successes"] for row in both] == [40, 40]
-    # As a version before statistics left it.
-    path = folder / pretrained.SPECIFICATION
-    values = json.loads(path.read_text())
-    del values["statistics"]
-    values["signature"]["parts"] = [["numbers", 0, 0]]
-    path.write_text(json.dumps(values))
-    assert program.main(again) == 2
-    assert "trained with another parts; train it again" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -15,12 +14,14 @@ import numpy as np
 import pytest
 
 from experiments import babyai
-from experiments.common import results, run, runtime, startup
-from experiments.common.interruption import SIGNALS, Interrupted, interruptible
-from experiments.common.progress import Meter
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
-from leapjax.files import only_process_in, write_text
+from leapjax.files import only_process_in
+from leapjax.running import jax_setup, results, startup
+from leapjax.running import train as running_train
+from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
+from leapjax.running.metrics import read_metrics
+from leapjax.running.progress import Meter
 from leapjax.types import TrainState
 from tests.programs import LONG, RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
 
@@ -54,8 +55,8 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
 
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
     with monkeypatch.context() as patch:
-        patch.setattr(run, "Meter", Stopped)
-        patch.setattr(runtime, "exit_at_once", sys.exit)
+        patch.setattr(running_train, "Meter", Stopped)
+        patch.setattr(jax_setup, "exit_at_once", sys.exit)
         with pytest.raises(SystemExit, match=str(code)):
             babyai.main(options)
     error = capsys.readouterr().err
@@ -66,7 +67,7 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
     assert not (tmp_path / "runs" / "babyai.jsonl").exists()
     assert babyai.main(options) == 0
     assert "continuing at step 20 of 60" in capsys.readouterr().out
-    assert [m["step"] for m in run.read_metrics(folder)] == [20, 40, 60]
+    assert [m["step"] for m in read_metrics(folder)] == [20, 40, 60]
     assert len(results.read(tmp_path / "runs" / "babyai.jsonl")) == 1
 
 
@@ -118,8 +119,8 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
     program = (
         [*"-m experiments.stars".split(), *RANDOM],
         ["-m", "benchmarks.methods"],
-        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; import experiments.__main__ as leapjax; "
-         "leapjax.main(['stars', *sys.argv[1:]])", *RANDOM],
+        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; from leapjax.__main__ import main; "
+         "main(['stars', *sys.argv[1:]])", *RANDOM],
     )[trial % 3]  # fmt: skip
     run = subprocess.Popen(
         [sys.executable, *program], cwd=tmp_path, text=True,
@@ -176,7 +177,7 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
-    monkeypatch.setattr("experiments.common.interruption.GRACE", 0.05)
+    monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
     with interruptible(ended.append) as interruption:
         with pytest.raises(Interrupted), interruption.deferred():
@@ -234,25 +235,26 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp
     saved.close()
 
 
-def test_a_path_that_goes_up_is_the_folder_that_it_leads_to(tmp_path):
-    (tmp_path / "below").mkdir()
-    roundabout = tmp_path / "below" / ".." / "checkpoints"
-    saved = Checkpoints(roundabout)
-    saved.save(state(1))
-    saved.close()
-    assert int(Checkpoints(roundabout).restore(state(0)).step) == 1
-    like = jax.eval_shape(lambda: state(0)).params
-    np.testing.assert_array_equal(restore_params(roundabout, like)["w"], 1.0)
-
-
 def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
-    saved = Checkpoints(tmp_path / "checkpoints")
+    (tmp_path / "below").mkdir()
+    saved = Checkpoints(tmp_path / "below" / ".." / "checkpoints")  # which leads to the same
     saved.save(state(1))
     saved.close()
+    like = jax.eval_shape(lambda: state(0)).params
+    found = restore_params(tmp_path / "below" / ".." / "checkpoints", like)
+    np.testing.assert_array_equal(found["w"], 1.0)
     other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
     with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
         Checkpoints(tmp_path / "checkpoints").restore(other)
     assert (tmp_path / "checkpoints" / "1").is_dir()
+
+
+def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
+    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
+    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+        pass
+    with only_process_in(tmp_path / "run"):
+        pass
 
 
 def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
@@ -298,21 +300,3 @@ with files.only_process_in(folder / "run"):  # which takes no room
     assert (tmp_path / "row.json").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
     assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1
-
-
-def test_a_lock_is_let_go_of(tmp_path):
-    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
-        pass
-    with only_process_in(tmp_path / "run"):
-        pass
-
-
-def test_text_is_replaced_whole(tmp_path):
-    write_text(tmp_path / "new" / "file.json", json.dumps([1]))
-    write_text(tmp_path / "new" / "file.json", json.dumps([2]))
-    assert json.loads((tmp_path / "new" / "file.json").read_text()) == [2]
-    assert [p.name for p in (tmp_path / "new").iterdir()] == ["file.json"]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot write"):
-        write_text(tmp_path / "file" / "below.json", "")

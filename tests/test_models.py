@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.babyai import encoders, symmetries, vocabulary
-from leapjax.babyai.adapter import END, NUM_ACTIONS
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.settings import Settings
+from leapjax.domains.babyai import encoders, symmetries, vocabulary
+from leapjax.domains.babyai.adapter import END, NUM_ACTIONS
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
 from leapjax.errors import UserError
 from leapjax.models.trajectory import (

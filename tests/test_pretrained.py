@@ -1,12 +1,15 @@
 """Planners that were trained before, asked for something else."""
 
 import dataclasses
+import itertools
 
 import jax
 import numpy as np
 import pytest
 
+import leapjax as leap
 from leapjax import pretrained
+from leapjax.batching import CompiledPlanner
 from leapjax.domain import blank_context
 from leapjax.errors import UserError
 from tests.programs import only_long, untrained_run
@@ -76,3 +79,36 @@ def test_it_plays_a_level_of_longer_episodes(tmp_path):
     there = pretrained.load(folder, level="GoToObjMazeS4R2")
     beyond = energy(there, domain.max_steps + 9)
     assert beyond == pytest.approx(last, rel=1e-6) and beyond != pytest.approx(early, rel=1e-4)
+
+
+def test_the_plan_for_an_environment_is_the_first_that_is_played():
+    """And what is said of a planner is short."""
+    planner = leap.load("GoToLocalS7N5")
+    adapter = planner.domain.make_adapter()
+    plan = planner.plan_for(adapter, seed=3)
+    assert plan.actions.shape == (5,) and plan.trace.shape == (5, 5)
+    for action in itertools.takewhile(lambda action: action < 6, plan.actions):
+        done = adapter.step(int(action)).terminated
+    played = leap.evaluate(
+        planner.domain.make_adapter, [3], planner.plan, planner.params, context=0
+    )
+    assert done and played.plans == 1
+    assert played.lengths[0] == sum(plan.actions < 6)
+    with pytest.raises(UserError, match="expected an Adapter"):
+        planner.plan_for(3)
+    level, network, search = repr(planner).splitlines()
+    assert "leap on GoToLocalS7N5, trained on 500 demonstrations" in level
+    assert network == "  network: leapjax, 3 layers of width 128, 952,588 parameters"
+    assert search.startswith("  planner: GibbsConfig(horizon=5, ")
+
+
+@pytest.mark.parametrize(("executed", "kinds"), [(None, 1), (1, 2)])
+def test_compiling_ahead_knows_what_is_encoded_already(executed, kinds, tmp_path, monkeypatch):
+    compiled = []
+    monkeypatch.setattr(
+        CompiledPlanner, "compile", lambda *given: compiled.append((given[2].encoded, given[3]))
+    )
+    planner = pretrained.load(untrained_run(tmp_path, "--architecture", "paper", "--context", "2"))
+    planner.compile(40, executed)
+    assert [batch for _, batch in compiled] == [40] * kinds
+    assert [None if each is None else each.shape[0] for each, _ in compiled] == [None, 2][:kinds]

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.common.runtime import Cluster
 from leapjax import processes
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes, join
+from leapjax.running.jax_setup import Cluster
 from tests.programs import ROOT, only_long, place_with_a_run
 
 place = pytest.fixture(place_with_a_run, scope="module")
@@ -43,10 +43,10 @@ def test_a_process_that_has_joined_others_can_still_be_stopped():
     """JAX would have the signal for itself."""
     program = f"""
 import os, signal, time
-from experiments.common import runtime
-from experiments.common.interruption import Interrupted, interruptible
+from leapjax.running import jax_setup
+from leapjax.running.interruption import Interrupted, interruptible
 with interruptible():
-    runtime.connect(runtime.Cluster({free_address()!r}, 1, 0))
+    jax_setup.connect(jax_setup.Cluster({free_address()!r}, 1, 0))
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(1)

@@ -13,10 +13,10 @@ import pytest
 
 import leapjax as leap
 from experiments import babyai, publish
-from experiments.common import results
-from experiments.common.config import parse
 from leapjax import pretrained, weights
 from leapjax.errors import UserError
+from leapjax.running import results
+from leapjax.running.command_line import parse
 from tests.programs import ROOT, only_long, untrained_run
 
 PARAMS = {"a": {"kernel": jnp.linspace(-3, 3, 12).reshape(3, 4)}, "b": jnp.ones(2)}

@@ -9,9 +9,9 @@ from experiments import qualitative
 from experiments.babyai_drawing import COLOURS, picture, way_of
 from experiments.common.episodes import watched
 from leapjax import pretrained, rollouts
-from leapjax.babyai.adapter import END, BabyAIAdapter
-from leapjax.babyai.levels import find_level
-from leapjax.babyai.observations import agent_cell
+from leapjax.domains.babyai.adapter import END, BabyAIAdapter
+from leapjax.domains.babyai.levels import find_level
+from leapjax.domains.babyai.observations import agent_cell
 from leapjax.types import Plan
 from tests.programs import only_long, untrained_run
 

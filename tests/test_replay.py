@@ -12,12 +12,12 @@ from minigrid.utils.baby_ai_bot import BabyAIBot
 from minigrid.wrappers import FullyObsWrapper
 
 from experiments import babyai
-from experiments.common import config
-from leapjax.babyai import demonstrations, levels, replay
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
 from leapjax.data import storage
+from leapjax.domains.babyai import demonstrations, levels, replay
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
+from leapjax.running import command_line
 from tests.programs import TOY, only_long
 from tests.test_storage import file_of
 
@@ -114,12 +114,12 @@ def test_episodes_that_go_otherwise_are_dropped_and_counted():
 
 def test_the_level_follows_from_the_data_and_must_be_theirs():
     name = recorded(NAMES["partial"], episodes=1)
-    (chosen,) = config.parse("babyai", ["--demonstrations", name])
+    (chosen,) = command_line.parse("babyai", ["--demonstrations", name])
     assert chosen.level == LEVEL and chosen.demonstrations == name
     with pytest.raises(
         UserError, match=f"is of {LEVEL}, not of GoToLocalS7N5: use --level {LEVEL}"
     ):
-        config.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
+        command_line.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
     assert storage.described("no/such/set-v0").level is None
 
 

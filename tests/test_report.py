@@ -4,10 +4,12 @@ import dataclasses
 from pathlib import Path
 
 from experiments import report
-from experiments.common import plots
-from experiments.common.config import configuration_hash, preset, with_options
+from experiments.common import figures
 from experiments.tables import analyses, babyai, puzzles
-from leapjax.babyai.levels import LEVELS
+from leapjax.configuration import configuration_hash
+from leapjax.domains.babyai.levels import LEVELS
+from leapjax.presets import find_preset
+from tests.programs import with_options
 
 
 def row(
@@ -15,7 +17,7 @@ def row(
     mean_length=6.0, **options,
 ):  # fmt: skip
     """The row of a run, or of its checkpoint played again, with the parts that tables read."""
-    config = with_options(preset("babyai", level, method, name), options)
+    config = with_options(find_preset("babyai", level, method, name), options)
     config = dataclasses.replace(config, checkpoint=Path("runs/name") if played else None)
     return {
         "domain": "babyai", "level": level, "method": method, "preset": name, "seed": seed,
@@ -63,8 +65,8 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert found["preset paper"][1].startswith("**20.0% [")
     assert found["preset leapjax"][2:7] == ["-"] * 5
     names, found = babyai.COMPARED, babyai.success_by_method(rows)
-    plots.methods_by_level(found, names, tmp_path / "methods.png")
-    plots.methods_by_level({}, names, tmp_path / "empty.png")
+    figures.methods_by_level(found, names, tmp_path / "methods.png")
+    figures.methods_by_level({}, names, tmp_path / "empty.png")
     # All have their place and colour on every level, also where there are no rows of them.
     everywhere = babyai.success_by_method([*rows, row("PickUpLoc", method="bc")])
     whose = [list(each) for each in everywhere.values()]
@@ -81,7 +83,7 @@ def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
     ours = [row(level, rate=0.9) for level in LEVELS]
     (line,) = (x for x in babyai.success(ours).splitlines() if "interquartile" in x)
     assert "| 63.6% | - | - | 90.0% [" in line
-    plots.intervals(found, tmp_path / "aggregate.png")
+    figures.intervals(found, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 
 
@@ -137,14 +139,14 @@ def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path
     rates = [[cell.strip() for cell in line] for line in lines]
     assert rates[0][2:6] == ["10.0%", "20.0%", "50.0%", "100.0%"]
     assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
-    plots.iterations_by_level(found, tmp_path / "figure.png")
+    figures.iterations_by_level(found, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
     """A row of a level whose plans are executed whole."""
     domain = "stars" if level.startswith("Star") else "sudoku"
-    config = with_options(preset(domain, level, method, "leapjax"), options)
+    config = with_options(find_preset(domain, level, method, "leapjax"), options)
     return {
         "domain": domain, "level": level, "method": method, "preset": "leapjax", "seed": seed,
         "first_episode_seed": config.test_seed, "episodes": 100, "successes": round(100 * rate),
@@ -185,7 +187,7 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
         "most certain first": {5: {"successes": 190, "episodes": 200}},
         "Gibbs sampling, random order": {20: {"successes": 30, "episodes": 100}},
     }
-    plots.iterations_by_level(by_passes, tmp_path / "searches.png")
+    figures.iterations_by_level(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0
 
 

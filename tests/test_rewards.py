@@ -70,14 +70,10 @@ def test_cloning_does_what_was_done_most_often():
     assert (actions != mixed.best_actions())[inner].all()
 
 
+@only_long
 @pytest.mark.parametrize(
     ("name", "architecture", "past"),
-    [
-        pytest.param("bcq", "leapjax", 0, marks=only_long),
-        pytest.param("iql", "leapjax", 0, marks=only_long),
-        pytest.param("mopo", "leapjax", 0, marks=only_long),
-        pytest.param("bcq", "paper", 2, marks=only_long),
-    ],
+    [("bcq", "leapjax", 0), ("iql", "leapjax", 0), ("mopo", "leapjax", 0), ("bcq", "paper", 2)],
 )
 def test_the_best_policy_is_found(name, architecture, past):
     agent, state, metrics = trained(name, architecture, past)
@@ -201,13 +197,10 @@ def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings):
     np.testing.assert_array_equal(bad, np.where(good == LEFT, RIGHT, LEFT))
 
 
-def test_returns_to_go_are_sums_of_what_is_to_come():
-    context = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
-    np.testing.assert_array_equal(returns.returns_to_go(context, jnp.float32(10)), [17, 16, 14, 10])
-
-
 def test_the_return_that_is_wanted_is_less_by_what_was_given():
     """In units that do not saturate; where a demonstration tells the rest, that is taken."""
+    given = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
+    np.testing.assert_array_equal(returns.returns_to_go(given, jnp.float32(10)), [17, 16, 14, 10])
     domain = mixed.DOMAIN._replace(return_scale=4.0)
     settings = dt.Settings(target_return=10.0)
     wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
@@ -226,12 +219,9 @@ def test_longer_plans_are_refused(name):
 @pytest.mark.parametrize(
     ("settings", "options"),
     [
-        (bcq.Settings, {"threshold": -0.1}), (bcq.Settings, {"discount": 1.1}),
-        (bcq.Settings, {"target_rate": float("nan")}), (iql.Settings, {"expectile": 2.0}),
-        (iql.Settings, {"inverse_temperature": -1.0}),
-        (iql.Settings, {"largest_weight": float("inf")}), (mopo.Settings, {"members": 1}),
-        (mopo.Settings, {"penalty": -1.0}), (mopo.Settings, {"real_share": 1.5}),
-        (mopo.Settings, {"rollout": 0}), (mopo.Settings, {"expectile": -1.0}),
+        (bcq.Settings, {"threshold": -0.1}), (bcq.Settings, {"target_rate": float("nan")}),
+        (iql.Settings, {"expectile": 2.0}), (iql.Settings, {"largest_weight": float("inf")}),
+        (mopo.Settings, {"members": 1}), (mopo.Settings, {"real_share": 1.5}),
         (dt.Settings, {"target_return": float("nan")}),
     ],
 )  # fmt: skip

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from leapjax.data import seeds
+from leapjax.domains.puzzles.stars import graphs
+from leapjax.domains.puzzles.sudoku import boards
 from leapjax.errors import UserError
-from leapjax.stars import graphs
-from leapjax.sudoku import boards
 
 TESTS = seeds.VALIDATION_START  # so many test levels
 VALIDATIONS = seeds.TRAINING_START - seeds.VALIDATION_START

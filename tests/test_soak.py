@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import babyai
-from experiments.common import results
 from leapjax import batching, planners, rollouts, sharding, training
 from leapjax.agents import leap
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.models.trajectory import ModelConfig
+from leapjax.running import results
 from tests.programs import TOY, only_long
 
 CYCLES, RUNS = 300, 20

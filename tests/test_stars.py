@@ -9,21 +9,22 @@ import pytest
 from PIL import Image
 
 from experiments import star_animation, stars
-from experiments.common import results, searches
-from experiments.common.config import preset, with_options
+from experiments.common import searches
 from leapjax.agents.learning import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.domains.puzzles.stars import graphs
+from leapjax.domains.puzzles.stars.domain import Settings, make
+from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
 from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
-from leapjax.stars import graphs
-from leapjax.stars.domain import Settings, make
-from leapjax.stars.graphs import Star, StarAdapter
+from leapjax.presets import find_preset
+from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
-from tests.programs import only_long
+from tests.programs import only_long, with_options
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -158,7 +159,7 @@ def test_edges_that_are_learned_from_are_in_no_order():
 
 def agent_and_domain(method="leap", **settings):
     domain = make("Star3x4", Settings(**settings))
-    config = preset("stars", "Star3x4", method, "leapjax")
+    config = find_preset("stars", "Star3x4", method, "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
     setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
     return find_method(method).make_agent(setup, None), domain
@@ -210,23 +211,12 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.check(states._replace(goal=np.full(5, 50)), "here")
 
 
-@pytest.mark.parametrize("star", [STAR, Star(5, 10)])
-def test_nodes_are_drawn_apart_and_in_the_picture(star):
-    graph, _ = graphs.draw(star, 0)
-    places = np.array(list(star_animation.layout(star, graph).values()))
-    assert len(places) == star.nodes
-    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 1e9 * np.eye(star.nodes)
-    assert apart.min() > 2 * star_animation.RADIUS
-    assert (places > star_animation.RADIUS).all()
-    assert (places < star_animation.side_of(star) - star_animation.RADIUS).all()
-
-
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
     """And plans that are shorter or longer than the way are, too."""
     star = Star(2, 3)
     other = {"horizon": horizon, "iterations": 2}
-    config = with_options(preset("stars", "Star2x3", "classifier", "leapjax"), other)
+    config = with_options(find_preset("stars", "Star2x3", "classifier", "leapjax"), other)
     num_actions = StarAdapter(star).num_actions
     energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
     run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)
@@ -266,7 +256,6 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     assert stars.main([*again, "Star5x2"]) == 0
     (*_, row) = results.read(tmp_path / "runs" / "stars.jsonl")
     assert (row["level"], row["played"]) == ("Star2x2", "Star5x2")
-    assert results.planner_name(row) == "N = 2, confident, on Star5x2"
     rows.append(row)
     for other, message in (
         ("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
@@ -275,8 +264,6 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     ):
         assert stars.main([*again, other]) == 2
         assert message in capsys.readouterr().err
-    assert stars.main([*arguments, "--play", "Star5x2"]) == 2
-    assert "with a --checkpoint, and there is none" in capsys.readouterr().err
     # One action at a time: one row, and nothing to animate.
     assert stars.main([*arguments, "--method", "bc", "--steps", "0", "--no-pictures"]) == 0
     assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1

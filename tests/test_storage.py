@@ -15,17 +15,15 @@ import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
-from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
 
 from leapjax import files
-from leapjax.babyai import levels, observations
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.observations import Observation
-from leapjax.babyai.settings import Settings
 from leapjax.data import storage
-from leapjax.domain import Collection, Described, Domain
+from leapjax.domain import Collection, Domain
+from leapjax.domains.babyai import levels, observations
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
@@ -67,8 +65,12 @@ def saved(local_demonstrations) -> list[Demonstration]:
     return local_demonstrations
 
 
-def test_what_is_saved_is_loaded(saved):
+def test_what_is_saved_is_loaded_and_replaced(saved):
+    save(saved[:2], "leapjax/GoToLocalS7N5/other-v1")
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL).demonstrations, saved[:2])
+    save(saved[3:])
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved[3:])
 
 
 def test_rewards_and_how_an_episode_ended_are_what_they_were(local_demonstrations):
@@ -101,30 +103,6 @@ def test_minari_itself_can_read_it(saved):
         )
 
 
-def test_grids_of_any_size_are_stored_without_loss():
-    # Minari takes byte arrays of 32 x 32 and more for pictures, unless it is told.
-    rng = np.random.default_rng(0)
-    side, steps = 40, 3
-    grid = np.stack([rng.integers(0, h, (steps + 1, side, side)) for h in (11, 6, 4)], axis=-1)
-    demonstration = Demonstration(
-        Observation(
-            grid.astype(np.uint8),
-            np.zeros((steps + 1, 3), np.int32),
-            np.zeros((steps + 1, 2), np.int32),
-            np.full((steps + 1, 2), -1, np.int32),
-            np.ones((steps + 1, WORDS), np.int32),
-        ),
-        np.zeros(steps, np.int32),
-        np.zeros(steps, np.float32),
-        terminated=False,
-        truncated=True,
-        seed=7,
-    )
-    large = LEVEL._replace(blank=observations.blank(side, WORDS))
-    save([demonstration], domain=large)
-    assert_same(storage.load(NAME, large).demonstrations, [demonstration])
-
-
 def domain_of(blank) -> Domain:
     """A world of one's own, whose observations look like `blank`."""
 
@@ -154,16 +132,21 @@ def test_observations_of_any_world(blank):
     assert_same(storage.load(NAME, domain_of(blank)).demonstrations, demonstrations)
 
 
+def put(folder, field, values):
+    with h5py.File(file_of(folder), "r+") as file:
+        instead(field, lambda before: values, "episode_0")(file)
+
+
 def test_observations_of_another_world_are_refused(minari_folder):
     save([own_demonstration(ARRAY)], domain=domain_of(ARRAY))
     assert "no observation 'place'" in refused(domain=domain_of(FIELDS))
     assert "observations has shape (4, 4)" in refused(domain=domain_of(np.zeros(5, np.float32)))
     assert "must be integers" in refused(domain=domain_of(np.zeros(4, np.int32)))
-    replace(file_of(minari_folder), "episode_0", "observations", np.full((4, 4), np.nan))
+    put(minari_folder, "observations", np.full((4, 4), np.nan))
     assert "not finite" in refused(domain=domain_of(ARRAY))
     save([own_demonstration(FIELDS)], domain=domain_of(FIELDS))
     assert "must be numbers" in refused(domain=domain_of(ARRAY))
-    replace(file_of(minari_folder), "episode_0", "observations/lamps", np.full((4, 2), 256))
+    put(minari_folder, "observations/lamps", np.full((4, 2), 256))
     assert "do not fit uint8" in refused(domain=domain_of(FIELDS))
 
 
@@ -174,17 +157,6 @@ def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
     assert "earlier version" in refused(name)
     save(saved, name.replace("v1", "v2"))
     assert_same(storage.load(name.replace("v1", "v2"), LEVEL).demonstrations, saved)
-
-
-def test_saving_again_replaces(saved):
-    save(saved[3:])
-    assert_same(storage.load(NAME, LEVEL).demonstrations, saved[3:])
-
-
-def test_data_sets_live_side_by_side(saved):
-    save(saved[:2], "leapjax/GoToLocalS7N5/other-v1")
-    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
-    assert_same(storage.load("leapjax/GoToLocalS7N5/other-v1", LEVEL).demonstrations, saved[:2])
 
 
 class Killed(BaseException):
@@ -249,10 +221,6 @@ def test_a_data_set_does_not_take_the_place_of_a_folder_of_others(saved):
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
-def test_a_name_that_no_file_may_have():
-    assert not storage.exists("a" * 300)
-
-
 def test_room_is_asked_for_all_that_is_written(local_demonstrations, monkeypatch, minari_folder):
     asked = []
     monkeypatch.setattr(files, "check_room", lambda folder, needed: asked.append(needed))
@@ -305,21 +273,10 @@ def test_a_folder_of_data_sets_that_is_relative(local_demonstrations, tmp_path, 
     assert (tmp_path / "sets" / NAME).is_dir()
 
 
-def test_exists():
-    assert not storage.exists(NAME)
-
-
-def test_exists_once_saved(saved):
-    assert storage.exists(NAME)
-
-
-@pytest.mark.parametrize("name", ["leapjax/none-v0", "none", "a/b/c/none-v3", "no such name!"])
-def test_a_missing_data_set(name):
+@pytest.mark.parametrize("name", ["leapjax/none-v0", "no such name!", "leapjax/GoToLocalS7N5"])
+def test_a_missing_data_set(saved, name):
     assert "no Minari data set" in refused(name)
-
-
-def test_a_namespace_is_not_a_data_set(saved):
-    assert "no Minari data set" in refused("leapjax/GoToLocalS7N5")
+    assert storage.exists(NAME) and not storage.exists("a" * 300)
 
 
 def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
@@ -331,55 +288,43 @@ def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
     assert refused(theirs).endswith("): restore it")
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
-def test_a_truncated_file(saved, minari_folder, kept):
-    path = file_of(minari_folder)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(kept * len(data))])
-    assert "cannot be read" in refused()
+def announced(**values):
+    """A change of what the metadata say."""
+
+    def change(folder):
+        path = folder / "metadata.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+    return change
 
 
-def test_a_file_of_garbage(saved, minari_folder):
-    file_of(minari_folder).write_bytes(b"\x00garbage\n" * 1000)
-    assert "cannot be read" in refused()
+def cut_short(folder):
+    path = folder / "main_data.hdf5"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "\x00", "[" * 100_000])
-def test_damaged_metadata(saved, minari_folder, text):
-    (minari_folder / NAME / "data" / "metadata.json").write_text(text)
-    assert "cannot be read" in refused()
+def endless(folder):
+    (folder / "metadata.json").unlink()
+    os.mkfifo(folder / "metadata.json")
 
 
-def test_metadata_that_have_no_end(saved, minari_folder):
-    path = minari_folder / NAME / "data" / "metadata.json"
-    path.unlink()
-    os.mkfifo(path)
-    assert storage.described(NAME) == Described()
-    assert "cannot be read" in refused()
-
-
-@pytest.mark.parametrize("name", ["main_data.hdf5", "metadata.json"])
-def test_a_missing_file(saved, minari_folder, name):
-    (minari_folder / NAME / "data" / name).unlink()
-    assert "cannot be read" in refused()
-
-
-def test_an_empty_folder(saved, minari_folder):
-    shutil.rmtree(minari_folder / NAME / "data")
-    assert "no Minari data set" in refused()
-
-
-def test_a_missing_episode(saved, minari_folder):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        del file["episode_2"]
-    assert "cannot be read" in refused()
-
-
-@pytest.mark.parametrize("field", ["observations", "actions", "rewards", "observations/goal"])
-def test_a_missing_part_of_an_episode(saved, minari_folder, field):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        del file["episode_2"][field]
-    refused()
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (cut_short, "cannot be read"),
+        (lambda folder: (folder / "metadata.json").write_text("{"), "cannot be read"),
+        (lambda folder: (folder / "metadata.json").write_text("[" * 100_000), "cannot be read"),
+        (lambda folder: (folder / "metadata.json").unlink(), "cannot be read"),
+        (lambda folder: (folder / "main_data.hdf5").unlink(), "cannot be read"),
+        (endless, "cannot be read"),
+        (shutil.rmtree, "no Minari data set"),
+        (announced(total_episodes=10**12), "1000000000000 episodes are announced, 5 are"),
+        (announced(total_steps=None), "None steps are announced"),
+    ],
+)
+def test_damaged_files(saved, minari_folder, change, says):
+    change(minari_folder / NAME / "data")
+    assert says in refused()
 
 
 def test_no_episodes():
@@ -387,108 +332,127 @@ def test_no_episodes():
     assert "no episodes" in refused()
 
 
-@pytest.mark.parametrize(
-    ("announced", "says"),
-    [
-        ({"total_episodes": 4}, "4 episodes are announced, 5 are there"),
-        ({"total_episodes": 0, "total_steps": 0}, "0 episodes are announced, 5 are there"),
-        ({"total_steps": 1}, "1 steps are announced"),
-        ({"total_steps": None}, "None steps are announced"),
-    ],
-)
-def test_numbers_of_episodes_and_steps_that_are_not_so(saved, minari_folder, announced, says):
-    path = minari_folder / NAME / "data" / "metadata.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **announced}))
-    assert says in refused()
+def instead(field, change, episode="episode_2"):
+    """A change of one array of an episode."""
 
-
-@pytest.mark.parametrize("marks", ["terminations", "truncations"])
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda marks: np.arange(len(marks)) == 1, "ended with step 1, and it goes on to step"),
-        (lambda marks: np.ones_like(marks), "ended with step 0"),
-        (lambda marks: marks[:-1], "have shape"),
-        (lambda marks: np.append(marks, True), "have shape"),
-        (lambda marks: marks[-1], "have shape ()"),
-        (lambda marks: np.full(len(marks), np.nan), "must be true or false"),
-        (lambda marks: np.full(len(marks), 2), "must be true or false"),
-        (lambda marks: np.full(len(marks), b"yes"), "must be true or false"),
-    ],
-)
-def test_marks_of_the_end_that_contradict_the_episode(saved, minari_folder, marks, change, says):
-    with h5py.File(file_of(minari_folder)) as file:
-        before = file["episode_2"][marks][()]
-    replace(file_of(minari_folder), "episode_2", marks, change(before))
-    message = refused()
-    assert f"episode 2 of the Minari data set {NAME!r}: {marks}" in message and says in message
-
-
-def test_marks_of_the_end_in_numbers(saved, minari_folder):
-    ends = np.arange(len(saved[0].actions)) == len(saved[0].actions) - 1
-    replace(file_of(minari_folder), "episode_0", "terminations", ends.astype(np.float32))
-    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
-
-
-def test_another_level(saved):
-    assert "level PickUpLoc needs" in refused(domain=BABYAI.make("PickUpLoc", Settings()))
-
-
-@pytest.mark.parametrize(
-    ("side", "words", "field"), [(6, WORDS, "grid"), (8, WORDS, "grid"), (SIDE, 9, "instruction")]
-)
-def test_another_shape(saved, side, words, field):
-    other = LEVEL._replace(blank=observations.blank(side, words))
-    assert f"{field} has shape" in refused(domain=other)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "says"),
-    [
-        ("observations/grid", 11, "grid objects"),
-        ("observations/grid", 255, "grid objects"),
-        ("observations/pose", 7, "positions"),
-        ("observations/pose", -1, "positions"),
-        ("observations/carried", 11, "carried objects"),
-        ("observations/carried", -1, "carried objects"),
-        ("observations/goal", 7, "goals"),
-        ("observations/goal", -2, "goals"),
-        ("observations/instruction", 100, "instruction"),
-        ("observations/instruction", -1, "instruction"),
-        ("actions", 6, "actions"),
-        ("actions", -1, "actions"),
-    ],
-)
-def test_a_value_out_of_range(saved, minari_folder, field, value, says):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        values = file["episode_3"][field]
-        values[(0,) * values.ndim] = value
-    message = refused()
-    assert says in message and "episode 3" in message and str(value) in message
-
-
-def test_a_direction_out_of_range(saved, minari_folder):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        file["episode_0"]["observations/pose"][1, 2] = 4
-    assert "directions run from" in refused()
-
-
-def replace(path, episode: str, field: str, values: np.ndarray) -> None:
-    with h5py.File(path, "r+") as file:
+    def replace(file):
+        values = change(file[episode][field][()])
         del file[episode][field]
         file[episode][field] = values
 
-
-@pytest.mark.parametrize("field", ["pose", "grid", "goal", "instruction"])
-def test_observations_of_another_length(saved, minari_folder, field):
-    values = getattr(saved[0].observations, field)[:-1]
-    replace(file_of(minari_folder), "episode_0", f"observations/{field}", values)
-    assert f"{field} has shape" in refused()
+    return replace
 
 
-def test_an_episode_without_actions(saved, minari_folder):
-    replace(file_of(minari_folder), "episode_0", "actions", np.zeros(0, np.int64))
-    assert "no actions" in refused()
+def first(field, value):
+    """A change of one number."""
+
+    def write(file):
+        values = file["episode_3"][field]
+        values[(0,) * values.ndim] = value
+
+    return write
+
+
+def in_infos(build):
+    """A change of what Minari reads beside the arrays that are needed."""
+    return lambda file: build(file["episode_0"].require_group("infos"))
+
+
+def diamonds(group):
+    """Each group is in the one before by two names: 2^40 ways lead to the last."""
+    for _ in range(40):
+        group["left"] = inner = group.file.create_group(None)
+        group["right"] = inner
+        group = inner
+
+
+def chain(group):
+    for _ in range(500):
+        group = group.create_group("x")
+
+
+def squeeze(group, name, shape):
+    """Half a gigabyte of zeros, in half a megabyte of a file."""
+    del group[name]
+    chunk = (2**22, *shape[1:])
+    array = group.create_dataset(name, shape, "u1", chunks=chunk, compression="gzip")
+    packed = zlib.compress(bytes(math.prod(chunk)), 9)
+    for start in range(0, shape[0], chunk[0]):
+        array.id.write_direct_chunk((start, *(0 for _ in shape[1:])), packed)
+
+
+def squeezed(name, shape):
+    return lambda file: squeeze(file["episode_0"], name, shape)
+
+
+NOT_A_MARK = "must be true or false"
+MARKS = f"episode 2 of the Minari data set {NAME!r}: truncations"
+GOAL = "observations/goal"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda file: file.__delitem__("episode_2"), "cannot be read"),
+        (lambda file: file.move("episode_1", "episode_7"), "episode_1 is not there"),
+        (lambda file: file["episode_2"].__delitem__(GOAL), "goal"),
+        (lambda file: file["episode_1"].__delitem__("rewards"), "rewards"),
+        (instead(GOAL, lambda values: values[:-1]), "goal has shape"),
+        (instead("actions", lambda values: values[:0]), "no actions"),
+        (instead("actions", lambda values: values.astype(np.int64) + 2**32), "actions run from"),
+        (instead("rewards", lambda values: np.append(values, 1.0)), "rewards have shape"),
+        (first("rewards", np.nan), "rewards: numbers that do not fit float32"),
+        (instead("rewards", lambda values: values + 1e300), "numbers that do not fit float32"),
+        (instead("terminations", np.ones_like), "ended with step 0"),
+        (
+            instead("truncations", lambda marks: np.arange(len(marks)) == 1),
+            f"{MARKS} say that the episode ended with step 1, and it goes on to step",
+        ),
+        (instead("truncations", lambda marks: marks[-1]), "have shape ()"),
+        (instead("truncations", lambda marks: np.full(len(marks), 2)), NOT_A_MARK),
+        (instead("truncations", lambda marks: np.full(len(marks), np.nan)), NOT_A_MARK),
+        (instead("truncations", lambda marks: np.full(len(marks), b"yes")), NOT_A_MARK),
+        (first("observations/grid", 11), "grid objects"),
+        (first("observations/pose", 7), "positions"),
+        (first("observations/carried", -1), "carried objects"),
+        (first("observations/goal", -2), "goals"),
+        (first("observations/instruction", 100), "instruction"),
+        (first("actions", 6), "actions"),
+        (first("actions", -1), "actions"),
+        (
+            instead("observations/pose", lambda pose: pose + np.array([0, 0, 4])),
+            "directions run from",
+        ),
+        (instead(GOAL, lambda values: np.full(len(values), b"x")), "goal"),
+        (in_infos(diamonds), "is an object that has another name too"),
+        (in_infos(lambda group: group.__setitem__("root", group.file["/"])), "another name"),
+        (in_infos(chain), "is a group in 17 groups"),
+        (in_infos(lambda group: group.__setitem__("kind", np.dtype("f4"))), "not an array of this"),
+        # Shapes are compared before anything is unpacked.
+        (squeezed("observations/instruction", (2**27, 4)), "has shape (134217728, 4)"),
+        (squeezed("actions", (2**29,)), "rewards have shape"),
+    ],
+)
+def test_damaged_arrays(saved, minari_folder, monkeypatch, change, says):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        change(file)
+    assert file_of(minari_folder).stat().st_size < 2**21
+    if "has shape (134" in says:
+        monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
+    assert says in refused()
+
+
+def test_marks_of_the_end_in_numbers(saved, minari_folder):
+    with h5py.File(file_of(minari_folder), "r+") as file:
+        instead("terminations", lambda marks: marks.astype(np.float32))(file)
+    assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
+
+
+def test_another_level_or_shape(saved):
+    assert "level PickUpLoc needs" in refused(domain=BABYAI.make("PickUpLoc", Settings()))
+    for side, words, field in ((8, WORDS, "grid"), (SIDE, 9, "instruction")):
+        other = LEVEL._replace(blank=observations.blank(side, words))
+        assert f"{field} has shape" in refused(domain=other)
 
 
 @pytest.mark.parametrize(
@@ -512,106 +476,6 @@ def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stor
     assert_same(storage.load(NAME, LEVEL).demonstrations, loaded.demonstrations)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-def test_rewards_that_are_not_finite(saved, minari_folder, bad):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        file["episode_1"]["rewards"][0] = bad
-    message = refused()
-    assert "episode 1" in message and "rewards: numbers that do not fit float32" in message
-
-
-@pytest.mark.parametrize("field", ["actions", "rewards", "terminations"])
-def test_a_group_in_the_place_of_an_array(saved, minari_folder, field):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        del file["episode_1"][field]
-        file["episode_1"].create_group(field)
-    assert f"{field} " in refused()
-
-
-def test_rewards_of_another_length(saved, minari_folder):
-    rewards = np.append(saved[2].rewards, 1.0)
-    replace(file_of(minari_folder), "episode_2", "rewards", rewards)
-    assert "rewards have shape" in refused()
-
-
-def test_actions_of_64_bits_do_not_wrap_around(saved, minari_folder):
-    actions = saved[0].actions.astype(np.int64) + 2**32
-    replace(file_of(minari_folder), "episode_0", "actions", actions)
-    assert "actions run from" in refused()
-
-
-def in_infos(build):
-    """A change of what Minari reads beside the arrays that are needed."""
-    return lambda file: build(file["episode_0"].require_group("infos"))
-
-
-def diamonds(group):
-    """Each group is in the one before by two names: 2^40 ways lead to the last."""
-    for _ in range(40):
-        group["left"] = inner = group.file.create_group(None)
-        group["right"] = inner
-        group = inner
-
-
-def ring(group):
-    innermost = group.create_group("a/b/c")
-    innermost["again"] = group["a"]
-
-
-def chain(group):
-    for _ in range(500):
-        group = group.create_group("x")
-
-
-@pytest.mark.parametrize(
-    ("build", "says"),
-    [
-        (in_infos(diamonds), "is an object that has another name too"),
-        (in_infos(ring), "is an object that has another name too"),
-        (in_infos(lambda group: group.__setitem__("root", group.file["/"])), "another name"),
-        (in_infos(lambda group: group.__setitem__("r", group.parent["rewards"])), "another name"),
-        (in_infos(chain), "is a group in 17 groups"),
-        (in_infos(lambda group: group.__setitem__("kind", np.dtype("f4"))), "not an array of this"),
-        (lambda file: file.move("episode_1", "episode_7"), "episode_1 is not there"),
-        (lambda file: file["episode_0"].__setitem__("x", file["episode_1"]), "another name"),
-    ],
-)
-def test_groups_that_are_no_tree_of_episodes(saved, minari_folder, build, says):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        build(file)
-    assert says in refused()
-
-
-def squeeze(group, name, shape):
-    """Half a gigabyte of zeros, in half a megabyte of a file."""
-    del group[name]
-    chunk = (2**22, *shape[1:])
-    array = group.create_dataset(name, shape, "u1", chunks=chunk, compression="gzip")
-    packed = zlib.compress(bytes(math.prod(chunk)), 9)
-    for start in range(0, shape[0], chunk[0]):
-        array.id.write_direct_chunk((start, *(0 for _ in shape[1:])), packed)
-
-
-@pytest.mark.parametrize(
-    ("name", "shape", "says"),
-    [
-        ("observations/instruction", (2**27, 4), "instruction has shape (134217728, 4)"),
-        ("observations/pose", (2**29,), "pose has shape"),
-        ("actions", (2**29,), "rewards have shape"),
-        ("rewards", (2**29,), "rewards have shape"),
-        ("terminations", (2**29,), "terminations have shape"),
-    ],
-)
-def test_shapes_are_compared_before_anything_is_unpacked(
-    saved, minari_folder, monkeypatch, name, shape, says
-):
-    with h5py.File(file_of(minari_folder), "r+") as file:
-        squeeze(file["episode_0"], name, shape)
-    assert file_of(minari_folder).stat().st_size < 2**20
-    monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
-    assert says in refused()
-
-
 def test_what_does_not_fit_into_memory_is_not_unpacked(saved, minari_folder, monkeypatch):
     with h5py.File(file_of(minari_folder), "r+") as file:
         squeeze_infos = file["episode_3"].require_group("infos")
@@ -622,11 +486,6 @@ def test_what_does_not_fit_into_memory_is_not_unpacked(saved, minari_folder, mon
     assert_same(storage.load(NAME, LEVEL, most=3).demonstrations, saved[:3])  # it is not needed
     monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
     assert "at least 0 GiB of memory would be needed" in refused()
-
-
-def test_an_array_is_not_widened_to_be_checked():
-    wide = np.broadcast_to(np.zeros((), np.uint8), (2**40,))  # takes a byte
-    assert storage._numbers(np.zeros((), np.int64), wide, "it") is wide
 
 
 PICTURE = np.zeros((32, 40, 3), np.uint8)
@@ -687,62 +546,73 @@ def test_bytes_of_varying_length_that_the_file_does_not_hold(minari_folder, save
         storage._check_varying(file["episode_0/infos/words"], "words", 9_999)
 
 
-def other_data_set(observation_space, observations, action_space, actions, **episode) -> None:
-    steps = len(actions)
+def other_data_set(space, states, action_space=None, actions=None) -> None:
+    """A data set of somebody else, of one episode and without its seed."""
+    steps = len(jax.tree.leaves(states)[0]) - 1
     minari.create_dataset_from_buffers(
         dataset_id=NAME,
         buffer=[
             EpisodeBuffer(
-                id=0,
-                observations=observations,
-                actions=actions,
+                id=0, observations=states, actions=[0] * steps if actions is None else actions,
                 rewards=[float(reward) for reward in range(steps)],
-                terminations=[False] * steps,
-                truncations=[False] * (steps - 1) + [True],
-                **episode,
+                terminations=[False] * steps, truncations=[False] * (steps - 1) + [True],
             )
         ],
-        observation_space=observation_space,
-        action_space=action_space,
+        observation_space=space, action_space=action_space or gym.spaces.Discrete(6),
         jpeg_encoding=False,
-    )
+    )  # fmt: skip
 
 
-def test_a_data_set_of_plain_arrays():
-    other_data_set(
-        gym.spaces.Box(-1, 1, (4,), np.float32),
-        np.zeros((3, 4), np.float32),
-        gym.spaces.Discrete(2),
-        [0, 1],
-    )
+LETTERS = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
+MINIGRID = {
+    "image": gym.spaces.Box(0, 255, (7, 7, 3), np.uint8),
+    "direction": gym.spaces.Discrete(4),
+    "mission": LETTERS,
+}
+
+
+@pytest.mark.parametrize(
+    ("spaces", "change", "says"),
+    [
+        ({"grid": gym.spaces.Box(0, 1000, (SIDE, SIDE, 3), np.int32)},
+         lambda states: {"grid": states["grid"].astype(np.int32) + 256}, "grid objects"),
+        ({"grid": gym.spaces.Box(0, 1, (SIDE, SIDE, 3), np.float32)},
+         lambda states: {"grid": states["grid"] / np.float32(255)}, "grid"),
+        ({"instruction": LETTERS},
+         lambda states: {"instruction": ["go to it"] * len(states["pose"])}, "instruction"),
+        # "can be used": test_replay.py
+        (MINIGRID, lambda states: {"image": states["grid"], "direction": states["pose"][:, 2],
+                                   "mission": ["go to it"] * len(states["pose"])},
+         "can be used, only 1 without the seed of their reset"),
+    ],
+)  # fmt: skip
+def test_observations_of_other_data_sets(local_demonstrations, spaces, change, says):
+    states = local_demonstrations[0].observations._asdict()
+    known = storage.observation_space(LEVEL.blank).spaces
+    if spaces is MINIGRID:
+        other_data_set(gym.spaces.Dict(spaces), change(states))
+    else:
+        other_data_set(gym.spaces.Dict({**known, **spaces}), {**states, **change(states)})
+    assert says in refused()
+
+
+def test_arrays_and_continuous_actions_of_other_data_sets(local_demonstrations):
+    box = gym.spaces.Box(-1, 1, (4,), np.float32)
+    other_data_set(box, np.zeros((3, 4), np.float32))
     assert "no observation 'grid'" in refused()
-
-
-def test_a_data_set_of_minigrids_own_observations():
-    space = gym.spaces.Dict(
-        {
-            "image": gym.spaces.Box(0, 255, (7, 7, 3), np.uint8),
-            "direction": gym.spaces.Discrete(4),
-            "mission": gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz "),
-        }
-    )
-    states = {
-        "image": np.zeros((3, 7, 7, 3), np.uint8),
-        "direction": np.zeros(3, np.int64),
-        "mission": ["go to the ball"] * 3,
-    }
-    other_data_set(space, states, gym.spaces.Discrete(7), [0, 1])
-    assert "can be used, only 1 without the seed of their reset" in refused()  # test_replay.py
+    states, steps = local_demonstrations[0].observations, len(local_demonstrations[0].actions)
+    minari.delete_dataset(NAME)
+    space = storage.observation_space(LEVEL.blank)
+    other_data_set(space, states._asdict(), box, np.zeros((steps, 4), np.float32))
+    assert "action" in refused()
 
 
 def test_a_users_data_set_without_seeds(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     other_data_set(
-        storage.observation_space(LEVEL.blank),
-        demonstration.observations._asdict(),
-        gym.spaces.Discrete(6),
-        list(demonstration.actions),
-    )
+        storage.observation_space(LEVEL.blank), demonstration.observations._asdict(),
+        gym.spaces.Discrete(6), list(demonstration.actions),
+    )  # fmt: skip
     expected = demonstration._replace(
         rewards=np.arange(len(demonstration.actions), dtype=np.float32),
         terminated=False,
@@ -752,58 +622,9 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
     assert_same(storage.load(NAME, LEVEL).demonstrations, [expected])
 
 
-def test_fields_of_text_instead_of_numbers(local_demonstrations):
-    [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(LEVEL.blank)
-    space["instruction"] = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
-    states = demonstration.observations._asdict()
-    states["instruction"] = ["go to the red ball"] * len(states["pose"])
-    other_data_set(space, states, gym.spaces.Discrete(6), list(demonstration.actions))
-    refused()
-
-
-def test_continuous_actions(local_demonstrations):
-    [demonstration] = local_demonstrations[:1]
-    steps = len(demonstration.actions)
-    other_data_set(
-        storage.observation_space(LEVEL.blank),
-        demonstration.observations._asdict(),
-        gym.spaces.Box(0, 1, (2,), np.float32),
-        list(np.full((steps, 2), 0.5, np.float32)),
-    )
-    refused()
-
-
-def test_numbers_that_wrap_around_are_out_of_range(local_demonstrations):
-    [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(LEVEL.blank)
-    space["grid"] = gym.spaces.Box(0, 1000, (SIDE, SIDE, 3), np.int32)
-    states = demonstration.observations._asdict()
-    states["grid"] = states["grid"].astype(np.int32) + 256
-    other_data_set(space, states, gym.spaces.Discrete(6), list(demonstration.actions))
-    assert "grid objects" in refused()
-
-
-def test_numbers_that_are_not_whole(local_demonstrations):
-    [demonstration] = local_demonstrations[:1]
-    space = storage.observation_space(LEVEL.blank)
-    space["grid"] = gym.spaces.Box(0, 1, (SIDE, SIDE, 3), np.float32)
-    states = demonstration.observations._asdict()
-    states["grid"] = states["grid"] / np.float32(255)  # scaled, as pictures often are
-    other_data_set(space, states, gym.spaces.Discrete(6), list(demonstration.actions))
-    refused()
-
-
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
     ids = [storage.dataset_id(LEVEL._replace(level=level.name), 500, 0) for level in known]
+    ids += [storage.dataset_id(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
     shared = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
     assert not shared
-
-
-def test_every_count_and_seed_has_a_cache_of_its_own():
-    ids = {storage.dataset_id(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)}
-    assert len(ids) == 4
-    for name in ids:
-        namespace, short, version = parse_dataset_id(name)
-        assert namespace and short and version is not None

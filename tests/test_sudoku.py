@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 from experiments import babyai, sudoku
-from experiments.common import results, searches
+from experiments.common import searches
 from leapjax.batching import compile_planner
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.domains.puzzles.sudoku import boards
+from leapjax.domains.puzzles.sudoku.boards import Size, SudokuAdapter
+from leapjax.domains.puzzles.sudoku.domain import BoardTokens, Settings, make
+from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
-from leapjax.sudoku import boards
-from leapjax.sudoku.boards import Size, SudokuAdapter
-from leapjax.sudoku.domain import BoardTokens, Settings, make
-from leapjax.sudoku.rules import rules
+from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long
@@ -106,7 +107,7 @@ def transformed(size):
 
 
 @SIZES
-@pytest.mark.parametrize("cell", [0, 1, 7])
+@pytest.mark.parametrize("cell", [0, 7])
 def test_a_transformed_window_is_that_of_another_board(size, cell):
     draw, seen = transformed(size), set()
     for seed, episode in itertools.product(range(4), range(2)):
@@ -261,8 +262,6 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     [
         ("Sudoku9", "unknown level 'Sudoku9': expected Sudoku<4 or 9>x<clues>, such as Sudoku4x6"),
         ("sudoku9x36", "did you mean Sudoku9x36"),
-        ("Sudoku6x10", "unknown level"),
-        ("Sudoku9x17", r"clues must be in 26 \.\. 81, got 17"),
         ("Sudoku4x17", r"clues must be in 4 \.\. 16"),
     ],
 )

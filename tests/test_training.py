@@ -14,13 +14,13 @@ from leapjax import schedules, sharding, training
 from leapjax.agents import leap, learning
 from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup, TrainingConfig
-from leapjax.babyai import encoders
-from leapjax.babyai.adapter import NUM_ACTIONS
-from leapjax.babyai.domain import BABYAI
-from leapjax.babyai.settings import Settings
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import blank_context
+from leapjax.domains.babyai import encoders
+from leapjax.domains.babyai.adapter import NUM_ACTIONS
+from leapjax.domains.babyai.domain import BABYAI
+from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.models import trajectory
 from leapjax.models.trajectory import ModelConfig

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leapjax.babyai import levels, vocabulary
+from leapjax.domains.babyai import levels, vocabulary
 from leapjax.errors import UserError
 
 words = st.sampled_from(vocabulary.WORDS)

@@ -9,17 +9,17 @@ import pytest
 from minigrid.core.constants import DIR_TO_VEC
 
 from experiments.properties import AGAIN, CASES, DETOUR_TURNS, FEW_TURNS, WatchedErrand
-from leapjax.babyai import demonstrations, observations
-from leapjax.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
-from leapjax.babyai.constraints import (
+from leapjax.domains.babyai import demonstrations, observations
+from leapjax.domains.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
+from leapjax.domains.babyai.constraints import (
     half_of_obstacles,
     without_lava,
     without_marks,
     without_open_doors,
 )
-from leapjax.babyai.dynamics import FLOOR, LAVA
-from leapjax.babyai.levels import LEVELS, MODIFIED, find_level
-from leapjax.babyai.symmetries import AGENT, EMPTY
+from leapjax.domains.babyai.dynamics import FLOOR, LAVA
+from leapjax.domains.babyai.levels import LEVELS, MODIFIED, find_level
+from leapjax.domains.babyai.symmetries import AGENT, EMPTY
 from leapjax.energy import from_total
 from leapjax.rollouts import History
 
@@ -122,15 +122,6 @@ def test_the_planner_sees_no_lava_and_everything_else():
     assert (np.asarray(seen.grid)[~other] == [1, 0, 0]).all()
 
 
-def test_open_doors_look_empty_and_closed_ones_do_not():
-    _, context = first("GoToObjMazeS4", 0)
-    doors = cells_of(context.observation, 4)
-    assert doors and not cells_of(jax.device_get(without_open_doors(context).observation), 4)
-    _, closed = first("GoToObjMazeS4R2Close", 0)
-    seen = jax.device_get(without_open_doors(closed).observation)
-    assert cells_of(seen, 4) == cells_of(closed.observation, 4) != set()
-
-
 def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_says():
     def total(params, memory, actions):
         return (memory.observation.grid[..., 0] == 4).sum().astype(float)
@@ -138,6 +129,11 @@ def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_say
     counts = from_total(lambda params, context: context, total, NUM_ACTIONS)
     _, context = first("GoToObjMazeS4", 0)
     doors = len(cells_of(context.observation, 4))
+    assert not cells_of(jax.device_get(without_open_doors(context).observation), 4)
+    _, closed = first("GoToObjMazeS4R2Close", 0)
+    closed_doors = cells_of(closed.observation, 4)
+    assert cells_of(jax.device_get(without_open_doors(closed).observation), 4) == closed_doors
+    assert doors and closed_doors
     (case,) = (case for case in CASES if case.name == "generalization-hard")
     for way in case.ways:
         energy = way.minimise([counts])
@@ -169,6 +165,12 @@ def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():
 
 def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
     adapter = BabyAIAdapter(find_level("GoToObjMazeS4Slip"))
+
+    def taken():
+        adapter.reset(7)
+        return [(adapter.step(0).truncated, adapter.taken)[1] for _ in range(30)]
+
+    assert taken() == taken() and len(set(taken())) > 1  # a seed decides how it slips
     asked, slipped = Counter(), Counter()
     rng = np.random.default_rng(0)
     for seed in range(40):
@@ -186,16 +188,6 @@ def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
         assert (0.15 < share < 0.25) if action in TURNS else share == 0
         if action in TURNS:
             assert min(others) > 0.1 * sum(others)  # each is a fifth of them
-
-
-def test_an_episode_slips_the_same_way_each_time():
-    def played():
-        adapter = BabyAIAdapter(find_level("GoToObjMazeS4Slip"))
-        adapter.reset(7)
-        return [(adapter.step(0).truncated, adapter.taken)[1] for _ in range(30)]
-
-    assert played() == played()
-    assert len(set(played())) > 1
 
 
 @pytest.mark.parametrize("name", ["GoToObjMazeS4Slip", "GoToObjMazeS4Mistakes"])
@@ -240,13 +232,6 @@ def test_mislabelled_demonstrations_are_the_same_but_for_labels():
         np.testing.assert_array_equal(a.observations.grid, b.observations.grid)
     wrong = np.concatenate([a.actions != b.actions for a, b in zip(good, bad, strict=True)])
     assert abs(wrong.mean() - 0.25 * 5 / 6) < 0.05
-
-
-def test_something_is_picked_up_in_a_room_and_in_a_maze():
-    for name in ("PickUpLocalS10N1", "PickUpObjMazeS4"):
-        (demonstration,) = demonstrations.collect(find_level(name), 1, 0).demonstrations
-        assert demonstration.actions[-1] == 3
-        assert not (demonstration.actions[:-1] == 3).any()
 
 
 def test_levels_that_models_share_have_the_same_side_and_plans():

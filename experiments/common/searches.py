@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from experiments.common.config import AnyConfig
+from leapjax.configuration import AnyConfig, change
 from leapjax.planners import GibbsConfig
 
 
@@ -44,11 +44,11 @@ BEST_OF_MANY = Search(
 )  # fmt: skip
 
 
-def searches(config: AnyConfig) -> list[Mapping[str, Any]]:
-    """Options of every way to plan that a method can; those of one action at a time have none."""
+def searches(config: AnyConfig) -> list[AnyConfig]:
+    """Every way to plan that a method can; those of one action at a time have none."""
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
     every = (*SEARCHES, BEST_OF_MANY) if config.method == "rules" else SEARCHES
     if config.method == "classifier":  # judges no plan in which actions are open
         every = tuple(search for search in every if "fill" not in search.options)
-    return [search.of(config.planner.horizon) for search in every]
+    return [change(config, planner=search.of(config.planner.horizon)) for search in every]

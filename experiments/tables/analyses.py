@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
-from experiments.common import analysis
-from experiments.common.analysis import Analysis, Case
-from experiments.common.results import Row
+from experiments.common.cases import Analysis, Case, rows_of_way
 from experiments.tables.cells import mean_length, mean_rate, milliseconds, minutes, rate, table
+from leapjax.running.results import Row
 
 ANALYSES = {
     program.ANALYSIS.name: program.ANALYSIS
@@ -18,9 +17,7 @@ def uses(row: Row) -> bool:
     """Whether a row is in a table."""
     of = ANALYSES[row["experiment"]]
     return any(
-        analysis.rows_of_way(of, [row], case, way, row["preset"])
-        for case in of.cases
-        for way in case.ways
+        rows_of_way(of, [row], case, way, row["preset"]) for case in of.cases for way in case.ways
     )
 
 
@@ -38,7 +35,7 @@ def analysed(of: Analysis, rows: Sequence[Row], kind: str = "") -> str:
             (way, preset, mine)
             for way in case.ways
             for preset in ("paper", "leapjax")
-            if (mine := analysis.rows_of_way(of, rows, case, way, preset))
+            if (mine := rows_of_way(of, rows, case, way, preset))
         ]
         best = max((mean_rate(mine) for _, _, mine in found), default=None)
         for way, preset, mine in found:
@@ -76,7 +73,7 @@ def compared(of: Analysis, rows: Sequence[Row]) -> str:
 
     def best(case: Case, preset: str, plans: bool, explores: bool) -> float | None:
         found = (
-            analysis.rows_of_way(of, rows, case, way, preset)
+            rows_of_way(of, rows, case, way, preset)
             for way in case.ways
             if (way.method == "leap") == plans and way.explores == explores
         )

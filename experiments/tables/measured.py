@@ -3,7 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from experiments.common.schema import (
+from experiments.landscape import CORRUPTED
+from experiments.tables.atari import ENCODED
+from leapjax.errors import UserError, first_line
+from leapjax.files import read_text
+from leapjax.running.schema import (
     AMOUNT,
     COUNT,
     POSITIVE,
@@ -17,10 +21,6 @@ from experiments.common.schema import (
     loads,
     problem,
 )
-from experiments.landscape import CORRUPTED
-from experiments.tables.atari import ENCODED
-from leapjax.errors import UserError, first_line
-from leapjax.files import read_text
 
 PART = {"part": str, "ms": POSITIVE, "gflop": AMOUNT}
 TRAINING = {

@@ -9,7 +9,7 @@ import dataclasses
 from jax.sharding import Mesh
 
 from leapjax.agents.imitation import make_imitator
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.types import Agent
 
 
@@ -23,4 +23,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return make_imitator(setup, mesh)
 
 
-BC = Method(Settings, make_agent, SINGLE_ACTION_PRESETS)
+BC = Method(Settings, make_agent)

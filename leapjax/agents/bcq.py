@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import encode_around, look_around
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.models.policy import Said
@@ -22,12 +22,19 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of BCQ alone. The defaults are the original's, but for the target network."""
+    """The options of BCQ alone. The defaults are the original's, but for the target network.
 
-    threshold: float = 0.3  # an action less likely than so much of the likeliest is excluded
+    Attributes:
+        threshold: Actions less likely than this share of the likeliest are excluded.
+        discount: Discount of rewards per step.
+        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
+        logit_penalty: Weight of the squares of the behaviour model's logits in the loss.
+    """
+
+    threshold: float = 0.3
     discount: float = 0.99
-    target_rate: float = 0.005  # how far the target network follows at each step
-    logit_penalty: float = 0.01  # on the squares of the behaviour's logits
+    target_rate: float = 0.005
+    logit_penalty: float = 0.01
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -86,4 +93,4 @@ def likely_values(said: Said, threshold: float) -> jax.Array:
     return jnp.where(likely, said["q"], -jnp.inf)
 
 
-BCQ = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+BCQ = Method(Settings, make_agent, rewards=True)

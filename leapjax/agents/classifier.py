@@ -12,16 +12,10 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning
 from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.energy import classifier
 from leapjax.models.trajectory import SequenceClassifier
 from leapjax.types import Agent, Context, Params, PyTree, Window
-
-_COMPLETE = {"fill": "together"}  # it judges no plan in which actions are open
-PRESETS: Presets = {
-    "paper": {"architecture": "paper", "windows": "episode", **_COMPLETE},
-    "leapjax": {"architecture": "leapjax", "windows": "step", "learning_rate": 1.5e-3, **_COMPLETE},
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,4 +83,4 @@ def _encode_and_judge(
     return module.degree(module.encode(context), actions)
 
 
-CLASSIFIER = Method(Settings, make_agent, PRESETS)
+CLASSIFIER = Method(Settings, make_agent)

@@ -12,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import LARGEST, check_within
 from leapjax.types import Agent
@@ -24,9 +24,12 @@ class Settings(q_learning.Settings):
 
     In the authors' code, and in d3rlpy, Q-values are means of 200 quantiles, whose losses are
     summed. An `alpha` of 4 weighs against those what 0.04 weighs here, against one loss.
+
+    Attributes:
+        alpha: Weight of the conservative term; 0 leaves double Q-learning.
     """
 
-    alpha: float = 0.04  # of the conservative term; 0 leaves double Q-learning
+    alpha: float = 0.04
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,4 +57,4 @@ def conservative(q: jax.Array, taken: jax.Array) -> jax.Array:
     return jax.nn.logsumexp(q, axis=1) - losses.of_action(q, taken)
 
 
-CQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+CQL = Method(Settings, make_agent, rewards=True)

@@ -10,16 +10,20 @@ from jax.sharding import Mesh
 
 from leapjax.agents import returns
 from leapjax.agents.imitation import make_imitator
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.types import Agent
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of Decision Transformer alone."""
+    """The options of Decision Transformer alone.
 
-    target_return: float = 1.0  # of an episode, asked for while acting
+    Attributes:
+        target_return: Return of an episode that is asked for while acting.
+    """
+
+    target_return: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -30,4 +34,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return make_imitator(setup, mesh, returns.wanted(setup))
 
 
-DT = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+DT = Method(Settings, make_agent, rewards=True)

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
@@ -29,13 +29,21 @@ class Settings:
 
     The IQL paper has the expectile in its mazes of ants, the temperature in its locomotion; LEAP's
     does not say what it took.
+
+    Attributes:
+        expectile: Expectile of the Q-values that the value network learns.
+        inverse_temperature: Factor of the advantages in the exponential weights of the cloned
+            actions.
+        largest_weight: Upper bound of those weights.
+        discount: Discount of rewards per step.
+        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
     """
 
     expectile: float = 0.9
-    inverse_temperature: float = 3.0  # of the advantages that weigh what is cloned
-    largest_weight: float = 100.0  # of an action that is cloned
+    inverse_temperature: float = 3.0
+    largest_weight: float = 100.0
     discount: float = 0.99
-    target_rate: float = 0.005  # how far the target network follows at each step
+    target_rate: float = 0.005
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -168,4 +176,4 @@ def _critic(params: Params) -> Params:
     return {"params": params["params"]["critic"]}
 
 
-IQL = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+IQL = Method(Settings, make_agent, rewards=True)

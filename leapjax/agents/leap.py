@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 from leapjax import schedules
 from leapjax.agents import learning, returns
 from leapjax.agents.batches import run_batches, window_batches
-from leapjax.agents.learning import Method, Presets, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
@@ -18,31 +18,26 @@ from leapjax.models import trajectory
 from leapjax.models.trajectory import Model
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
-PRESETS: Presets = {
-    # The appendix, and the authors' code where that made the numbers: every action of a window is
-    # masked in turn. The copies of a few windows at a time stay in a core's cache.
-    "paper": {
-        "architecture": "paper", "dropout": 0.1, "masking": "each", "windows": "episode",
-        "microbatch": 4,
-    },
-    # Ours, chosen on validation levels (docs/tried.md). A little noise leads out of plans
-    # that lead nowhere.
-    "leapjax": {
-        "architecture": "leapjax", "dropout": 0.0, "masking": "random", "windows": "step",
-        "learning_rate": 3e-3, "temperature": 0.5,
-    },
-}  # fmt: skip
-
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of LEAP alone."""
+    """The options of LEAP alone.
 
-    masking: str = "one"  # one of leapjax.schedules.MASKINGS
-    end: bool = True  # a plan may end early; if not, what follows the end is PAD, not predicted
-    repeat_state: bool = True  # at every position (eq. 4); if not, without a pose at later ones
-    returns: bool = False  # condition plans on the return to go, as Decision Transformer does
-    target_return: float = 1.0  # of an episode, asked for while acting
+    Attributes:
+        masking: Actions to mask in training: "one", "each", "all", "random" or "stratified". The
+            function `leapjax.schedules.sample_masks` explains them.
+        end: A plan may end early. If not, what follows the end is padding that nothing predicts.
+        repeat_state: Every position sees the whole state (eq. 4). If not, later ones see it without
+            the agent's pose.
+        returns: Condition plans on the return to go, as Decision Transformer does.
+        target_return: Return of an episode that is asked for while acting. It needs `returns`.
+    """
+
+    masking: str = "one"
+    end: bool = True
+    repeat_state: bool = True
+    returns: bool = False
+    target_return: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -170,4 +165,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return Agent(init, batch, update, energy, encode_next)
 
 
-LEAP = Method(Settings, make_agent, PRESETS)
+LEAP = Method(Settings, make_agent)

@@ -1,7 +1,7 @@
 """What agents share: the setup they are made from, optimisation, one gradient step."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -34,19 +34,6 @@ from leapjax.types import (
     Window,
 )
 
-Presets = Mapping[str, Mapping[str, Any]]  # by name: options, by the names of the command line
-SINGLE_ACTION = {"horizon": 1, "iterations": 1}  # options of methods that choose one at a time
-# Of methods that have no reason for others.
-NETWORK_PRESETS: Presets = {
-    # A few windows at a time stay in a core's cache.
-    "paper": {"architecture": "paper", "dropout": 0.1, "windows": "episode", "microbatch": 8},
-    "leapjax": {
-        "architecture": "leapjax", "dropout": 0.0, "windows": "step", "learning_rate": 3e-3,
-    },
-}  # fmt: skip
-SINGLE_ACTION_PRESETS: Presets = {
-    name: {**SINGLE_ACTION, **options} for name, options in NETWORK_PRESETS.items()
-}
 UNDECAYED = ("bias", "scale", "embedding")
 # Settings of training that change how a step is computed, and not what comes of it: no name of a
 # run or a checkpoint is made from them.
@@ -55,19 +42,37 @@ UNNAMED = ("microbatch",)
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """How a network is trained. The defaults are the paper's (appendix, table 5)."""
+    """How a network is trained. The defaults are the paper's (appendix, table 5).
 
-    steps: int = 1600  # 200 epochs of one window per demonstration, 500 demonstrations
+    1600 steps are 200 epochs of one window for each of 500 demonstrations.
+
+    Attributes:
+        steps: Training steps.
+        batch: Training windows in a step.
+        learning_rate: Learning rate of AdamW after the warm-up.
+        warmup: Steps of linear warm-up, at most a tenth of all; cosine decay follows.
+        final_fraction: Share of the learning rate that is left at the end.
+        betas: Decay rates of AdamW's two moments.
+        weight_decay: Weight decay of all parameters but embeddings, norms and biases.
+        clip: Largest global norm of the gradient; inf for no clipping.
+        windows: How training windows are drawn: by "episode", each equally often, by "step", each
+            equally often, or at the "start" of episodes.
+        microbatch: Windows whose loss a device computes at a time; 0 for all of its share.
+        run: Consecutive windows in one training example, in which each state is encoded once; 1
+            draws windows alone.
+    """
+
+    steps: int = 1600
     batch: int = 64
     learning_rate: float = 6e-4
-    warmup: int = 100  # steps of linear warm-up, at most a tenth of all; then cosine decay
-    final_fraction: float = 0.1  # of the learning rate that is left at the end
+    warmup: int = 100
+    final_fraction: float = 0.1
     betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = 0.1  # not on embeddings, norms and biases
-    clip: float = 1.0  # global norm of the gradient
-    windows: str = "episode"  # drawn by "episode", by "step", or at the "start" of episodes
-    microbatch: int = 0  # examples whose loss a device takes at a time; 0: all of its own
-    run: int = 1  # windows in a row that make an example; each state of theirs is encoded once
+    weight_decay: float = 0.1
+    clip: float = 1.0
+    windows: str = "episode"
+    microbatch: int = 0
+    run: int = 1
 
     def __post_init__(self) -> None:
         check_types(self, "clip")
@@ -88,14 +93,23 @@ class TrainingConfig:
 
 
 class Setup(NamedTuple):
-    """What every method is made from."""
+    """What every method is made from.
+
+    Attributes:
+        domain: the level to learn.
+        context: K, past steps that the network sees.
+        horizon: T, planned actions.
+        model: the size of the network.
+        training: how it is trained.
+        settings: of the method, an instance of `Method.settings`.
+    """
 
     domain: Domain
-    context: int  # K
-    horizon: int  # T
+    context: int
+    horizon: int
     model: ModelConfig
     training: TrainingConfig
-    settings: Any  # of the method: an instance of `Method.settings`
+    settings: Any
 
     @property
     def sizes(self) -> Sizes:
@@ -144,15 +158,21 @@ class Setup(NamedTuple):
 
 
 class Method(NamedTuple):
-    """A way to learn and to act, as the table of methods has it."""
+    """A way to learn and to act, as the table of methods has it.
 
-    settings: type  # a frozen dataclass: the options that only this method has
+    Attributes:
+        settings: a frozen dataclass: the options that only this method has.
+        make_agent: (setup, mesh of devices to train on) -> agent; mesh None: one device.
+        rewards: whether it learns from rewards: data without any are refused.
+        planner: a frozen dataclass: the settings of how it searches.
+        everywhere: whether every domain can have it, so that it is one of `--method all`.
+    """
+
+    settings: type
     make_agent: Callable[[Setup, Mesh | None], Agent]
-    # mesh: of devices to train on (see leapjax.sharding); None for one device
-    presets: Presets  # whatever the level; what that asks for is in its domain's presets
-    rewards: bool = False  # it learns from them: data without any are refused
-    planner: type = GibbsConfig  # the settings of how it searches
-    everywhere: bool = True  # every domain can have it, so it is one of `--method all`
+    rewards: bool = False
+    planner: type = GibbsConfig
+    everywhere: bool = True
 
 
 def untrained(energy: Energy) -> Agent:

@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import iql, learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import LARGEST, check_at_least, check_within
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -29,12 +29,19 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings(iql.Settings):
-    """The options of MOPO, and those of the IQL that it trains."""
+    """The options of MOPO, and those of the IQL that it trains.
 
-    members: int = 5  # of the ensemble
-    rollout: int = 1  # steps that are imagined from the current state of each context
-    penalty: float = 1.0  # on the disagreement of the ensemble
-    real_share: float = 0.5  # of the loss: that of the data, not of what is imagined
+    Attributes:
+        members: Dynamics models in the ensemble.
+        rollout: Steps to imagine from the current state of each context.
+        penalty: Weight of the ensemble's disagreement, which is taken off imagined rewards.
+        real_share: Share of the loss that is of the data; the rest is of imagined steps.
+    """
+
+    members: int = 5
+    rollout: int = 1
+    penalty: float = 1.0
+    real_share: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -256,4 +263,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
-MOPO = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+MOPO = Method(Settings, make_agent, rewards=True)

@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import NETWORK_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.energy import autoregressive
@@ -22,9 +22,13 @@ from leapjax.types import Agent, Context, Params, PyTree, Window
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of PlaTe alone."""
+    """The options of PlaTe alone.
 
-    state_weight: float = 1.0  # of the states' loss beside the actions'
+    Attributes:
+        state_weight: Weight of the loss of predicted states beside that of actions.
+    """
+
+    state_weight: float = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -90,4 +94,4 @@ def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.A
     return module.read(plan, jnp.concatenate([before, actions[:-1]]))
 
 
-PLATE = Method(Settings, make_agent, NETWORK_PRESETS, planner=BeamConfig)
+PLATE = Method(Settings, make_agent, planner=BeamConfig)

@@ -19,11 +19,18 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of each of them."""
+    """The options of each of them.
+
+    The originals copy the network to the target network every few thousand steps: 8,000 in Agarwal
+    et al., 2,000 in d3rlpy.
+
+    Attributes:
+        discount: Discount of rewards per step.
+        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
+    """
 
     discount: float = 0.99
-    # The originals copy it every few thousand steps: 8,000 (Agarwal et al.), 2,000 (d3rlpy).
-    target_rate: float = 0.005  # how far the target network follows at each step
+    target_rate: float = 0.005
 
     def __post_init__(self) -> None:
         check_types(self)

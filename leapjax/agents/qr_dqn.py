@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import check_at_least
 from leapjax.types import Agent
@@ -18,9 +18,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of QR-DQN. The defaults are the paper's, but for the target network."""
+    """The options of QR-DQN. The defaults are the paper's, but for the target network.
 
-    quantiles: int = 200  # of the return of each action
+    Attributes:
+        quantiles: Quantiles of the return that are learned of each action.
+    """
+
+    quantiles: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -49,4 +53,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return q_learning.make_agent(setup, mesh, choices * count, loss, values)
 
 
-QR_DQN = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+QR_DQN = Method(Settings, make_agent, rewards=True)

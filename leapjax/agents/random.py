@@ -5,13 +5,9 @@ import dataclasses
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import SINGLE_ACTION, Method, Presets, Setup, untrained
+from leapjax.agents.learning import Method, Setup, untrained
 from leapjax.energy import single_action
 from leapjax.types import Agent, Context, Params, PyTree
-
-# There is nothing to learn and nothing to learn it from; at temperature 1 all actions are alike.
-NOTHING = {**SINGLE_ACTION, "steps": 0, "demos": 0, "temperature": 1.0}
-PRESETS: Presets = {"paper": NOTHING, "leapjax": NOTHING}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,4 +29,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return untrained(energy)
 
 
-RANDOM = Method(Settings, make_agent, PRESETS)
+RANDOM = Method(Settings, make_agent)

@@ -12,7 +12,7 @@ import optax
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import SINGLE_ACTION_PRESETS, Method, Setup
+from leapjax.agents.learning import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import check_at_least
 from leapjax.types import Agent
@@ -20,9 +20,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of REM. The defaults are the original's, but for the target network."""
+    """The options of REM. The defaults are the original's, but for the target network.
 
-    q_heads: int = 200  # Q-functions that are mixed
+    Attributes:
+        q_heads: Q-functions that are mixed at random.
+    """
+
+    q_heads: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,4 +61,4 @@ def mixture(key: jax.Array, count: int) -> jax.Array:
     return drawn / drawn.sum()
 
 
-REM = Method(Settings, make_agent, SINGLE_ACTION_PRESETS, rewards=True)
+REM = Method(Settings, make_agent, rewards=True)

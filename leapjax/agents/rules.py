@@ -4,12 +4,9 @@ import dataclasses
 
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import Method, Presets, Setup, untrained
+from leapjax.agents.learning import Method, Setup, untrained
 from leapjax.errors import UserError
 from leapjax.types import Agent
-
-NOTHING = {"steps": 0, "demos": 0}
-PRESETS: Presets = {"paper": NOTHING, "leapjax": NOTHING}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,4 +28,4 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     return untrained(setup.domain.rules)
 
 
-RULES = Method(Settings, make_agent, PRESETS, everywhere=False)
+RULES = Method(Settings, make_agent, everywhere=False)

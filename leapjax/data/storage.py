@@ -87,10 +87,7 @@ def source(domain: Domain, count: int, seed: int) -> Source:
 
 def no_demonstrator(domain: Domain) -> str:
     """What to say where demonstrations would have to be made, and nobody can."""
-    return (
-        f"{domain.level} has no demonstrator: name a Minari data set of it with --dataset "
-        "(--demonstrations)"
-    )
+    return f"{domain.level} has no demonstrator: name a Minari data set of it to train on"
 
 
 def observation_space(blank: PyTree) -> gym.Space:
@@ -428,12 +425,31 @@ def _demonstration(
         )
         if again is not None:
             return again
+    found = Demonstration(episode.observations, actions, rewards, terminated, truncated, seed)
+    return check_demonstration(found, domain, where)
+
+
+def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Demonstration:
+    """Returns a demonstration in the types that a domain's network reads.
+
+    Args:
+        given: one episode.
+        domain: the level that it should be of.
+        where: what it is, for messages.
+
+    Raises:
+        UserError: actions that the domain does not have; observations or rewards of other shapes
+            or types; numbers that are out of range.
+    """
+    actions, rewards = _actions(given.actions, where), _rewards(given.rewards, where)
     last = domain.num_actions - 2
     if actions.max() > last:
         raise UserError(
             f"{where}: actions run from {actions.min()} to {actions.max()}, expected 0 to {last}"
         )
-    observations = _like(domain.blank, episode.observations, where)
+    if rewards.shape != actions.shape:
+        raise UserError(f"{where}: rewards of shape {rewards.shape}, actions of {actions.shape}")
+    observations = _like(domain.blank, given.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
     domain.check(observations, where)
 
@@ -441,13 +457,10 @@ def _demonstration(
         name = jax.tree_util.keystr(path, simple=True) or "observations"
         return check_fits(f"{where}: {name}", values, like.dtype)
 
-    return Demonstration(
-        jax.tree.map_with_path(narrowed, observations, domain.blank),
-        actions.astype(np.int32),
-        rewards,
-        terminated,
-        truncated,
-        seed,
+    return given._replace(
+        observations=jax.tree.map_with_path(narrowed, observations, domain.blank),
+        actions=actions.astype(np.int32),
+        rewards=rewards,
     )
 
 
@@ -697,6 +710,8 @@ def _check_memory(name: str, outlines: Sequence[PyTree], domain: Domain) -> None
 def _actions(values: Any, where: str) -> np.ndarray:
     """The actions of an episode `[n]`, n > 0, in the type that they are stored in."""
     actions = _numbers(np.zeros((), np.int64), values, f"{where}: actions")
+    if actions.ndim != 1 or not actions.size:
+        raise UserError(f"{where}: actions have shape {actions.shape}, expected one per step")
     if actions.min() < 0 or actions.max() > MOST:
         raise UserError(
             f"{where}: actions run from {actions.min()} to {actions.max()}, expected 0 or more"
@@ -731,6 +746,7 @@ def _like(blank: PyTree, stored: Any, where: str, name: str = "observations") ->
     """What was stored, in the structure of `blank`, in the types that it is stored in."""
     if isinstance(blank, np.ndarray):
         return _numbers(blank, stored, f"{where}: {name}")
+    stored = stored._asdict() if hasattr(stored, "_asdict") else stored
     parts = _fields(blank)
     missing = [part for part in parts if not isinstance(stored, dict) or part not in stored]
     if missing:

@@ -5,6 +5,11 @@ sums over examples and tokens at once. XLA's CPU compiler then transposes whole 
 first (it folds a transposition into a matrix product of two axes only), which takes longer than
 the product. Here a batch becomes rows before anything is differentiated, so that every product,
 gradients included, is one of two matrices.
+
+This is the only module that imports from `jax.extend` and `jax.interpreters`, which may change
+with every release of JAX. Its public functions do not suffice. A `custom_vmap` whose rule calls it
+again, which batches of batches need, has no reverse-mode gradient. `custom_vjp` computes the
+gradient of each example before it adds them up.
 """
 
 from typing import Any

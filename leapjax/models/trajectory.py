@@ -27,16 +27,29 @@ MOST_LAYERS = 200  # each is compiled by itself, which takes about a second
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The network. The defaults are the paper's transformer."""
+    """The network. The defaults are the paper's transformer.
 
-    architecture: str = "leapjax"  # "paper": the appendix's network; "leapjax": ours
-    layers: int = 3  # transformer layers
-    heads: int = 4  # attention heads
-    width: int = 128  # D, embedding dimension
-    dropout: float = 0.1  # of embeddings, attention and residuals
-    dtype: str = "float32"  # of matrix products: "float32" or "bfloat16"; parameters are float32
-    attention: str = "full"  # of a plan's actions; "causal": no action sees a later one
-    neighbours: bool = False  # LEAP's token of an action also holds the actions beside it
+    Attributes:
+        architecture: Network: "leapjax" for ours, "paper" for that of the appendix.
+        layers: Transformer layers.
+        heads: Attention heads.
+        width: D, embedding dimension; a multiple of the heads.
+        dropout: Dropout rate of embeddings, attention and residuals.
+        dtype: Type of matrix products, "float32" or "bfloat16"; parameters are always float32.
+        attention: Attention between the actions of a plan: "full", or "causal", where no action
+            sees a later one.
+        neighbours: The token of an action also holds the actions beside it. Only LEAP with
+            architecture "leapjax" has this.
+    """
+
+    architecture: str = "leapjax"
+    layers: int = 3
+    heads: int = 4
+    width: int = 128
+    dropout: float = 0.1
+    dtype: str = "float32"
+    attention: str = "full"
+    neighbours: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)

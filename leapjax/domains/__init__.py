@@ -1,0 +1,87 @@
+"""The table of domains: what `leapjax.load` and the experiments find by name."""
+
+import importlib
+import sys
+from typing import Any, NamedTuple
+
+from leapjax.checks import check_kind
+from leapjax.domain import Domain, DomainType
+from leapjax.errors import UserError
+from leapjax.extras import missing_explained
+
+
+class Place(NamedTuple):
+    """Where a domain is defined: it is imported when it is first used.
+
+    Attributes:
+        module: that defines it.
+        name: of the `DomainType` in that module.
+        extra: of the package that the domain needs; see `leapjax.extras`.
+    """
+
+    module: str
+    name: str
+    extra: str
+
+
+DOMAINS: dict[str, DomainType | Place] = {
+    "babyai": Place("leapjax.domains.babyai.domain", "BABYAI", "babyai"),
+    "stars": Place("leapjax.domains.puzzles.stars.domain", "STARS", "train"),
+    "sudoku": Place("leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train"),
+    "gymnasium": Place("leapjax.domains.gymnasium.domain", "GYMNASIUM", "train"),
+    "atari": Place("leapjax.domains.atari.domain", "ATARI", "atari"),
+}
+
+
+def find_domain(name: str) -> DomainType:
+    """The domain of that name.
+
+    Raises:
+        UserError: there is none, and names those that there are; or it needs an extra that is not
+            installed.
+    """
+    if name not in DOMAINS:
+        raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
+    found = DOMAINS[name]
+    if isinstance(found, Place):
+        with missing_explained(found.extra):
+            found = getattr(importlib.import_module(found.module), found.name)
+    return found
+
+
+def make_level(name: str, level: str, settings: Any) -> Domain:
+    """Makes one level of a domain, which remembers what it was made from.
+
+    Args:
+        name: of the domain.
+        level: by name.
+        settings: of the domain: an instance of its `DomainType.settings`.
+
+    Raises:
+        UserError: an unknown domain or level, settings of another domain, or an environment that
+            cannot be made.
+    """
+    kind = find_domain(name)
+    check_kind(settings, kind.settings)
+    return kind.make(level, settings)._replace(made_from=(name, settings))
+
+
+def check_imported(level: str, named_by: str) -> None:
+    """Refuses to import a module because a file names it.
+
+    A level `module:id` is an environment that a module registers: to make it is to run the
+    module's code. Whoever wants that imports the module, or names the level.
+
+    Args:
+        level: by name or id.
+        named_by: the file or folder that names it, for the message.
+
+    Raises:
+        UserError: the module has not been imported.
+    """
+    module, colon, _ = level.partition(":")
+    if colon and module not in sys.modules:
+        raise UserError(
+            f"{named_by} names the level {level}, which would run the module {module}: if you "
+            f"trust it, import {module} first, or name the level (level, --level, --env)"
+        )

@@ -1,0 +1,133 @@
+"""The games of Atari as a `Domain`."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from leapjax.checks import check_at_least, check_types, check_within
+from leapjax.data.seeds import MAX_TRAINING_SEED
+from leapjax.domain import Collection, Domain, DomainType, Source
+from leapjax.domains.atari import replay
+from leapjax.domains.atari.augmentation import mirrored, shifted
+from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
+from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
+from leapjax.environments import Adapter
+from leapjax.errors import UserError
+from leapjax.extras import missing_explained
+from leapjax.models.encoder import Encoder
+from leapjax.models.trajectory import ModelConfig
+
+LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
+FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
+MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
+TOKENS = 4  # of a state, of our encoder
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Atari: data, games and augmentation.
+
+    Attributes:
+        transitions: Transitions to learn from; whole games are sampled until there are so many.
+        replay_run: Number of the DQN-Replay run to learn from; the published data have five of each
+            game.
+        sticky: Probability that the game repeats the last action in place of the new one.
+        max_steps: Decisions after which a game is cut off.
+        features: Features of the first convolution; the others have twice as many.
+        mirror: Mirror every other training window, left and right exchanged.
+        shift: Pixels by which all frames of a training window may be shifted at random, at most.
+    """
+
+    transitions: int = 50_000
+    replay_run: int = 1
+    sticky: float = 0.0
+    max_steps: int = MAX_STEPS
+    features: int = 32
+    mirror: bool = False
+    shift: int = 0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_at_least(self, 1, "transitions")
+        check_at_least(self, 1, "replay_run", most=MAX_TRAINING_SEED)  # each has seeds of its own
+        check_at_least(self, 1, "features", most=10_000)
+        check_at_least(self, 1, "max_steps", most=MOST_STEPS)
+        check_at_least(self, 0, "shift", most=WIDTH - 1)
+        check_within(self, 0, 1, "sticky")
+
+
+def make(name: str, settings: Settings) -> Domain:
+    """A game by its name.
+
+    Raises:
+        UserError: there is none, or ale-py is not installed.
+    """
+    game = find_game(name)
+    with missing_explained("atari"):
+        import ale_py  # noqa: F401, PLC0415  (to say so now if it is missing)
+
+    def make_adapter() -> Adapter:
+        from leapjax.domains.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
+
+        return AtariAdapter(game, settings.sticky, settings.max_steps)
+
+    def state_tokens(model: ModelConfig, context: int) -> Encoder:
+        del context
+        return StateTokens(model.width, settings.features, model.dtype)
+
+    def current_tokens(model: ModelConfig, context: int) -> Encoder:
+        del context
+        return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
+
+    mirror = functools.partial(mirrored, mirror=game.mirror, actions=game.actions)
+    shift = functools.partial(shifted, most=settings.shift)
+    return Domain(
+        level=name,
+        make_adapter=make_adapter,
+        collect=None,  # by transitions, not by episodes: see `source`
+        actions=(*game.actions, "end"),
+        max_steps=settings.max_steps,
+        blank=np.zeros((HEIGHT, WIDTH), np.uint8),
+        encoders={"paper": state_tokens, "leapjax": current_tokens},
+        augmentations=[mirror] * settings.mirror + [shift] * (settings.shift > 0),
+        source=source(game, settings),
+        return_scale=game.return_scale,
+        signature={"actions": list(game.actions)},
+    )
+
+
+def source(game: Game, settings: Settings) -> Source:
+    """Where the trajectories of a game come from."""
+    count, run = settings.transitions, settings.replay_run
+
+    def load(where: str, seed: int) -> Collection:
+        from leapjax.domains.atari.collect import shards  # noqa: PLC0415  (ale-py is optional)
+
+        ours = shards(Path(where), game, count, run)
+        found = replay.read(Path(where), game, count, seed, run, ours)
+        held = sum(len(each.actions) for each in found.demonstrations)
+        if held < count:
+            raise UserError(
+                f"{where} holds {held} transitions of {game.name}, fewer than --transitions "
+                f"{count}: use --transitions {held}"
+            )
+        return found
+
+    def write(where: str, progress: Callable[[int], None]) -> str:
+        from leapjax.domains.atari.collect import collect  # noqa: PLC0415  (so)
+
+        collect(Path(where), game, count, run, LONGEST, progress=progress)
+        return f"{count} transitions of {game.name} in {where}"
+
+    def exists(where: str) -> bool:
+        from leapjax.domains.atari.collect import is_whole  # noqa: PLC0415  (so)
+
+        return is_whole(Path(where), game, count, run, LONGEST)
+
+    return Source(FOLDER, exists, write, load, count, "transitions")
+
+
+ATARI = DomainType(Settings, make, tuple(GAMES))

@@ -1,0 +1,99 @@
+"""BabyAI as a `Domain`: what a run needs of a level."""
+
+import contextlib
+import functools
+
+import numpy as np
+
+from leapjax.domain import Domain, DomainType
+from leapjax.domains.babyai import (
+    augmentation,
+    demonstrations,
+    encoders,
+    levels,
+    observations,
+    replay,
+    vocabulary,
+)
+from leapjax.domains.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.domains.babyai.levels import Level
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
+from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
+from leapjax.models.trajectory import ModelConfig
+
+
+def make(name: str, options: Settings) -> Domain:
+    """A level by name or id; makes its environment once, to look at it.
+
+    Raises:
+        UserError: an unknown level.
+    """
+    level = levels.find_level(name)
+    with contextlib.closing(levels.make_environment(level)) as env:
+        side = max(env.width, env.height)
+        longest, shortest = levels.longest_episode(level, env), levels.shortest_limit(env)
+
+    def state_tokens(model: ModelConfig, context: int) -> Encoder:
+        del context
+        if model.width % encoders.NORM_GROUPS:
+            raise UserError(
+                f"width {model.width} is not a multiple of {encoders.NORM_GROUPS}, the groups of "
+                "channels that the paper's encoder normalises"
+            )
+        return encoders.StateTokens(side, model.width, model.dtype)
+
+    def context_tokens(model: ModelConfig, context: int) -> Encoder:
+        del context
+        return encoders.ContextTokens(options, model.width, model.dtype)
+
+    return Domain(
+        level=level.name,
+        make_adapter=lambda: BabyAIAdapter(level),
+        collect=functools.partial(demonstrations.collect, level),
+        actions=ACTIONS,
+        max_steps=longest,
+        blank=observations.blank(side, level.words),
+        encoders={"paper": state_tokens, "leapjax": context_tokens},
+        augmentations=augmentation.chosen(options),
+        extras=augmentation.way,
+        check=functools.partial(check, level=level),
+        replay=functools.partial(replay.replay, level=level),
+        shortest_limit=shortest,
+        signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
+    )
+
+
+def check(states: Observation, where: str, level: Level) -> None:
+    """Refuses observations whose numbers mean nothing in this world.
+
+    Args:
+        states: `[n + 1, ...]` of one episode.
+        where: to find it.
+        level: that they should be of.
+
+    Raises:
+        UserError: says which numbers, and what is possible.
+    """
+    side = states.grid.shape[1]
+    ranges: dict[str, tuple[np.ndarray, int, int]] = {
+        "grid objects": (states.grid[..., 0], 0, encoders.OBJECTS - 1),
+        "grid colours": (states.grid[..., 1], 0, encoders.COLOURS - 1),
+        "grid states": (states.grid[..., 2], 0, encoders.STATES - 1),
+        "positions": (states.pose[:, :2], 0, side - 1),
+        "directions": (states.pose[:, 2], 0, encoders.DIRECTIONS - 1),
+        "goals": (states.goal, -1, side - 1),
+        "instruction": (states.instruction, 0, vocabulary.SIZE - 1),
+        "carried objects": (states.carried[:, 0], 0, encoders.OBJECTS - 1),
+        "carried colours": (states.carried[:, 1], 0, encoders.COLOURS - 1),
+    }
+    for field, (values, low, high) in ranges.items():
+        if values.min() < low or values.max() > high:
+            raise UserError(
+                f"{where}: {field} run from {values.min()} to {values.max()}, "
+                f"expected {low} to {high} ({level.name})"
+            )
+
+
+BABYAI = DomainType(Settings, make, tuple(levels.LEVELS))

@@ -1,0 +1,66 @@
+"""What becomes of an agent that turns and moves, as a pure function: for constraints on plans."""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.domains.babyai.adapter import ACTIONS, END
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.symmetries import AGENT, DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
+
+FORWARD = ACTIONS.index("forward")
+FLOOR, DOOR, GOAL, LAVA = 3, 4, 8, 9  # MiniGrid's object indices; a floor is a coloured cell
+OPEN = 0  # MiniGrid's state of an open door
+PASSABLE = (EMPTY, FLOOR, GOAL, LAVA, AGENT)  # the agent's mark hides what it stands on
+
+
+def passable(grid: jax.Array) -> jax.Array:
+    """`[S, S]` bool: which cells an agent can step into."""
+    kind, state = grid[..., 0], grid[..., 2]
+    return jnp.isin(kind, jnp.array(PASSABLE)) | ((kind == DOOR) & (state == OPEN))
+
+
+def roll(observation: Observation, actions: jax.Array) -> jax.Array:
+    """The poses that a plan leads through, in a world where nothing else changes.
+
+    Doors and objects stay as they are, whatever the plan does to them, and lava is passed.
+    From the end action on, and from the first action that is not chosen yet, nothing moves.
+
+    Args:
+        observation: the current state.
+        actions: `[T]` a plan, which may hold MASK.
+
+    Returns:
+        `[T + 1, 3]` int32: x, y and direction before the first action, and after each.
+    """
+    free = passable(jnp.asarray(observation.grid))
+    vectors = jnp.asarray(DIRECTION_VECTORS)
+
+    def move(
+        carry: tuple[jax.Array, jax.Array], action: jax.Array
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        pose, over = carry
+        over |= action >= END
+        turn = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
+        ahead = pose[:2] + vectors[pose[2]]
+        moves = (action == FORWARD) & free[ahead[0], ahead[1]]
+        moved = jnp.append(jnp.where(moves, ahead, pose[:2]), (pose[2] + turn) % 4)
+        pose = jnp.where(over, pose, moved)
+        return (pose, over), pose
+
+    start = jnp.asarray(observation.pose)
+    _, poses = jax.lax.scan(move, (start, jnp.bool_(False)), actions)
+    return jnp.concatenate([start[None], poses])
+
+
+def faced(poses: jax.Array) -> jax.Array:
+    """`[n, 2]` int32: the cells in front of an agent at poses `[n, 3]`."""
+    return poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
+
+
+def steps_to(pose: jax.Array, cell: jax.Array) -> jax.Array:
+    """`[]` int32: turns and moves from a pose `[3]` to a cell `[2]`, if nothing is in the way."""
+    offset = jnp.asarray(cell) - pose[:2]
+    ahead = offset @ jnp.asarray(DIRECTION_VECTORS)[pose[2]]
+    moves = jnp.abs(offset).sum()
+    turns = jnp.where(ahead < 0, 2, moves > jnp.abs(ahead))
+    return moves + turns

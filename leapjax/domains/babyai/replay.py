@@ -1,0 +1,80 @@
+"""Episodes that somebody recorded of MiniGrid's own observations, played again.
+
+Minari's published data sets of BabyAI hold an image, a direction and the mission, seen from the
+agent or as a whole. They hold no object carried, and no goal. Their levels follow from the seed
+of the reset, so the recorded actions lead through the same states again, whole.
+"""
+
+import numpy as np
+
+from leapjax.domain import Recording
+from leapjax.domains.babyai.adapter import END, BabyAIAdapter
+from leapjax.domains.babyai.levels import Level
+from leapjax.domains.babyai.observations import Observation
+from leapjax.environments import closing
+from leapjax.types import Demonstration
+
+NO_SEED = "without the seed of their reset"
+DONE = "with the action `done`"
+DIFFERENT = "that go otherwise when they are played again"
+FAILED = "that failed"
+INCOMPLETE = "without an observation for every step"
+OTHER_GOAL = "that ended at another match than the nearest"
+
+
+def replay(recording: Recording, level: Level) -> Demonstration | str | None:
+    """A recorded episode as a demonstration; or why it is none; None: it is not of MiniGrid."""
+    stored = recording.observations
+    if not isinstance(stored, dict) or not {"image", "mission"} <= set(stored):
+        return None
+    if recording.seed < 0:
+        return NO_SEED
+    images, missions = np.asarray(stored["image"]), np.asarray(stored["mission"])
+    if {len(images), len(missions)} != {len(recording.actions) + 1}:
+        return INCOMPLETE
+    if (recording.actions >= END).any():
+        return DONE
+    if not (recording.rewards > 0).any():
+        return FAILED
+    with closing(BabyAIAdapter(level)) as adapter:
+        return _replayed(recording, adapter, images, missions)
+
+
+def _replayed(
+    recording: Recording, adapter: BabyAIAdapter, images: np.ndarray, missions: np.ndarray
+) -> Demonstration | str:
+    """A recorded episode played again; or why it is no demonstration."""
+    states = [adapter.reset(recording.seed)]
+    same = _is(adapter, images[0], missions[0])
+    success = terminated = truncated = False
+    for step, action in enumerate(recording.actions, start=1):
+        if terminated or truncated or not same:
+            return DIFFERENT
+        state, reward, terminated, truncated, success = adapter.step(int(action))[:5]
+        states.append(state)
+        same = _is(adapter, images[step], missions[step])
+        same = same and bool(np.isclose(reward, recording.rewards[step - 1]))
+    if not same or not success:
+        return DIFFERENT
+    if adapter.misled:
+        return OTHER_GOAL
+    return Demonstration(
+        Observation(*(np.stack(parts) for parts in zip(*states, strict=True))),
+        recording.actions.astype(np.int32),
+        recording.rewards.astype(np.float32),
+        terminated,
+        truncated,
+        recording.seed,
+    )
+
+
+def _is(adapter: BabyAIAdapter, image: np.ndarray, mission: np.ndarray) -> bool:
+    """Whether a level is now as it was recorded."""
+    env = adapter.env
+    if str(mission) != env.mission:
+        return False
+    whole = adapter.observe().grid[: env.width, : env.height]
+    if np.array_equal(whole, image):
+        return True
+    # The adapter has no use for the agent's view, so it has taken it away.
+    return np.array_equal(type(env).gen_obs(env)["image"], image)

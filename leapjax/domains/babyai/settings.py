@@ -1,0 +1,51 @@
+"""The options of this domain."""
+
+import dataclasses
+
+from leapjax.checks import check_at_least, check_types, check_within
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """BabyAI: augmentation of demonstrations, and the encoders.
+
+    Attributes:
+        augment: Change training windows at random: mirror the level, recolour and rename objects,
+            and restate the instruction.
+        exchange_objects: With `augment`: also exchange keys, balls and boxes for each other.
+        clutter: Largest share of the cells not needed by the demonstration to fill with random
+            objects, in 0 .. 1.
+        lookalikes: Clutter may share the kind or the colour of the target.
+        false_starts: Share of training windows that begin with random moves, in 0 .. 1. It needs a
+            context of 0.
+        detours: Share of training windows that lead around obstacles, in 0 .. 1. It needs a context
+            of 0.
+        channels: Features of each grid cell.
+        rounds: Rounds of convolution over the grid.
+        fields: Learned distance fields; 0 leaves convolutions alone.
+        sweeps: Rounds of value iteration that compute the distance fields.
+        word_heads: Attention heads from cells to the words of the instruction; 0 for none.
+        radius: Cells around the agent, in each direction, that are read one by one.
+    """
+
+    augment: bool = False
+    exchange_objects: bool = False
+    clutter: float = 0.0
+    lookalikes: bool = False
+    false_starts: float = 0.0
+    detours: float = 0.0
+    channels: int = 32
+    rounds: int = 2
+    fields: int = 8
+    sweeps: int = 16
+    word_heads: int = 0
+    radius: int = 3
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_at_least(self, 1, "channels", most=10_000)
+        check_at_least(self, 1, "sweeps", most=10_000)  # no way in any level is longer
+        check_at_least(self, 0, "rounds", most=200)  # each is compiled by itself
+        check_at_least(self, 0, "fields", "word_heads", most=1000)
+        check_at_least(self, 0, "radius", most=100)  # no level is larger
+        check_within(self, 0, 1, "clutter", "false_starts", "detours")

@@ -1,0 +1,1 @@
+"""Puzzles whose whole solution is one plan: star graphs and Sudoku."""

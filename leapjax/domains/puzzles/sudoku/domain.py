@@ -1,0 +1,114 @@
+"""Sudoku as a `Domain`."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax.checks import check_types
+from leapjax.domain import Domain, DomainType
+from leapjax.domains.puzzles.sudoku import boards
+from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
+from leapjax.domains.puzzles.sudoku.rules import rules
+from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
+from leapjax.models.transformer import embed
+from leapjax.types import Context
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Sudoku: augmentation.
+
+    Attributes:
+        augment: Turn every training window into one of another board, by symmetries that keep the
+            rules.
+    """
+
+    augment: bool = True
+
+    def __post_init__(self) -> None:
+        check_types(self)
+
+
+class BoardTokens(Encoder):
+    """A token for each cell, and one for the cell that is written next.
+
+    It says of which cell an action of the plan is (`encode_positions`), so that which cells share
+    a row, a column or a box with it need not be learned for each of them.
+    """
+
+    side: int
+    width: int
+
+    def setup(self) -> None:  # noqa: D102
+        self.row = embed(self.side, self.width)
+        self.column = embed(self.side, self.width)
+        self.box = embed(self.side, self.width)
+        self.digit = embed(self.side + 1, self.width)
+        self.task = embed(1, self.width)
+
+    def __call__(self, context: Context) -> jax.Array:
+        """Tokens `[cells + 1, D]`."""
+        here = self._groups(context.observation.cell[None])
+        task = self.task(jnp.zeros(1, jnp.int32))
+        return jnp.concatenate([self._cells(context), task + here])
+
+    def encode_positions(self, context: Context, horizon: int) -> jax.Array:
+        """`[T, D]`: the cells that a plan fills, and what is in them."""
+        ahead = context.observation.cell + jnp.arange(horizon)
+        return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]
+
+    def _cells(self, context: Context) -> jax.Array:
+        """`[cells, D]`."""
+        return self._groups(jnp.arange(self.side**2)) + self.digit(context.observation.digits)
+
+    def _groups(self, cells: jax.Array) -> jax.Array:
+        """`[n, D]` the row, column and box of cells `[n]`; of the last, where there is none."""
+        row, column = jnp.divmod(jnp.minimum(cells, self.side**2 - 1), self.side)
+        box = boards.side_of_box(self.side)
+        return self.row(row) + self.column(column) + self.box(row // box * box + column // box)
+
+
+def make(name: str, settings: Settings) -> Domain:
+    """A level by name, such as Sudoku9x36.
+
+    Raises:
+        UserError: there is none.
+    """
+    size = boards.find_level(name)
+    turn = functools.partial(boards.transform, side=size.side)
+    return Domain(
+        level=name,
+        make_adapter=lambda: SudokuAdapter(size),
+        collect=functools.partial(boards.collect, size),
+        actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
+        max_steps=size.cells,
+        blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
+        encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
+        augmentations=[turn] if settings.augment else [],
+        extras=boards.puzzles,
+        rules=rules(size.side),
+        check=functools.partial(check, side=size.side),
+        signature={"side": size.side, "clues": size.clues},
+    )
+
+
+def check(states: Board, where: str, side: int) -> None:
+    """Refuses digits that there are not, and what does not solve a board cell by cell.
+
+    Raises:
+        UserError: says what is expected.
+    """
+    digits, cells = states.digits, side**2
+    if digits.min() < 0 or digits.max() > side:
+        raise UserError(
+            f"{where}: digits run from {digits.min()} to {digits.max()}, expected 0 to {side}"
+        )
+    if not np.array_equal(states.cell, np.arange(cells + 1)) or digits[-1].min() < 1:
+        raise UserError(f"{where} does not fill the {cells} cells of a board, one after the other")
+
+
+SUDOKU = DomainType(Settings, make, boards.LEVELS)

@@ -1,0 +1,158 @@
+"""Training in one call: from demonstrations to a ready planner."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from leapjax import compilation, pretrained, sharding
+from leapjax.agents.learning import TrainingConfig
+from leapjax.batching import compile_planner
+from leapjax.checks import check_integer, check_kind, check_seed
+from leapjax.data import storage, windows
+from leapjax.domain import Domain, apply_statistics
+from leapjax.domains import make_level
+from leapjax.errors import UserError
+from leapjax.methods import find_method
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import PlannerConfig
+from leapjax.presets import find_preset
+from leapjax.pretrained import Origin, Pretrained, Specification
+from leapjax.training import make_begin, make_train_step, train
+from leapjax.types import Demonstration, TrainState
+
+PRESET = "leapjax"
+ANY = "gymnasium"  # its presets serve a level of no registered domain
+
+
+def report_nothing(step: int, means: dict[str, float]) -> None:
+    """Reports nothing."""
+    del step, means
+
+
+def make_domain(name: str, level: str, settings: Any = None) -> Domain:
+    """Makes one level of a domain, as `leapjax.fit` and `leapjax.evaluate` need it.
+
+    Args:
+        name: of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
+        level: by name, such as "GoToLocalS7N5"; of Gymnasium, the id of an environment.
+        settings: options of encoder and augmentation, as in the module of the domain; None for
+            those that preset `leapjax` has for LEAP on this level.
+
+    Raises:
+        UserError: an unknown domain or level, settings of another domain, or an environment that
+            cannot be made.
+    """
+    if settings is None:
+        settings = find_preset(name, level, "leap", PRESET).domain_settings
+    return make_level(name, level, settings)
+
+
+def fit(
+    demonstrations: Sequence[Demonstration] | str,
+    domain: Domain,
+    method: str = "leap",
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    horizon: int | None = None,
+    context: int | None = None,
+    model: ModelConfig | None = None,
+    training: TrainingConfig | None = None,
+    planner: PlannerConfig | None = None,
+    settings: Any = None,
+    progress: Callable[[int, dict[str, float]], None] = report_nothing,
+) -> Pretrained:
+    """Trains a planner on demonstrations; nothing is kept on disk (see `Pretrained.save`).
+
+    What is None is what preset `leapjax` of the command line has for the domain and the method.
+    The same demonstrations, settings and seed give the same parameters on the same devices.
+
+    Args:
+        demonstrations: episodes, or the id of a Minari data set.
+        domain: the level that they are of, such as
+            `leapjax.make_domain("gymnasium", "CartPole-v1")`.
+        method: a name in `leapjax.methods.METHODS`.
+        steps: of training; None for those of `training`.
+        seed: of parameters, batches and noise.
+        horizon: T, planned actions; None for that of `planner`.
+        context: K, past steps that the network sees.
+        model: the size of the network.
+        training: batch, learning rate and so on.
+        planner: how to search.
+        settings: options of the method alone, an instance of its `Settings`.
+        progress: called with (step, mean metrics) every 20 steps and at the end.
+
+    Raises:
+        UserError: before any training: no demonstrations, some of another domain, none with
+            rewards where the method learns from them, an unknown method, or settings that cannot
+            be.
+        NonFiniteLoss: see `leapjax.training.train`.
+    """
+    check_kind(domain, Domain)
+    chosen, seed = find_method(method), check_seed(seed)
+    name, domain_settings = domain.made_from or (None, None)
+    kinds = (ModelConfig, TrainingConfig, chosen.planner, chosen.settings)
+    for given, kind in zip((model, training, planner, settings), kinds, strict=True):
+        if given is not None:
+            check_kind(given, kind)
+    given_numbers = {"steps": steps, "horizon": horizon, "context": context}
+    asked = {k: check_integer(k, n) for k, n in given_numbers.items() if n is not None}
+    config = find_preset(name or ANY, domain.level, method, PRESET)
+    try:
+        model = model or config.model
+        training = training or config.training
+        training = dataclasses.replace(training, steps=asked.get("steps", training.steps))
+        planner = planner or config.planner
+        planner = dataclasses.replace(planner, horizon=asked.get("horizon", planner.horizon))
+        settings = config.method_settings if settings is None else settings
+        mesh = sharding.make_mesh(training.batch // training.run, jax.local_devices())
+    except ValueError as error:  # the dataclasses refuse values that cannot be
+        raise UserError(str(error)) from None
+    data = _read(demonstrations, domain, seed)
+    if not data and training.steps:
+        raise UserError("no demonstrations: expected at least one to learn from")
+    if (chosen.rewards or getattr(settings, "returns", False)) and not any(
+        d.rewards.any() for d in data
+    ):
+        raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
+    name_of_data = demonstrations if isinstance(demonstrations, str) else None
+    statistics = domain.measure(data) if data else ()
+    domain = apply_statistics(domain, statistics)
+    context = asked.get("context", config.context)
+    specification = Specification(
+        name or "", domain.level, method, context, model, training, planner,
+        settings, domain_settings, dict(domain.signature),
+        Origin(PRESET, seed, len(data), name_of_data), statistics,
+    )  # fmt: skip
+    compilation.use_disk_cache()
+    agent = pretrained.make_agent(specification, domain, mesh)
+    begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
+    steps_of_all: Any = windows.concatenate(data, domain.extras, padded=True) if data else ()
+
+    def report(done: int, state: TrainState, means: dict[str, float]) -> None:
+        del state
+        progress(done, means)
+
+    state, key = begin(seed)
+    placed = sharding.replicate(steps_of_all, mesh)
+    state = train(step, state, placed, key, training.steps, report)
+    params = jax.tree.map(jnp.asarray, sharding.to_host(state.params))
+    plan = compile_planner(agent.energy, planner, encode_next=agent.encode_next)
+    return Pretrained(specification, agent.energy, params, plan, domain)
+
+
+def _read(
+    demonstrations: Sequence[Demonstration] | str, domain: Domain, seed: int
+) -> list[Demonstration]:
+    """The demonstrations that `fit` was given, each checked against the domain."""
+    if isinstance(demonstrations, str):
+        if domain.source is not None:
+            return domain.source.load(demonstrations, seed).demonstrations
+        return storage.load(demonstrations, domain).demonstrations
+    return [
+        storage.check_demonstration(check_kind(each, Demonstration), domain, f"demonstration {i}")
+        for i, each in enumerate(demonstrations)
+    ]

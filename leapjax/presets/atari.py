@@ -1,0 +1,112 @@
+"""Presets of Atari: the paper's (appendix, tables 6 and 8) and ours."""
+
+from typing import Any
+
+from leapjax.agents import cql, dt
+from leapjax.configuration import AnyConfig, Config
+from leapjax.domains.atari.domain import LONGEST, Settings
+from leapjax.domains.atari.encoders import STACK
+from leapjax.domains.atari.games import find_game
+from leapjax.planners import PlannerConfig
+from leapjax.presets.common import (
+    demonstrations,
+    our_model,
+    our_training,
+    paper_model,
+    paper_training,
+    search,
+    settings,
+)
+
+TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
+EPISODES = 20  # games
+ALL = 100_000  # demonstrations: more than the data of any game hold
+# By game: T, N and the batch.
+PAPER = {
+    "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
+}  # fmt: skip
+PAPER_TRANSITIONS = 500_000  # 1% of the data of DQN-Replay
+EPOCHS = 10
+PAST = 25  # states of the paper's contexts
+IMITATORS = ("leap", "bc", "dt")  # they draw actions: to ask for a ball can be improbable
+
+
+def paper(name: str, method: str) -> AnyConfig:
+    """The paper's network, data and training.
+
+    Raises:
+        UserError: an unknown game.
+    """
+    find_game(name)
+    horizon, iterations, batch = PAPER[name]
+    training = paper_training(
+        method, steps=EPOCHS * PAPER_TRANSITIONS // batch, batch=batch, windows="step",
+        **({"microbatch": 0} if method == "leap" else {}),
+    )  # fmt: skip
+    return Config(
+        domain="atari",
+        level=name,
+        method=method,
+        preset="paper",
+        demos=demonstrations(method, ALL),
+        episodes=EPISODES,
+        test_seed=TEST_SEED,
+        executed=1,
+        context=PAST,
+        model=paper_model(method, layers=6, heads=8, attention="causal"),
+        training=training,
+        planner=_search(method, horizon, iterations, 1.0),
+        method_settings=_settings(name, method, masking="one"),
+        domain_settings=Settings(transitions=PAPER_TRANSITIONS),
+    )
+
+
+def leapjax(name: str, method: str) -> AnyConfig:
+    """A small network that ten minutes on one core train, on few transitions.
+
+    Raises:
+        UserError: an unknown game.
+    """
+    find_game(name)
+    # Things in Seaquest look where they go. Imitators that see the past learn to go on as before.
+    blind = method in IMITATORS and name == "Seaquest"
+    # Reading the frames costs more than looking at a plan in T ways: so many copies share them.
+    own = _settings(name, method, masking="stratified")
+    if method == "cql":
+        own = cql.Settings(alpha=1.0)  # with less it learns nothing in so few steps
+    return Config(
+        domain="atari",
+        level=name,
+        method=method,
+        preset="leapjax",
+        demos=demonstrations(method, ALL),
+        episodes=EPISODES,
+        test_seed=TEST_SEED,
+        executed=1,
+        context=0 if blind else STACK - 1,
+        model=our_model(method, layers=2, width=64),
+        training=our_training(method, steps=10_000, windows="step", learning_rate=1e-3),
+        planner=_search(method, 5, 5, 0.1),
+        method_settings=own,
+        domain_settings=Settings(
+            transitions=transitions(name), features=16, mirror=True, max_steps=LONGEST
+        ),
+    )
+
+
+def transitions(name: str) -> int:
+    """Returns how many transitions of a game preset `leapjax` learns from."""
+    return 200_000 if name == "Seaquest" else 50_000
+
+
+def _search(method: str, horizon: int, iterations: int, temperature: float) -> PlannerConfig:
+    """Imitators draw their actions at a temperature."""
+    return search(method, horizon, iterations, temperature if method in IMITATORS else 0.0)
+
+
+def _settings(name: str, method: str, masking: str) -> Any:
+    """LEAP and Decision Transformer ask for a return; games have no end action to learn."""
+    target = find_game(name).target
+    if method == "dt":
+        return dt.Settings(target)
+    return settings(method, masking=masking, end=False, returns=True, target_return=target)

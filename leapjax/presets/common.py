@@ -1,0 +1,83 @@
+"""What the presets of all domains share: networks, training and search by method."""
+
+from typing import Any
+
+from leapjax.agents import leap
+from leapjax.agents.learning import TrainingConfig
+from leapjax.methods import find_method
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
+
+UNTRAINED = ("random", "rules")  # these methods learn nothing
+SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several actions, others choose one
+
+
+def paper_model(method: str, **changes: Any) -> ModelConfig:
+    """The network of the paper's appendix, table 5."""
+    if method in UNTRAINED:
+        return ModelConfig(**changes)
+    return ModelConfig(architecture="paper", dropout=0.1, **changes)
+
+
+def paper_training(method: str, **changes: Any) -> TrainingConfig:
+    """The training of the paper's appendix, table 5."""
+    if method in UNTRAINED:
+        return TrainingConfig(**{**changes, "steps": 0})
+    # So many examples at a time fit into a core's cache; LEAP has a copy of each for every action.
+    microbatch = {"leap": 4, "classifier": 0}.get(method, 8)
+    return TrainingConfig(**{"windows": "episode", "microbatch": microbatch, **changes})
+
+
+def our_model(method: str, **changes: Any) -> ModelConfig:
+    """The network of preset `leapjax`."""
+    if method in (*UNTRAINED, "classifier"):
+        return ModelConfig(**changes)
+    # Augmentation makes dropout useless: chosen on validation levels of BabyAI.
+    return ModelConfig(dropout=0.0, **changes)
+
+
+def our_training(method: str, **changes: Any) -> TrainingConfig:
+    """The training of preset `leapjax`: its rates were chosen on validation levels of BabyAI."""
+    if method in UNTRAINED:
+        return TrainingConfig(**{**changes, "steps": 0})
+    rate = 1.5e-3 if method == "classifier" else 3e-3
+    return TrainingConfig(**{"windows": "step", "learning_rate": rate, **changes})
+
+
+def demonstrations(method: str, count: int) -> int:
+    """Returns how many demonstrations a method takes: none where it learns nothing."""
+    return 0 if method in UNTRAINED else count
+
+
+def search(
+    method: str,
+    horizon: int,
+    iterations: int,
+    temperature: float = 0.0,
+    fill: str = "together",
+    beams: int = BeamConfig.beams,
+) -> PlannerConfig:
+    """Returns how a method finds its plans.
+
+    Args:
+        method: by name.
+        horizon: T of methods that plan several actions; the others choose one.
+        iterations: N of Gibbs sampling.
+        temperature: of Gibbs sampling or beams.
+        fill: see `GibbsConfig`; the classifier judges complete plans only.
+        beams: W of PlaTe.
+    """
+    if method == "plate":
+        return BeamConfig(horizon, beams, temperature)
+    if method == "random":
+        temperature = 1.0  # all actions have the same energy
+    if method not in SEQUENCE:
+        horizon = iterations = 1
+    if method == "classifier":
+        fill = "together"
+    return GibbsConfig(horizon, iterations, fill=fill, temperature=temperature)
+
+
+def settings(method: str, **of_leap: Any) -> Any:
+    """Returns the settings of a method: its defaults, and changes of LEAP's."""
+    return leap.Settings(**of_leap) if method == "leap" else find_method(method).settings()

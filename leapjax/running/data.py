@@ -1,0 +1,136 @@
+"""The demonstrations that a run learns from: made where they are missing, read, and noted."""
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from leapjax import files, processes
+from leapjax.data import seeds, storage
+from leapjax.data.storage import reasons
+from leapjax.domain import Domain, Source
+from leapjax.environments import judge_episode
+from leapjax.errors import UserError
+from leapjax.methods import find_method
+from leapjax.running.progress import Meter
+from leapjax.running.run import Run
+from leapjax.serialization import read_json
+from leapjax.types import Demonstration
+
+DATA = "data.json"  # in the folder of a run: the demonstrations that it learns from
+
+
+def load_demonstrations(run: Run) -> list[Demonstration]:
+    """Reads the demonstrations to train on: the user's, or those that the domain makes.
+
+    Raises:
+        UserError: they cannot be made or read, are fewer than asked for, hold no rewards where the
+            method learns from them, or are of levels that measure success.
+    """
+    config = run.config
+    if not config.demos:
+        return []
+    source = run.domain.source or storage.source(run.domain, config.demos, run.seed)
+    name = config.demonstrations or source.default
+    begun = time.perf_counter()
+    if config.demonstrations is None and processes.first_does(lambda: not source.exists(name)):
+        if run.domain.with_statistics is None:  # the network needs to know nothing of the data
+            run.programs.begin(run)
+        processes.first_does(lambda: _make(run, source, name))
+    # Each process reads for itself: the data need not be on one shared disk.
+    loaded = processes.together(lambda: source.load(name, run.seed))
+    data, dropped = loaded.demonstrations[: config.demos], reasons(loaded)
+    run.seconds["demos"] += time.perf_counter() - begun
+    if dropped:
+        run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)
+    asked = find_method(config.method).rewards or getattr(config.method_settings, "returns", False)
+    if asked and not any(d.rewards.any() for d in data):
+        raise UserError(
+            f"{name} holds no rewards, from which --method {config.method} learns: give it data "
+            "with rewards, or another method"
+        )
+    seeds.check_disjoint([d.seed for d in data], run.played)
+    return data
+
+
+def _make(run: Run, source: Source, name: str) -> None:
+    """Makes the demonstrations of a source."""
+    with Meter(run.console, source.unit, source.amount) as meter:
+        summary = source.make(name, meter.update)
+    run.console.print(summary)
+
+
+def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
+    """How well demonstrations do, by the criterion that played episodes are judged by.
+
+    None where the environment has a measure of its own, which demonstrations do not keep.
+    """
+    criterion = domain.criterion
+    if criterion is None or not data:
+        return None
+    totals = [float(np.sum(d.rewards, dtype=np.float64)) for d in data]
+    successes = [
+        judge_episode(criterion, total, float(d.rewards[-1]), d.terminated, d.truncated)
+        for total, d in zip(totals, data, strict=True)
+    ]
+    return {"success": float(np.mean(successes)), "return": float(np.mean(totals))}
+
+
+def read_outcome(folder: Path) -> tuple[float, float] | None:
+    """Success rate and mean return of the data that a run learned from, where it noted them."""
+    found = _read_note(folder).get("outcome") if (folder / DATA).exists() else None
+    values = [found.get(name) for name in ("success", "return")] if isinstance(found, dict) else []
+    numbers = [float(each) for each in values if isinstance(each, float) and math.isfinite(each)]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+
+
+def check_data(
+    folder: Path,
+    fingerprint: str,
+    level_seeds: Sequence[int],
+    outcome: Mapping[str, Any] | None = None,
+) -> None:
+    """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
+
+    Notes what they are, their level seeds for `find_demonstrated`, and their outcome for
+    `read_outcome`.
+
+    Raises:
+        UserError: the run was begun on others, or processes have read different ones.
+    """
+    if len(set(processes.gather(fingerprint))) > 1:
+        raise UserError(
+            "the processes have different demonstrations: copy one data set to all machines, or "
+            "put MINARI_DATASETS_PATH on a shared disk"
+        )
+
+    def check() -> None:
+        if not (folder / DATA).exists():
+            noted: dict[str, Any] = {"fingerprint": fingerprint, "seeds": list(level_seeds)}
+            noted |= {} if outcome is None else {"outcome": outcome}
+            return files.write_text(folder / DATA, json.dumps(noted))
+        before = _read_note(folder).get("fingerprint")
+        if before != fingerprint:
+            raise UserError(
+                f"{folder} was begun on other demonstrations ({before}, now {fingerprint}): "
+                "remove it to begin again, or give this run another --runs folder"
+            )
+        return None
+
+    processes.first_does(check)
+
+
+def find_demonstrated(folder: Path) -> list[int]:
+    """Level seeds of the demonstrations that a run learned from, where its folder says so."""
+    found = _read_note(folder).get("seeds") if (folder / DATA).exists() else None
+    return [seed for seed in found if isinstance(seed, int)] if isinstance(found, list) else []
+
+
+def _read_note(folder: Path) -> dict[str, Any]:
+    """What `check_data` has noted of a run's demonstrations; nothing, where it is no object."""
+    values = read_json(folder / DATA)
+    return values if isinstance(values, dict) else {}

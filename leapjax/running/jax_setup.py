@@ -1,0 +1,195 @@
+"""How JAX is set up for a program of ours: its devices, its compilation cache."""
+
+import contextlib
+import enum
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple, NoReturn
+
+import jax
+
+from leapjax import compilation
+from leapjax.errors import UserError, first_line
+from leapjax.processes import Cluster
+from leapjax.running import startup
+
+MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
+MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
+CONNECT_SECONDS = 120
+# How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
+# starts one process has too.)
+LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+
+
+class Promise(NamedTuple):
+    """A setting of JAX that one of our promises rests on."""
+
+    setting: str
+    allowed: Sequence[Any]
+    why: str
+
+
+_DRAWS = "what a seed draws would be something else"
+_STEPS = "leapjax traces, compiles and runs its programs itself"
+_TYPES = "leapjax mixes types and ranks as NumPy does"
+# Settings that only report, slow down or tune the compiler are not here.
+PROMISES = (
+    Promise("jax_enable_x64", (False,), "leapjax computes in 32 bits"),
+    Promise("jax_explicit_x64_dtypes", ("warn",), "leapjax computes in 32 bits"),
+    Promise("jax_default_matmul_precision", (None,), "a resumed run would end with other bits"),
+    Promise("jax_softmax_custom_jvp", (False,), "a resumed run would end with other bits"),
+    Promise("jax_default_prng_impl", ("threefry2x32",), _DRAWS),
+    Promise("jax_threefry_partitionable", (True,), _DRAWS),
+    Promise("jax_random_seed_offset", (0,), _DRAWS),
+    Promise("jax_high_dynamic_range_gumbel", (False,), _DRAWS),
+    Promise("jax_disable_jit", (False,), _STEPS),
+    Promise("jax_no_tracing", (False,), _STEPS),
+    Promise("jax_no_execution", (False,), _STEPS),
+    Promise("jax_allow_f16_reductions", (True,), "networks with --dtype bfloat16 need them"),
+    Promise("jax_numpy_dtype_promotion", ("standard",), _TYPES),
+    Promise("jax_numpy_rank_promotion", ("allow", "warn"), _TYPES),
+    Promise("jax_debug_infs", (False,), "masked logits and energies of partial plans are infinite"),
+    Promise("jax_default_device", (None,), "leapjax places batches on every device itself"),
+    *(
+        Promise(
+            f"jax_transfer_guard{direction}", (None, "allow", "log", "log_explicit"),
+            "leapjax moves data to and from the devices",
+        )
+        for direction in ("", "_host_to_device", "_device_to_device", "_device_to_host")
+    ),
+)  # fmt: skip
+
+
+ALONE = Cluster()  # one process
+
+
+def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
+    """Every program's first step, before JAX has touched a device.
+
+    Args:
+        cluster: the processes that share the run.
+        cache: keep compiled programs; without, compile times are real.
+
+    Raises:
+        UserError: a setting of JAX breaks a promise, the other processes cannot be reached, or
+            JAX can use no device.
+    """
+    check_promises()
+    use_every_core()
+    if cache:
+        compilation.use_disk_cache()
+    else:
+        jax.config.update("jax_enable_compilation_cache", False)
+    connect(cluster)
+    check_devices()
+
+
+def check_promises() -> None:
+    """Refuses settings of JAX under which something that we promise does not hold.
+
+    Raises:
+        UserError: names the setting.
+    """
+    for setting, allowed, why in PROMISES:
+        value = getattr(jax.config, setting, allowed[0])  # not every version has them all
+        value = value.name.lower() if isinstance(value, enum.Enum) else value
+        if value not in allowed:
+            raise UserError(
+                f"JAX's setting {setting} is {value!r}: {why}; unset {setting.upper()}, or use "
+                f"{' or '.join(map(repr, allowed))}"
+            )
+
+
+def check_devices() -> None:
+    """Starts JAX, if it was not.
+
+    Raises:
+        UserError: it has no device, as with JAX_PLATFORMS=cuda where there is no GPU.
+    """
+    try:
+        jax.devices()
+    except Exception as error:  # noqa: BLE001  (each platform raises its own)
+        raise UserError(
+            f"JAX can use no device{startup.settings_of_jax()} ({first_line(error)}): change "
+            "these settings, or install what they need"
+        ) from None
+
+
+def connect(cluster: Cluster) -> None:
+    """Joins the other processes of a run, if there are others.
+
+    Raises:
+        UserError: they cannot be reached.
+    """
+    launched = any(_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
+    if cluster.coordinator is None and not launched:
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        jax.distributed.initialize(
+            cluster.coordinator, cluster.num_processes, cluster.process_id,
+            initialization_timeout=CONNECT_SECONDS,
+        )  # fmt: skip
+        for number, handler in handlers.items():  # JAX takes SIGTERM for itself
+            if handler is not None:
+                signal.signal(number, handler)
+    except Exception as error:  # noqa: BLE001  (gRPC and JAX raise many kinds)
+        raise UserError(
+            f"cannot join the other processes of this run ({first_line(error)}): check that all "
+            "were started, and that process 0 can be reached at --coordinator"
+        ) from None
+
+
+def _count(text: str) -> int:
+    """A number of processes; 1 where nothing, or no number, is said."""
+    return int(text) if text.strip().isdecimal() else 1
+
+
+def leave(code: int) -> int:
+    """The exit code of a program that ends early.
+
+    With other processes it ends here: JAX would wait for them to end too, minutes long, while
+    they wait for this one. The first one gives the others time to say why they end, because
+    without it they are aborted.
+    """
+    if jax.distributed.is_initialized():
+        exit_at_once(code)
+    return code
+
+
+def exit_at_once(code: int) -> NoReturn:
+    """Ends the program without the interpreter's own end."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if jax.distributed.is_initialized():
+        time.sleep(5 if jax.process_index() == 0 else 1)
+    os._exit(code)
+
+
+def use_every_core() -> None:
+    """Makes each core a JAX device of its own, as `leapjax.sharding` wants them.
+
+    `JAX_NUM_CPU_DEVICES`, if set, has the last word.
+
+    Raises:
+        UserError: it is set to a number that JAX cannot make.
+    """
+    if "JAX_NUM_CPU_DEVICES" in os.environ:
+        asked: int = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
+        if asked != -1 and not 1 <= asked <= MOST_ASKED_FOR:  # -1: JAX's own default
+            raise UserError(
+                f"JAX_NUM_CPU_DEVICES is {asked}: expected a number in 1 .. {MOST_ASKED_FOR}"
+            )
+        return
+    with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
+        jax.config.update("jax_num_cpu_devices", min(cores(), MOST_CPU_DEVICES))
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,188 @@
+"""What a configuration may ask for: refused before any long work."""
+
+import math
+from collections.abc import Sequence
+
+import jax
+
+from leapjax import checkpoints, pretrained
+from leapjax.checks import check_integer, check_number
+from leapjax.configuration import AnyConfig, episode_seeds, make_domain, specify
+from leapjax.data import seeds, storage
+from leapjax.domain import Domain
+from leapjax.errors import UserError
+from leapjax.models.trajectory import ModelConfig
+from leapjax.planners import GibbsConfig
+from leapjax.presets import find_preset
+from leapjax.rollouts import MOST_OPEN
+from leapjax.running import loggers, memory
+from leapjax.running.programs import PLANS_TOGETHER
+
+OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
+COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
+
+
+def check(config: AnyConfig) -> None:
+    """Refuses what cannot work before any long work starts.
+
+    Raises:
+        UserError: says what.
+    """
+    check_counts(config, "episodes")
+    if config.training.steps and config.demos < 1:
+        raise UserError(
+            f"--demos must be at least 1, got {config.demos}: --steps {config.training.steps} "
+            "needs demonstrations to train on, and a method that learns nothing has none by default"
+        )
+    check_seeds(config.seeds)
+    episode_seeds(config)
+    if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
+        raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
+    loggers.check(config.loggers)
+    if config.checkpoint_seconds != math.inf:  # never before the end
+        check_number("--checkpoint-seconds", config.checkpoint_seconds, 0)
+    check_integer("--context", config.context)
+    check_number("--rules", config.rules, 0)
+    check_executed(config.executed, config.planner.horizon)
+    check_target_return(config)
+    checkpoints.check_path(config.runs)
+    if config.play is not None and config.checkpoint is None:
+        raise UserError("--play: another level is played with a --checkpoint, and there is none")
+    recorded = storage.described(config.demonstrations).level if config.demonstrations else None
+    # `module:id` is an environment that a module registers; data know it by its id.
+    if recorded is not None and recorded != config.level.rpartition(":")[2]:
+        raise UserError(
+            f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
+            f"{config.level}: use {config.flag('level')} {recorded}"
+        )
+    domain = make_domain(config)
+    made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
+    if made and domain.collect is None and domain.source is None:
+        raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
+    if config.rules and domain.rules is None:
+        raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
+    limit = domain.shortest_limit
+    if limit is not None and config.planner.horizon > limit:
+        raise UserError(
+            f"--horizon {config.planner.horizon} is longer than an episode of {config.level} "
+            f"may last: its step limit is {limit}"
+        )
+    if config.checkpoint is None and config.context > domain.max_steps:
+        raise UserError(
+            f"--context {config.context} is longer than any episode of {config.level}: at most "
+            f"{domain.max_steps} steps come before a state"
+        )
+    check_memory(config, domain)
+    # An agent costs nothing to make, and says what its method cannot do.
+    agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
+    fill = getattr(config.planner, "fill", "together")
+    if not agent.energy.accepts_mask and fill != "together":
+        raise UserError(
+            f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
+            "begin at once (--fill together)"
+        )
+
+
+def check_seeds(training: Sequence[int]) -> None:
+    """Refuses training seeds that are out of range, or one seed twice.
+
+    Raises:
+        UserError: says which.
+    """
+    if not training:
+        raise UserError("--seeds needs at least one seed")
+    for seed in training:
+        seeds.training_seeds(seed)
+        if training.count(seed) > 1:
+            raise UserError(f"--seeds names {seed} twice: both would be one run")
+
+
+def check_target_return(config: AnyConfig) -> None:
+    """Refuses to ask for a return where the model is not told of any.
+
+    Raises:
+        UserError: says which option is missing.
+    """
+    settings = config.method_settings
+    if getattr(settings, "returns", True):
+        return
+    default = find_preset(config.domain, config.level, config.method, config.preset).method_settings
+    if settings.target_return != default.target_return:
+        raise UserError(
+            f"--target-return {settings.target_return}: --method {config.method} is told of "
+            "returns with --returns only"
+        )
+
+
+def check_memory(config: AnyConfig, domain: Domain) -> None:
+    """Refuses what would need more memory than the machine has, by what it needs at least.
+
+    This is arithmetic, which a number of any size passes at once. What is exact follows when the
+    programs of a run are compiled: `memory.check_program`.
+
+    Raises:
+        UserError: says which options ask for it.
+    """
+    model, search, training = config.model, config.planner, config.training
+    horizon, paper = search.horizon, model.architecture == "paper"
+    observation = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
+    context = (observation + 8) * (config.context + 1)
+    tokens = 2 * (horizon + config.context) if paper else horizon
+    layer = layer_bytes(model, tokens)
+    times = domain.max_steps if paper else 0  # each has an embedding
+    embeddings = times + tokens + domain.num_actions
+    needs = {
+        # Parameters, their gradients and Adam's two moments.
+        "--width, --layers, --max-steps": 4 * 4 * (
+            12 * model.layers * model.width**2 + model.width * embeddings
+        ),
+        "--episodes, --context": config.episodes * OUTCOME
+        + min(config.episodes, MOST_OPEN) * context,
+    }  # fmt: skip
+    if training.steps and config.checkpoint is None:
+        masking = getattr(config.method_settings, "masking", "one")
+        copies = horizon if masking in COPYING else 1
+        together = min(training.batch, training.microbatch or training.batch)
+        activations = together * copies * model.layers * layer
+        needs["--batch, --context, --horizon"] = training.batch * context + activations
+        source = domain.source
+        # A demonstration has two states at least.
+        states = 2 * config.demos if source is None else source.amount
+        needs["--demos" if source is None else f"--{source.unit}"] = states * observation
+    # Plans are made together. Each restart is scored, as are candidates: with T passes.
+    many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
+    scored = (many > 1 and not hasattr(search, "beams")) or search.score
+    passes = many * (horizon if scored else 1)
+    plans = min(PLANS_TOGETHER, config.episodes)
+    choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
+    drawn = getattr(search, "resampled", 1) * domain.num_actions + horizon
+    needs["--iterations, --restarts, --beams, --candidates, --horizon"] = plans * (
+        passes * layer + choices * drawn
+    )
+    memory.check(needs)
+
+
+def layer_bytes(model: ModelConfig, tokens: int) -> int:
+    """Bytes that a layer makes of so many tokens, at least."""
+    # Queries, keys, values and so on; and the weights of attention.
+    return 4 * (12 * model.width * tokens + model.heads * tokens**2)
+
+
+def check_counts(options: object, *names: str) -> None:
+    """Refuses options that count something and are not positive, or more than can be counted.
+
+    Raises:
+        UserError: says which.
+    """
+    for name in names:
+        check_integer(f"--{name.replace('_', '-')}", getattr(options, name), 1)
+
+
+def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
+    """Refuses to execute more of a plan than there is.
+
+    Raises:
+        UserError: says how much there is.
+    """
+    if executed is not None and not 1 <= executed <= horizon:
+        raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")

@@ -1,0 +1,129 @@
+"""Runs every level, method and seed of a command line, each to a row beside the paper's."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import jax
+from rich.console import Console
+
+from leapjax import files, processes
+from leapjax.configuration import AnyConfig, configuration_hash
+from leapjax.errors import UserError
+from leapjax.running import jax_setup, results, shell
+from leapjax.running.command_line import parse
+from leapjax.running.data import load_demonstrations
+from leapjax.running.evaluate import evaluate
+from leapjax.running.interruption import Interruption
+from leapjax.running.record import record
+from leapjax.running.run import Experiment, Run, find_folder, open_run, rows_path
+from leapjax.running.train import train
+from leapjax.running.trained import add_rules, load_trained
+
+
+def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
+    """Runs every level and seed asked for; the exit code."""
+    given = shell.arguments_of(arguments)
+    return shell.stoppable(
+        experiment.module, given, lambda interruption: run_all(experiment, given, interruption)
+    )
+
+
+def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
+    """Every level and seed of a command line; the failure of one comes after all others."""
+    configs = parse(experiment.domain, arguments, experiment.config, experiment.module)
+    jax_setup.start(configs[0].cluster)
+    versions = results.versions()  # of the code that runs, whatever is committed meanwhile
+    console = Console(quiet=not processes.is_first(), markup=False)
+    runs = [(config, seed) for config in configs for seed in config.seeds]
+    rows, failure = [], None
+    for config, seed in runs:
+        try:
+            rows.append(finish(experiment, config, seed, versions, console, interruption))
+            for again in find_searches(experiment, config, seed):
+                rows.append(finish(experiment, again, seed, versions, console, interruption))
+        except shell.FAILURES as error:
+            if len(runs) > 1:  # the others can still be run
+                console.print(f"{config.level}, seed {seed}, failed: {error}")
+            failure = failure or error
+    if rows:
+        console.print(results.success_table(rows), results.time_table(rows))
+    if failure is not None:
+        raise failure
+
+
+def finish(
+    experiment: Experiment,
+    config: AnyConfig,
+    seed: int,
+    versions: Mapping[str, str],
+    console: Console,
+    interruption: Interruption,
+) -> results.Row:
+    """Returns the row of one level and one seed; runs it where it is not recorded yet."""
+    rows, name = rows_path(experiment, config), configuration_hash(config, seed)
+    # Read even where nothing is looked for: a damaged file is better found now than after the run.
+    known = processes.first_does(lambda: results.find(rows, name))
+    if config.record and not config.force and known is not None:
+        console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
+        return known
+    with open_run(experiment, config, seed, console, interruption) as run:
+        console.print(
+            f"{config.level}, {config.method}, preset {config.preset}, seed {seed}: "
+            f"{config.checkpoint or run.folder}"
+        )
+        check_start(run)
+        return complete(run, versions)
+
+
+def check_start(run: Run) -> None:
+    """Refuses what would fail after hours of work.
+
+    Raises:
+        UserError: fewer episodes than processes, or a folder that cannot be written to.
+    """
+    if run.config.episodes < jax.process_count():
+        raise UserError(
+            f"--episodes {run.config.episodes}: fewer than the {jax.process_count()} processes"
+        )
+    for where in (run.rows.parent, run.config.runs):
+        processes.first_does(functools.partial(files.check_writable, where))
+
+
+def complete(run: Run, versions: Mapping[str, str]) -> results.Row:
+    """Does a run, from demonstrations to its row."""
+    if run.config.checkpoint is None:
+        data = load_demonstrations(run)
+        planner = train(run, data)
+    else:
+        planner = load_trained(run)
+    planner = add_rules(run, planner)
+    episodes = evaluate(run, planner)
+    return record(run, planner, episodes, versions)
+
+
+def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:
+    """The other ways to plan with what a run has learned, if it has learned anything.
+
+    Raises:
+        UserError: the run is recorded, and one of them is not, but what was learned is not here.
+    """
+    if config.checkpoint is not None:
+        return []
+    folder = find_folder(experiment, config, seed)
+    others = experiment.searches(config)
+    found = [dataclasses.replace(o, checkpoint=folder, pictures=False) for o in others]
+
+    def out_of_reach() -> int:
+        if folder.is_dir():
+            return 0
+        known = {row["hash"] for row in results.read(rows_path(experiment, config))}
+        return sum(configuration_hash(each, seed) not in known for each in found)
+
+    count = processes.first_does(out_of_reach)
+    if count:
+        raise UserError(
+            f"{config.level}, seed {seed}, is recorded, and {count} of {len(found)} ways to search "
+            f"with it are not, but {folder} is not here: --force trains it again"
+        )
+    return found

@@ -1,0 +1,119 @@
+"""What is compiled for a run, in the background while its data are made."""
+
+import concurrent.futures
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh
+
+from leapjax import pretrained, sharding, training
+from leapjax.agents import learning
+from leapjax.batching import CompiledPlanner, compile_planner
+from leapjax.configuration import AnyConfig
+from leapjax.errors import UserError
+from leapjax.pretrained import Pretrained
+from leapjax.running import memory
+from leapjax.training import TrainStep
+from leapjax.types import Agent, TrainState
+
+if TYPE_CHECKING:
+    from leapjax.running.run import Run
+
+# Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
+# faster, and the last episodes of an evaluation would rather have smaller ones.
+PLANS_TOGETHER = 32
+
+
+class Programs(NamedTuple):
+    """What is compiled for a run.
+
+    Attributes:
+        agent: of its method.
+        begin: (seed) -> the first training state, and the key of all batches.
+        step: one step of training.
+        plan: its planner.
+    """
+
+    agent: Agent
+    begin: Callable[[int], tuple[TrainState, jax.Array]]
+    step: TrainStep
+    plan: CompiledPlanner
+
+
+class BackgroundPrograms:
+    """Compiles the programs of a run, once, in threads of its own."""
+
+    def __init__(self) -> None:
+        self._wait: Callable[[], Programs] | None = None
+
+    def begin(self, run: "Run") -> None:
+        """Begins to compile, unless that has begun."""
+        if self._wait is None:
+            self._wait = _compile(run)
+
+    def take(self, run: "Run") -> Programs:
+        """Returns the programs, once they are compiled."""
+        self.begin(run)
+        assert self._wait is not None
+        return self._wait()
+
+
+def _compile(run: "Run") -> Callable[[], Programs]:
+    """Begins to compile in the background; what it returns waits for the end of that."""
+    config, domain = run.config, run.domain
+    plays = run.plays and not config.rules  # with rules another planner plays: see `add_rules`
+    mesh = make_mesh(config)
+    agent = pretrained.make_agent(run.specification, domain, mesh)
+    plan = compile_planner(
+        agent.energy, config.planner, chunk_sizes(config), encode_next=agent.encode_next
+    )
+    like = learning.blank_steps(domain) if config.demos else ()
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    memory.check_state(state)
+
+    def compile_training() -> tuple[Any, TrainStep]:
+        if config.training.steps:
+            begin, step = training.compile_ahead(agent, mesh, like)
+            memory.check_program(step.update)
+            return begin, step
+        return training.make_begin(agent, mesh), training.make_train_step(agent, mesh)
+
+    def compile_planning() -> None:
+        params = jax.tree.map(lambda x: jax.numpy.zeros(x.shape, x.dtype), state.params)
+        blank = Pretrained(run.specification, agent.energy, params, plan, domain)
+        blank.compile(config.episodes, config.executed)
+
+    pool = concurrent.futures.ThreadPoolExecutor(2)
+    compiled = pool.submit(compile_training)
+    warm = pool.submit(compile_planning) if plays else None
+    pool.shutdown(wait=False)
+
+    def wait() -> Programs:
+        begun = time.perf_counter()
+        begin, step = compiled.result()
+        if warm is not None:
+            warm.result()
+        run.seconds["compile"] += time.perf_counter() - begun
+        return Programs(agent, begin, step, plan)
+
+    return wait
+
+
+def chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
+    """Plans that are made together: as many as there are episodes, up to the usual."""
+    return (min(PLANS_TOGETHER, 1 << (config.episodes - 1).bit_length()),)
+
+
+def make_mesh(config: AnyConfig) -> Mesh:
+    """The devices that a run trains on, those of all processes included.
+
+    Raises:
+        UserError: they cannot share the batch.
+    """
+    try:
+        examples = config.training.batch // config.training.run
+        return sharding.make_mesh(examples, jax.devices(), config.cluster.fsdp)
+    except ValueError as error:
+        raise UserError(f"--batch, --fsdp: {error}") from None

@@ -1,0 +1,406 @@
+"""Result rows: JSON lines, one file per experiment; tables are made from rows only."""
+
+import contextlib
+import datetime
+import json
+import math
+import platform
+import statistics
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from leapjax import compilation, scores
+from leapjax.checks import LARGEST_SEED
+from leapjax.errors import UserError, first_line
+from leapjax.files import only_process_in, read_text, whole, write_text
+from leapjax.rollouts import Episodes
+from leapjax.running import jax_setup
+from leapjax.running.schema import (
+    AMOUNT,
+    COUNT,
+    POSITIVE,
+    SEVERAL,
+    Absent,
+    Nullable,
+    Number,
+    Schema,
+    loads,
+    problem,
+)
+from leapjax.serialization import read_json
+from leapjax.version import find_version
+
+Row = dict[str, Any]
+EPISODE = np.dtype([("seed", "<i8"), ("success", "?"), ("return", "<f8"), ("length", "<i4")])
+# What every row has; a float may be written as an integer.
+FIELDS = {
+    "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
+    "seed": int, "episodes": int, "successes": int, "mean_length": float,
+    "compile_seconds": float, "train_seconds": float, "eval_seconds": float,
+    "plans_per_second": float,
+}  # fmt: skip
+ROW: dict[str, Schema] = {
+    **FIELDS,
+    "seed": Number(0, LARGEST_SEED, whole=True),
+    "episodes": SEVERAL,
+    "successes": COUNT,
+    "mean_length": POSITIVE,
+    "compile_seconds": AMOUNT,
+    "train_seconds": AMOUNT,
+    "eval_seconds": AMOUNT,
+    "plans_per_second": POSITIVE,
+    # What only some rows have, and a terminal shows.
+    "success": Absent(Number(0, 1)),
+    "demos_seconds": Absent(AMOUNT),
+    "mean_return": Absent(float),
+    "paper_success": Absent(Nullable(Number(0, 100))),
+    "configuration": Absent({"planner": Absent(dict)}),
+}
+# Rows of an experiment, and of an analysis, with what tables read.
+OF_EXPERIMENT: dict[str, Schema] = {
+    **ROW,
+    "train_steps": COUNT,
+    "iterations": SEVERAL,
+    "plans": SEVERAL,
+    "mean_return": float,
+    "return_error": Absent(Nullable(AMOUNT)),
+    "configuration": {"planner": {"temperature": Absent(AMOUNT)}},
+}
+OF_ANALYSIS: dict[str, Schema] = {
+    **ROW,
+    "case": str,
+    "way": str,
+    "plans": SEVERAL,
+    "first_pass_successes": Nullable(COUNT),
+    "violations": Nullable(COUNT),
+    "paper_success": Nullable(Number(0, 100)),
+    "versions": {"machine": str},
+}
+
+
+def read(path: Path, schema: Schema = ROW) -> list[Row]:
+    """The rows of a file; none if there is no file.
+
+    Args:
+        path: of the file.
+        schema: what each row must be.
+
+    Raises:
+        UserError: a line is not a row, by its number; or two rows have one hash: a table would
+            count one seed twice.
+    """
+    if not path.exists():
+        return []
+    rows = []
+    line_of: dict[str, int] = {}  # by hash
+    # Split where JSON lines are: other kinds of line end may be inside of a text.
+    for number, line in enumerate(read_text(path).split("\n"), start=1):
+        if not line.strip():
+            continue
+        try:
+            row = loads(line)
+        except (ValueError, RecursionError) as error:
+            reason = "" if isinstance(error, json.JSONDecodeError) else f" ({first_line(error)})"
+            raise UserError(f"{path}, line {number}: not JSON{reason}") from None
+        wrong = problem(row, schema) or _contradiction(row)
+        if wrong:
+            raise UserError(f"{path}, line {number}: {wrong}")
+        row["success"] = success(row)  # rows of an earlier version have counts alone
+        first = line_of.setdefault(row["hash"], number)
+        if first != number:
+            raise UserError(
+                f"{path}, line {number}: the same hash, {row['hash'][:20]}, as line {first}, so "
+                "both are of one run: delete one of them"
+            )
+        rows.append(row)
+    return rows
+
+
+def _contradiction(row: Row) -> str | None:
+    """What fields say against each other."""
+    for name in ("successes", "first_pass_successes"):
+        if (row.get(name) or 0) > row["episodes"]:
+            return f"{row[name]} {name} of {row['episodes']} episodes"
+    if not math.isclose(row.get("success", success(row)), success(row), abs_tol=1e-9):
+        return f"success is {row['success']}, of {row['successes']} of {row['episodes']} episodes"
+    return None
+
+
+def success(row: Row) -> float:
+    """The success rate of a row, as a fraction."""
+    return row["successes"] / row["episodes"]
+
+
+def folder(recorded: bool, runs: Path) -> Path:
+    """Where rows go: to those that are committed, or beside the runs that they are of."""
+    return Path("results") if recorded else runs
+
+
+def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
+    """Adds a row, in the place of one of the same configuration, and its episodes, atomically.
+
+    Args:
+        path: file of rows.
+        row: to be added.
+        episodes: of the row; `read_episodes` returns them.
+
+    Raises:
+        UserError: the row holds a number that is not finite, which JSON has no word for.
+    """
+    for name, value in row.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError:
+            raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
+    with only_process_in(path.parent, wait=True):
+        rows = [other for other in read(path) if other["hash"] != row["hash"]]
+        # First, so that a process killed in between leaves episodes without a row, which the next
+        # one drops, and no row without its episodes.
+        known, hashes = read_episodes(path), {other["hash"] for other in rows}
+        tables = {name: each for name, each in known.items() if name in hashes}
+        if episodes is not None:
+            tables[row["hash"]] = as_table(episodes)
+        if tables or known:
+            _write_episodes(_episodes_path(path), tables)
+        lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
+        write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+def change(path: Path, changed: Callable[[Any], Any]) -> Any:
+    """Rewrites a JSON file as what becomes of it, None where there is none, atomically."""
+    with only_process_in(path.parent, wait=True):
+        found = changed(read_json(path) if path.exists() else None)
+        write_text(path, json.dumps(found, indent=1) + "\n")
+    return found
+
+
+def add(path: Path, name: str, value: Any) -> dict[str, Any]:
+    """Adds a value by its name to a JSON file, in the place of one of that name; all of them."""
+    return change(path, lambda known: {**(known or {}), name: value})
+
+
+def as_table(episodes: Episodes) -> np.ndarray:
+    """Returns what became of each episode: an array `[E]` with the fields of `EPISODE`."""
+    columns = episodes.seeds, episodes.successes, episodes.returns, episodes.lengths
+    return np.array(list(zip(*columns, strict=True)), EPISODE)
+
+
+def write_csv(path: Path, episodes: Episodes) -> None:
+    """Writes what became of each episode as text."""
+    lines = (f"{seed},{good:d},{total:.6g},{n}" for seed, good, total, n in as_table(episodes))
+    write_text(path, "\n".join([",".join(EPISODE.names or ()), *lines]) + "\n")
+
+
+def _episodes_path(path: Path) -> Path:
+    """Returns the file of the episodes of a file of rows."""
+    return path.parent / "episodes" / f"{path.stem}.npz"
+
+
+def read_episodes(path: Path) -> dict[str, np.ndarray]:
+    """Reads the episodes of rows, which not every row has.
+
+    Args:
+        path: file of the rows.
+
+    Returns:
+        By the hash of the row: `[E]` with the fields of `EPISODE`.
+
+    Raises:
+        UserError: the file of episodes is damaged.
+    """
+    path = _episodes_path(path)
+    if not path.exists():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in archive.files}
+    except Exception as error:  # noqa: BLE001  # zipfile raises many kinds
+        raise UserError(f"cannot read {path}: {first_line(error)}") from None
+    for name, table in found.items():
+        if table.dtype != EPISODE or table.ndim != 1:
+            raise UserError(f"{path}: {name} is an array of {table.dtype}, not of episodes")
+    return found
+
+
+def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
+    # An array a row: where a row is added, git stores the new one and shares the others.
+    with whole(path) as scratch:
+        np.savez_compressed(scratch, **tables)  # type: ignore[arg-type]
+
+
+def find(path: Path, configuration: str) -> Row | None:
+    """The recorded row of a configuration."""
+    return next((row for row in read(path) if row["hash"] == configuration), None)
+
+
+def versions() -> dict[str, str]:
+    """What a result was made with; starts JAX, if it was not."""
+    names = ("jax", "flax", "optax", "minigrid", "numpy")
+    found = {name: metadata.version(name) for name in names}
+    with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
+        found["ale-py"] = metadata.version("ale-py")
+    found["leapjax"] = find_version() + code_version(Path(__file__).parent.parent.parent)
+    machine = f"{compilation.name_processor()}, cores: {jax_setup.cores()}"
+    devices = jax.local_devices()
+    if devices[0].platform != "cpu":
+        machine += f", {len(devices)} {devices[0].device_kind}"
+    return {**found, "python": platform.python_version(), "machine": machine}
+
+
+def code_version(root: Path) -> str:
+    """Which commit last changed the code of a checkout, as a local version: "+g1a2b3c4".
+
+    With ".dirty" where the code differs from it; empty where there is no repository. Rows are
+    committed too, so it is not simply the last commit.
+    """
+    code = ("--", "leapjax", "experiments", "benchmarks")
+
+    def git(*arguments: str) -> str:
+        command = ("git", "-C", str(root), *arguments, *code)
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    if not (root / ".git").exists():
+        return ""
+    try:
+        changed = git("status", "--porcelain")
+        return f"+g{git('log', '-1', '--format=%h')}{'.dirty' if changed else ''}"
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def today() -> str:
+    """The date of a row."""
+    return datetime.datetime.now(datetime.UTC).date().isoformat()
+
+
+def percent(row: Row) -> str:
+    """A success rate with its 95% interval."""
+    return _rate(success(row), scores.wilson_interval(row["successes"], row["episodes"]))
+
+
+def percent_over_seeds(rows: Sequence[Row]) -> str:
+    """The mean success rate of rows of several training seeds with its 95% interval."""
+    counts = [row["successes"] for row in rows], [row["episodes"] for row in rows]
+    mean = statistics.fmean(map(success, rows))
+    return _rate(mean, scores.interval_over_seeds(*counts))
+
+
+def _rate(rate: float, interval: tuple[float, float]) -> str:
+    return f"{rate:.1%} [{interval[0]:.1%}, {interval[1]:.1%}]"
+
+
+def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    """The rows that differ in their training seed alone, where there are several.
+
+    Args:
+        rows: of any seeds.
+        key: all that tells rows apart but the seed.
+    """
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def summarize(row: Row) -> str:
+    """What a run has come to, in one line."""
+    paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
+    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
+    if "criterion" not in row:
+        return ", ".join(parts)
+    total = f"mean return {format_return(row)}"
+    parts.insert(1 if row.get("criterion_given") else 0, total)
+    return f"{', '.join(parts)}; success: {row['criterion']}"
+
+
+def format_success(row: Row) -> str:
+    """A success rate, and that of the data where it is known."""
+    data = _find_number(row, "data_success")
+    return percent(row) + ("" if data is None else f" (data: {data:.1%})")
+
+
+def format_return(row: Row) -> str:
+    """A mean return, and that of the data where it is known."""
+    mean, data = _find_number(row, "mean_return"), _find_number(row, "data_return")
+    return ("-" if mean is None else f"{mean:.2f}") + (
+        "" if data is None else f" (data: {data:.2f})"
+    )
+
+
+def _find_number(row: Row, name: str) -> float | None:
+    """A number that a row need not have."""
+    value = row.get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def planner_name(row: Row) -> str:
+    """How a row's plans were found, as far as it says."""
+    configuration = row.get("configuration", {})
+    planner, rules = configuration.get("planner", {}), configuration.get("rules", 0)
+    parts = {
+        f"N = {planner.get('iterations')}": "iterations" in planner,
+        str(planner.get("fill")): planner.get("fill", "together") != "together",
+        f"rules {rules}": bool(rules),
+        f"on {row.get('played')}": row.get("played", row["level"]) != row["level"],
+    }
+    return ", ".join(part for part, said in parts.items() if said)
+
+
+def success_table(rows: Sequence[Row]) -> Table:
+    """Success rates beside the paper's; below, the mean over training seeds if there are several.
+
+    The mean return comes first where a row's criterion of success was not given by the user.
+    """
+    measures = {
+        "success [95%]": (format_success, percent_over_seeds),
+        "return": (format_return, _mean_return),
+    }
+    if any("criterion" in row and not row.get("criterion_given") for row in rows):
+        measures = dict(reversed(measures.items()))
+    criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})
+    result = Table(
+        *("level", "method", "planner", "seed", *measures, "length", "paper"),
+        caption="\n".join(criteria) or None,
+    )
+
+    def named(row: Row) -> tuple[str, ...]:
+        return row["level"], f"{row['method']} ({row['preset']})", planner_name(row)
+
+    def paper(row: Row) -> str:
+        found = row.get("paper_success")
+        return "-" if found is None else f"{found:.1f}%"
+
+    for row in rows:
+        said = (measure(row) for measure, _ in measures.values())
+        length = f"{row['mean_length']:.1f}"
+        result.add_row(*named(row), str(row["seed"]), *said, length, paper(row))
+    result.add_section()
+    for group in group_seeds(rows, named):
+        said = (measure(group) for _, measure in measures.values())
+        length = f"{statistics.fmean(row['mean_length'] for row in group):.1f}"
+        seeds = f"mean of {len(group)}"
+        result.add_row(*named(group[0]), seeds, *said, length, paper(group[0]))
+    return result
+
+
+def _mean_return(rows: Sequence[Row]) -> str:
+    returns = [_find_number(row, "mean_return") for row in rows]
+    known = [each for each in returns if each is not None]
+    return f"{statistics.fmean(known):.2f}" if len(known) == len(rows) else "-"
+
+
+def time_table(rows: Sequence[Row]) -> Table:
+    """Where the time of each run went."""
+    parts = ("demos", "compile", "train", "eval")
+    result = Table("level", "seed", *(f"{part} (s)" for part in parts), "plans/s")
+    for row in rows:
+        seconds = (f"{row.get(f'{part}_seconds', 0):.1f}" for part in parts)
+        result.add_row(row["level"], str(row["seed"]), *seconds, f"{row['plans_per_second']:.0f}")
+    return result

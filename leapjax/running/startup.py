@@ -1,0 +1,182 @@
+"""What a program does before it imports JAX: signals, output, --version, JAX's own settings.
+
+Imports only the standard library: importing JAX takes seconds.
+"""
+
+import contextlib
+import io
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import NoReturn, TextIO
+
+from leapjax.running.interruption import SIGNALS, Interrupted
+from leapjax.version import find_version
+
+COMMAND = "leapjax"  # the installed script
+UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
+# The extra of the package that a program needs, where it is not `babyai`.
+EXTRAS = {
+    "atari": "atari",
+    "atari_energy": "atari",
+    "gymnasium": "train",
+    "stars": "train",
+    "sudoku": "train",
+}
+
+
+def is_program() -> bool:
+    """Whether the interpreter is about to run a module of this package as a program.
+
+    While `python -m` looks for a module, and imports the packages that hold it, its name for the
+    program is "-m".
+    """
+    return str(started()) == "-m" or started().stem == COMMAND
+
+
+def started() -> Path:
+    """What the interpreter runs, as `sys.argv` says it."""
+    return Path(next(iter(getattr(sys, "argv", ())), ""))
+
+
+def prepare() -> None:
+    """Lets signals end the program at once, makes every text printable, and imports JAX.
+
+    Exits with 0 after --version, which needs no JAX. Exits with 2, and one line, if JAX cannot be
+    imported: it reads its settings then.
+    """
+    for number in SIGNALS:
+        signal.signal(number, end)
+    sys.stdout, sys.stderr = make_output(sys.stdout), make_output(sys.stderr)
+    if "--version" in sys.argv[1:]:
+        print(COMMAND, find_version())
+        sys.exit(0)
+    sys.unraisablehook = print_unraisable
+    sys.excepthook = print_uncaught
+    # Figures go to files. Matplotlib refuses an unknown backend with a traceback.
+    os.environ["MPLBACKEND"] = "agg"
+    try:
+        import jax  # noqa: F401, PLC0415
+    except Exception as error:  # noqa: BLE001  (each setting raises its own)
+        message = f"error: cannot import JAX{settings_of_jax()}: {error or type(error).__name__}"
+        print(" ".join(message.split()), file=sys.stderr)
+        sys.exit(2)
+
+
+class Output(io.TextIOWrapper):
+    """A stream that ends the program once nobody reads it any more, as in `--help | head`.
+
+    Other programs are ended by SIGPIPE. That signal would also end this one where a worker process
+    or a logger has gone, which are failures that can be reported.
+    """
+
+    def write(self, text: str) -> int:
+        """Writes a text."""
+        try:
+            return super().write(text)
+        except BrokenPipeError:
+            end_unread()
+
+    def flush(self) -> None:
+        """Passes on what is buffered; the interpreter does so at its end."""
+        try:
+            super().flush()
+        except BrokenPipeError:
+            end_unread()
+
+
+def make_output(stream: TextIO) -> TextIO:
+    """A standard stream as an `Output` that replaces what its encoding does not have."""
+    if not isinstance(stream, io.TextIOWrapper):  # there is none, or another program's
+        return stream
+    return Output(
+        stream.buffer, stream.encoding, "replace",
+        line_buffering=stream.line_buffering, write_through=stream.write_through,
+    )  # fmt: skip
+
+
+def end_unread() -> NoReturn:
+    """Ends the program without a word: what is left to print has nowhere to go."""
+    os._exit(UNREAD)
+
+
+def command(module: str) -> str:
+    """How a program was started: `leapjax babyai`, or `python -m experiments.babyai`.
+
+    Args:
+        module: of the program, such as "experiments.babyai".
+    """
+    package, _, name = module.partition(".")
+    if started().stem == COMMAND:
+        return f"{COMMAND} {name}"
+    if started().parts[-2:] == (package, "__main__.py"):
+        return f"python -m {package} {name}"
+    return f"python -m {module}"
+
+
+def find_modules_here() -> None:
+    """Lets the installed command import from the working folder, as `python -m` does.
+
+    Called once `leapjax` is imported: it is the installed one, whatever is in that folder.
+    """
+    if started().stem == COMMAND and not sys.flags.safe_path:
+        with contextlib.suppress(OSError):  # the working folder was removed
+            sys.path.insert(0, str(Path.cwd()))
+
+
+def end(number: int, _: FrameType | None = None) -> None:
+    """The signal handler until `interruptible` has its own.
+
+    It raises nothing: an import, or a callback of the interpreter, may drop what is raised.
+    """
+    stopped = Interrupted(number)
+    with contextlib.suppress(Exception):  # what is being printed cannot be flushed
+        sys.stdout.flush()
+    with contextlib.suppress(OSError):  # nobody reads it any more
+        os.write(2, f"stopped by {stopped}\n".encode())
+    os._exit(stopped.exit_code)
+
+
+def print_unraisable(failure: "sys.UnraisableHookArgs") -> None:
+    """The hook for exceptions that nothing can catch: prints all but those of closed event loops.
+
+    If the disk is full, TensorStore reports to event loops that Orbax has closed already.
+    """
+    if failure.object is not None or str(failure.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(failure)
+
+
+def print_uncaught(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    """The hook for exceptions that end the program.
+
+    A missing extra is one line and exit code 2: a program imports optional modules before its
+    `main` can handle errors. All other errors are printed as Python does.
+    """
+    from leapjax.extras import explain_missing  # noqa: PLC0415  (imports JAX)
+
+    spec = sys.modules["__main__"].__spec__  # None for the installed script
+    explanation = explain_missing(error, extra_of(spec.name if spec else ""))
+    if explanation is None:
+        sys.__excepthook__(kind, error, trace)
+        return
+    print(f"error: {explanation}", file=sys.stderr)
+    sys.exit(2)
+
+
+def extra_of(module: str) -> str:
+    """The extra of the package that a program needs, by its module, such as `experiments.atari`."""
+    return EXTRAS.get(module.rpartition(".")[2], "babyai")
+
+
+def settings_of_jax() -> str:
+    """The settings of JAX and XLA in the environment, for a message; empty if there are none."""
+    given = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if _is_setting(name)]
+    return f" with {', '.join(given)}" if given else ""
+
+
+def _is_setting(name: str) -> bool:
+    return name.startswith("JAX_") or name == "XLA_FLAGS"

@@ -1,0 +1,110 @@
+"""Trains the network of a run, or goes on where it stopped."""
+
+import contextlib
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+
+from leapjax import files, pretrained, processes, sharding, training
+from leapjax.checkpoints import Checkpoints
+from leapjax.data import windows
+from leapjax.domain import apply_statistics
+from leapjax.pretrained import Pretrained
+from leapjax.running.data import check_data, judge_data
+from leapjax.running.metrics import Metrics, read_metrics, write_metrics
+from leapjax.running.programs import make_mesh
+from leapjax.running.progress import Meter
+from leapjax.running.run import Run
+from leapjax.types import Demonstration, Energy, Params, TrainState
+
+Watch = Callable[[Energy, Params], dict[str, float]]
+REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
+
+
+def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -> Pretrained:
+    """Trains, or goes on where the run stopped; the training curve is in its folder.
+
+    Args:
+        run: to do. Other processes are kept out of its folder until it is closed.
+        data: to train on.
+        watch: measures more of what is being learned, whenever progress is reported.
+
+    Raises:
+        UserError: the folder is of another run or of other data, or another process works in it.
+        Interrupted: the run was asked to stop; its newest state is saved.
+    """
+    run = learn_statistics(run, data)
+    processes.first_does(lambda: run.opened.enter_context(files.only_process_in(run.folder)))
+    config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
+    # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
+    steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
+    named = windows.fingerprint(windows.unpadded(steps) if data else ())
+    check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
+    agent, begin, step, plan = run.programs.take(run)
+    state, key = begin(run.seed)
+    steps = sharding.replicate(steps, make_mesh(config))
+    compiling = time.perf_counter()
+    if total:  # the one program that depends on how many demonstrations there are
+        jax.block_until_ready(step.draw(key, state.step, steps))
+    run.seconds["compile"] += time.perf_counter() - compiling
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
+    processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
+    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
+    restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
+    # Not before: what does not fit the run that is there leaves it as it is.
+    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
+    metrics: Metrics = []
+    if restored is not None:
+        state = restored
+        metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
+        console.print(f"continuing at step {int(state.step)} of {total}")
+    if not total and restored is None:
+        saved.save(state)  # there is nothing to learn: what a method begins with is all of it
+
+    before = metrics[-1]["seconds"] if metrics else 0.0
+    begun = last_saved = time.perf_counter()
+    with (
+        run.interruption.deferred(),
+        contextlib.closing(saved),
+        Meter(console, "training", total, int(state.step)) as meter,
+    ):
+
+        def report(done: int, now: TrainState, means: dict[str, float]) -> bool:
+            nonlocal last_saved
+            elapsed = time.perf_counter() - begun
+            seen = watch(agent.energy, now.params) if watch else {}
+            metrics.append({"step": done, "seconds": before + elapsed, **means, **seen})
+            run.log(done, {f"training/{name}": value for name, value in (means | seen).items()})
+            meter.update(done, " ".join(f"{name} {mean:.3g}" for name, mean in means.items()))
+            due = time.perf_counter() - last_saved > config.checkpoint_seconds
+            # Processes have their own clocks and signals, and must agree on what to do.
+            signals, dues = zip(*processes.gather([run.interruption.requested, due]), strict=True)
+            for number in filter(None, signals):
+                run.interruption.adopt(number)
+            if done == total or any(signals) or any(dues):
+                processes.first_does(lambda: write_metrics(folder, metrics))
+                saved.save(now)
+                last_saved = time.perf_counter()
+            return any(signals)
+
+        often = REPORT_SECONDS if jax.process_count() == 1 else math.inf
+        state = training.train(step, state, steps, key, total, report, report_seconds=often)
+    run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
+    # Planning is each process's own business, on its own devices.
+    params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
+    return Pretrained(run.specification, agent.energy, params, plan, run.domain)
+
+
+def learn_statistics(run: Run, data: Sequence[Demonstration]) -> Run:
+    """Returns a run whose network knows the statistics of what it learns from, if it needs any."""
+    statistics = run.domain.measure(data)
+    return dataclasses.replace(
+        run,
+        domain=apply_statistics(run.domain, statistics),
+        specification=dataclasses.replace(run.specification, statistics=statistics),
+    )

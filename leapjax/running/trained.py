@@ -1,0 +1,74 @@
+"""The planner of an earlier run, and rules beside what it learned."""
+
+import dataclasses
+from typing import Any
+
+from leapjax import pretrained
+from leapjax.batching import compile_planner
+from leapjax.data import seeds
+from leapjax.energy import compose
+from leapjax.errors import UserError
+from leapjax.pretrained import Pretrained, Specification
+from leapjax.running.data import find_demonstrated
+from leapjax.running.programs import chunk_sizes
+from leapjax.running.run import Run
+
+
+def load_trained(run: Run) -> Pretrained:
+    """Loads the planner of the checkpoint that a configuration names.
+
+    Raises:
+        UserError: says what the run has, and what it was asked for; or a row is to be recorded of a
+            run that has not come to its end.
+    """
+    checkpoint = run.config.checkpoint
+    assert checkpoint is not None
+    if run.config.play in (None, run.config.level):  # the seeds of another level are others
+        seeds.check_disjoint(find_demonstrated(checkpoint), run.played)
+    trained = pretrained.read_specification(checkpoint)
+    wanted, found = (_training_settings(s) for s in (run.specification, trained))
+    for name in wanted:
+        if wanted[name] != found.get(name):
+            label = name.rsplit(".", 1)[-1]
+            raise UserError(
+                f"the checkpoint {checkpoint} does not fit: {label} is {found.get(name)}, "
+                f"not {wanted[name]}"
+            )
+    target, known = (
+        getattr(s.method_settings, "target_return", None) for s in (run.specification, trained)
+    )
+    return pretrained.load(
+        checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play,
+        None if target == known else target, finished=run.config.record,
+    )  # fmt: skip
+
+
+def _training_settings(specification: Specification) -> dict[str, Any]:
+    """What a trained planner cannot be asked to change: all but how it searches, and for what."""
+
+    def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, value in values.items():
+            nested = isinstance(value, dict)
+            found |= flat(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+        return found
+
+    settings = flat(dataclasses.asdict(specification), "")
+    asked = {"method_settings.target_return", "statistics"} | {
+        name for name in settings if name.startswith(("planner.", "signature."))
+    }
+    return {
+        name: value
+        for name, value in settings.items()
+        if name not in asked or name == "planner.horizon"
+    }
+
+
+def add_rules(run: Run, planner: Pretrained) -> Pretrained:
+    """Returns a planner that minimises the domain's rules too, where that is asked for."""
+    weight, rules = run.config.rules, run.domain.rules
+    if not weight or rules is None:
+        return planner
+    energy = compose([planner.energy, rules], [1.0, weight])
+    plan = compile_planner(energy, run.config.planner, chunk_sizes(run.config))
+    return dataclasses.replace(planner, energy=energy, params=(planner.params, ()), plan=plan)

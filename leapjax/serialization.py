@@ -1,0 +1,107 @@
+"""Configurations as JSON, and the digest that parameters are sealed with."""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from leapjax import files
+from leapjax.errors import UserError, first_line
+
+IDENTITY = "identity"  # the array that says whose parameters are beside it
+T = TypeVar("T")
+
+
+def identity_digest(identity: str) -> np.ndarray:
+    """The SHA-256 of an identity: `[32]` uint8."""
+    return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
+
+
+def from_json(kind: type[T], values: Any, **types_of: type) -> T:
+    """A frozen configuration dataclass from what `dataclasses.asdict` and JSON made of it.
+
+    A field that is missing has its default: a setting that was added later changes nothing
+    that was written before it.
+
+    Args:
+        kind: of dataclass.
+        values: a JSON object.
+        types_of: the type of a field, where the dataclass leaves it open.
+
+    Raises:
+        UserError: a field that is unknown, of another type, or missing without a default.
+    """
+    if not isinstance(values, dict):
+        raise UserError(f"a {kind.__name__} must be a JSON object, got {type(values).__name__}")
+    hints = typing.get_type_hints(kind) | types_of
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    nothing = dataclasses.MISSING
+    needed = {n for n, f in fields.items() if f.default is f.default_factory is nothing}
+    odd = sorted((values.keys() - fields.keys()) | (needed - values.keys()))
+    if odd:
+        raise UserError(f"{kind.__name__}: missing or unknown {', '.join(odd)}")
+    converted = {name: _convert(hints[name], value, name) for name, value in values.items()}
+    try:
+        return kind(**converted)
+    except ValueError as error:
+        raise UserError(f"{kind.__name__}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    if hint is Any:
+        return value
+    if dataclasses.is_dataclass(hint):
+        return from_json(hint, value)  # type: ignore[arg-type]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        options = typing.get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        return _convert(next(o for o in options if o is not type(None)), value, name)
+    if typing.get_origin(hint) is tuple:
+        element = typing.get_args(hint)[0]
+        if isinstance(value, list):
+            return tuple(_convert(element, item, name) for item in value)
+    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
+        return value
+    raise UserError(f"{name} must be of type {getattr(hint, '__name__', hint)}, got {value!r}")
+
+
+def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
+    """The contents of a JSON file.
+
+    Args:
+        path: of the file.
+        most: the largest size allowed, in bytes.
+
+    Raises:
+        UserError: it is missing, is too large, or is not JSON.
+    """
+    text = files.read_text(path, most)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
+
+
+def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """What is not the default, part by part.
+
+    Names made from it do not change when a setting is added later, with what was done before
+    as its default.
+    """
+    found = {}
+    for name, value in values.items():
+        default = defaults.get(name)
+        if isinstance(value, dict) and isinstance(default, dict):
+            value, default = differences(value, default), {}
+        if value != default:
+            found[name] = value
+    return found

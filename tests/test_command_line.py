@@ -1,0 +1,215 @@
+"""The command line as someone meets it who has just installed the package."""
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import experiments.__main__ as programs
+import leapjax
+import leapjax.__main__
+from experiments import atari, babyai, gymnasium
+from leapjax import scores, version
+from leapjax.errors import UserError
+from leapjax.methods import METHODS
+from leapjax.running import command_line, results, startup
+from leapjax.running import main as running
+from leapjax.running.spelling import GymnasiumConfig
+from tests.programs import RANDOM, ROOT, only_long
+
+LEVEL = "GoToLocalS7N5"
+
+
+def python(*arguments, **options):
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False,
+                          env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["leapjax", "experiments babyai", "experiments.babyai"])
+def test_the_version_needs_no_jax(command):
+    """-S hides all that is installed, and with it the version."""
+    done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
+
+
+def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
+    assert version.find_version() == leapjax.__version__
+    monkeypatch.setattr(metadata, "distribution", lambda name: metadata.Distribution.from_name("-"))
+    assert version.find_version() == "0+unknown"
+
+
+@pytest.mark.parametrize(
+    ("main", "started", "command"),
+    [
+        (leapjax.__main__.main, "/env/bin/leapjax", "leapjax babyai"),
+        (leapjax.__main__.main, "/site/leapjax/__main__.py", "python -m leapjax babyai"),
+        (programs.main, "/site/experiments/__main__.py", "python -m experiments babyai"),
+        (programs.main, "/site/experiments/babyai.py", "python -m experiments.babyai"),
+    ],
+)
+def test_usage_lines_say_how_a_program_was_started(main, started, command, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [started])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for arguments, code in (["--help"], 0), (["--nothing"], 2):
+        with pytest.raises(SystemExit, match=str(code)):
+            main(["babyai", *arguments])
+    said = capsys.readouterr()
+    assert said.out.startswith(f"usage: {command} [-h]") and f"{command} --help" in said.err
+
+
+@pytest.mark.parametrize("buffered", [[], pytest.param(["-u"], marks=only_long)])
+@pytest.mark.parametrize(
+    "name", ["experiments", pytest.param("experiments.stars", marks=only_long)]
+)
+def test_output_that_nobody_reads_ends_a_program_quietly(buffered, name):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = python(*buffered, "-m", name, "--help", stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (startup.UNREAD, "")
+
+
+@pytest.mark.parametrize(
+    ("started", "safe", "finds"),
+    [("bin/leapjax", False, True), ("bin/leapjax", True, False), ("bin/pytest", False, False)],
+)
+def test_the_command_imports_from_the_working_folder(started, safe, finds, monkeypatch):
+    interpreter = SimpleNamespace(argv=[started], path=[], flags=SimpleNamespace(safe_path=safe))
+    monkeypatch.setattr(startup, "sys", interpreter)
+    assert programs.main(["--help"]) == 0
+    assert interpreter.path == [str(Path.cwd())] * finds
+
+
+def helps(main, arguments, capsys, monkeypatch):
+    """By option, what the help of a program says, the default apart."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit, match="0"):
+        main([*arguments, "--help"])
+    found: dict[str, str] = {}
+    for line in (line.strip(" │") for line in capsys.readouterr().out.splitlines()):
+        if re.match(r"--?\w|\[?RUNS", line):
+            option, _, said = line.partition("  ")
+            found[option] = said.strip()
+        elif found and re.search(r"\w", line):
+            assert not found[option], f"{option} is broken before {line}"
+            found[option] = line
+    del found["-h, --help"]
+    return {
+        option: re.sub(r" ?\((default: .*|required)\)$", "", said) for option, said in found.items()
+    }
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*programs.PROGRAMS, "publish", "atari collect", *(f"babyai --method {m}" for m in METHODS)],
+)
+def test_every_option_is_explained_in_whole_sentences(command, capsys, monkeypatch):
+    name, *arguments = command.split()
+    main = importlib.import_module(f"experiments.{name}").main
+    for option, said in helps(main, arguments, capsys, monkeypatch).items():
+        assert re.fullmatch(r"[A-Z0-9].*[.)\]]", said), f"{option}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("main", "own", "not_own"),
+    [
+        (gymnasium.main, {"--env", "--dataset"}, {"--level", "--demonstrations", "--game"}),
+        (atari.main, {"--game", "--demonstrations"}, {"--level", "--env", "--dataset"}),
+        (babyai.main, {"--level", "--demonstrations"}, {"--env", "--dataset", "--game"}),
+    ],
+)
+def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, monkeypatch):
+    found = helps(main, [], capsys, monkeypatch)
+    names = {option.split()[0] for option in found}
+    assert own <= names and not not_own & names
+    assert not [said for said in found.values() if any(name in said for name in not_own)]
+    method = next(said for option, said in found.items() if option.startswith("--method"))
+    assert all(name in method for name in METHODS)
+
+
+def test_messages_have_the_names_of_the_program():
+    options = ["--env", "CartPole-v1", "--method", "bc"]
+    with pytest.raises(UserError, match=r"Minari data set of it to train on \(--dataset\)"):
+        command_line.parse("gymnasium", options, GymnasiumConfig)
+
+
+def methods_of(*names):
+    found = command_line.parse(
+        "babyai", ["--level", LEVEL, "--method", *names, "--seeds", "0", "1"]
+    )
+    return [each.method for each in found]
+
+
+def test_a_command_line_may_name_several_methods():
+    assert methods_of("leap", "bc", "dt", "bc") == ["leap", "bc", "dt"]
+    every = [name for name in METHODS if METHODS[name].everywhere]
+    assert methods_of("all") == every and methods_of("bc", "all")[0] == "bc"
+    chosen = command_line.parse("babyai", ["--method", "bc", "random", "--steps", "5"])
+    assert [each.training.steps for each in chosen] == [5, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("--method bc dtt", "unknown method 'dtt'"),
+        ("--method", "--method needs a name"),
+        ("--method bc dt --pretrained", "--method bc dt: .* is of one method"),
+    ],
+)
+def test_methods_that_cannot_be_run_are_refused(arguments, says):
+    with pytest.raises(UserError, match=says):
+        command_line.parse("babyai", arguments.split())
+
+
+def test_usage_names_the_method_that_has_no_such_option(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        command_line.parse(
+            "babyai", "--method leap bc --masking each".split(), module="experiments.x"
+        )
+    assert "run python -m experiments.x --method bc --help" in capsys.readouterr().err
+
+
+def row(seed, method="bc", successes=5):
+    said = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
+    return {**said, "seed": seed, "method": method, "episodes": 10, "successes": successes,
+            "mean_return": 0.5, "hash": f"{seed}{method}"}  # fmt: skip
+
+
+def test_tables_end_with_the_mean_over_seeds():
+    rows = [row(0), row(1, successes=7), row(0, "dt"), {**row(1, "dt"), "paper_success": 60.0}]
+    rows.append({**row(2, "dt"), "configuration": {"planner": {"iterations": 3}}})
+    table = results.success_table(rows)
+    columns = {column.header: list(column.cells) for column in table.columns}
+    assert columns["seed"] == ["0", "1", "0", "1", "2", "mean of 2", "mean of 2"]
+    assert columns["method"][-2:] == ["bc (x)", "dt (x)"]
+    low, high = scores.interval_over_seeds([5, 7], [10, 10])
+    assert columns["success [95%]"][-2] == f"60.0% [{low:.1%}, {high:.1%}]"
+    assert results.success_table(rows[1:3]).row_count == 2
+
+
+def test_each_method_and_seed_is_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(running, "finish", lambda _, chosen, seed, *rest: row(seed, chosen.method))
+    monkeypatch.chdir(tmp_path)
+    assert babyai.main(["--method", "bc", "dt", "--seeds", "0", "1"]) == 0
+    assert len(re.findall(r"mean of 2", capsys.readouterr().out)) == 2
+
+
+def test_rows_have_a_success_rate(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert babyai.main([*RANDOM, "--level", LEVEL]) == 0
+    (found,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    written = (tmp_path / "runs" / "babyai.jsonl").read_text()
+    assert found["success"] == found["successes"] / 3 and '"success": ' in written
+    results.record(tmp_path / "old.jsonl", row(0))  # as an earlier version wrote it
+    assert results.read(tmp_path / "old.jsonl")[0]["success"] == 0.5
+    results.record(tmp_path / "wrong.jsonl", {**row(0), "success": 0.6})
+    with pytest.raises(UserError, match=r"success is 0\.6, of 5 of 10 episodes"):
+        results.read(tmp_path / "wrong.jsonl")

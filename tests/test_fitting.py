@@ -1,0 +1,116 @@
+"""Training in one call."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+import leapjax as leap
+from leapjax import fitting, pretrained
+from leapjax.agents.learning import TrainingConfig
+from leapjax.configuration import specify
+from leapjax.models.trajectory import ModelConfig
+from leapjax.presets import find_preset
+from tests import frozen_lake
+from tests.parameters import make_begin
+
+SMALL = ModelConfig(width=16, heads=2, layers=1, dropout=0.0)
+
+
+@pytest.fixture(scope="module")
+def star():
+    """A level, and demonstrations of it."""
+    domain = leap.make_domain("stars", "Star2x3")
+    return domain, domain.collect(6, 0, lambda count: None).demonstrations
+
+
+def test_what_is_fitted_is_what_is_saved(star, tmp_path):
+    domain, data = star
+    seen = []
+    training = TrainingConfig(batch=4)
+    planner = leap.fit(
+        data, domain, steps=3, model=SMALL, training=training,
+        progress=lambda step, means: seen.append((step, sorted(means))),
+    )  # fmt: skip
+    assert seen == [(3, ["accuracy", "gradient_norm", "loss"])]
+    assert planner.specification.training == dataclasses.replace(training, steps=3)
+    untrained = leap.fit(data, domain, steps=0, model=SMALL, training=training)
+    assert not np.array_equal(*(jax.tree.leaves(p.params)[0] for p in (planner, untrained)))
+    planner.save(tmp_path / "mine")
+    again = leap.load(tmp_path / "mine")
+    jax.tree.map(np.testing.assert_array_equal, again.params, planner.params)
+    assert again.specification == planner.specification and again.domain.level == "Star2x3"
+    plans = [each.plan_for(each.domain.make_adapter(), seed=5) for each in (planner, again)]
+    np.testing.assert_array_equal(*(plan.trace for plan in plans))
+    pretrained.publish(str(tmp_path / "mine"), str(tmp_path / "small"))
+    files = {path.name for path in (tmp_path / "small").iterdir()}
+    assert files == {"specification.json", "weights.npz"}
+    small = leap.load(tmp_path / "small")
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-6)
+    jax.tree.map(close, small.params, planner.params)
+    with pytest.raises(leap.UserError, match="is there already"):
+        planner.save(tmp_path / "mine")
+
+
+@pytest.mark.parametrize("method", ["leap", "dt", "plate"])
+@pytest.mark.parametrize(
+    ("domain", "level"), [("babyai", "GoToLocalS7N5"), ("gymnasium", "CartPole-v1")]
+)
+def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypatch):
+    monkeypatch.setattr(fitting, "make_begin", make_begin)
+    monkeypatch.setattr(fitting, "train", lambda step, state, *rest: state)
+    made = leap.make_domain(domain, level)
+    episode = leap.Demonstration(
+        jax.tree.map(lambda x: np.zeros((3, *x.shape), x.dtype), made.blank),
+        np.zeros(2, np.int32), np.ones(2, np.float32), True, False, 0,
+    )  # fmt: skip
+    made = made._replace(check=lambda observations, where: None)
+    found = leap.fit([episode], made, method).specification
+    chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
+    expected = specify(chosen, 0, made)
+    assert dataclasses.replace(found, statistics=()) == expected
+
+
+def test_a_domain_that_no_table_has_can_be_fitted_and_not_saved(monkeypatch, tmp_path):
+    monkeypatch.setattr(fitting, "make_begin", make_begin)
+    lake = frozen_lake.make(frozen_lake.LEVEL, None)
+    data = lake.collect(2, 0, lambda count: None).demonstrations
+    planner = leap.fit(data, lake, "bc", steps=0, model=SMALL)
+    with pytest.raises(leap.UserError, match="cannot be saved"):
+        planner.save(tmp_path / "mine")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        (lambda data: [], {}, "no demonstrations"),
+        (lambda data: [3], {}, "expected Demonstration, got int"),
+        (lambda data: "no/such-v0", {}, "no Minari data set 'no/such-v0'"),
+        (lambda data: [data[0]._replace(actions=[99])], {}, "demonstration 0: actions run from 99"),
+        (lambda data: [data[0]._replace(rewards=[1])], {}, "demonstration 0: rewards of shape"),
+        (lambda data: [data[0]._replace(observations=3)], {}, "has no observation 'edges'"),
+        (lambda data: [d._replace(rewards=0 * d.rewards) for d in data], {"method": "dt"},
+         "no demonstration holds a reward"),
+        (list, {"method": "lepa"}, "unknown method 'lepa'"),
+        (list, {"domain": "stars"}, "expected Domain, got str"),
+        (list, {"steps": -1}, "steps must be at least 0"),
+        (list, {"settings": SMALL}, "expected Settings, got ModelConfig"),
+        (list, {"training": SMALL}, "expected TrainingConfig, got ModelConfig"),
+        (list, {"horizon": 9}, "it needs 9 iterations"),
+        (list, {"method": "bc", "planner": leap.GibbsConfig(2)}, "horizon is 1"),
+        (list, {"seed": -1}, "seed"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_found_before_training(change, options, message, star, monkeypatch):
+    monkeypatch.setattr(fitting, "train", lambda *given: pytest.fail("trained"))
+    domain, data = star
+    with pytest.raises(leap.UserError, match=message):
+        leap.fit(change(data), **{"domain": domain, **options})
+
+
+def test_settings_of_another_domain_are_refused():
+    with pytest.raises(leap.UserError, match="expected Settings, got ModelConfig"):
+        leap.make_domain("stars", "Star2x3", SMALL)
