@@ -122,7 +122,7 @@ class CompiledPlanner:
             raise UserError(
                 "a compiled planner was called inside of jit, vmap or grad, where it sees no "
                 "numbers: call it outside, or use leap.gibbs (or the planner of its "
-                "configuration) there, with jax.vmap over keys and contexts"
+                "configuration) there, with jax.vmap over keys and what energy.encode returns"
             )
         if not hasattr(keys, "dtype"):
             if not isinstance(keys, Sequence) or isinstance(keys, str):
