@@ -32,8 +32,8 @@ from leapjax.domain import Domain
 from leapjax.environments import Eager, closing
 from leapjax.errors import UserError
 from leapjax.presets import find_preset
-from leapjax.rollouts import kept
 from leapjax.running import jax_setup, shell
+from leapjax.types import Context, Params, PyTree
 
 GAMES_PLAYED = (1, 16, 64)  # together
 DECISIONS = 50  # of each game, to measure
@@ -110,28 +110,34 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     energy = agent.energy
     params = jax.jit(agent.init)(jax.random.key(0)).params
-    encode = jax.vmap(energy.encode, in_axes=(None, 0))
+
+    def encode_one(params: Params, context: Context, cache: PyTree) -> PyTree:
+        if agent.encode_next is None:
+            return energy.encode(params, context)
+        return agent.encode_next(params, context, cache)
+
+    encode = jax.vmap(encode_one, in_axes=(None, 0, 0))
     tokens = config.training.batch * config.planner.horizon
     peak = matmul_peak(tokens, config.model.width, seconds)
     rows: list[Row] = []
     for batch in batches:
-        plan = compile_planner(energy, config.planner, (batch,))
+        plan = compile_planner(
+            energy, config.planner, (batch,), encode_next=agent.encode_next
+        ).plan_next
         contexts = jax.device_put(random_contexts(domain, config.context, batch))
         keys = jax.random.split(jax.random.key(1), batch)
         begun = time.perf_counter()
-        encoded = kept(plan(params, keys, contexts), config.executed)
+        _, cache = plan(params, keys, contexts, None)
         first = time.perf_counter() - begun
-        anew = fastest(partial(plan, params, keys, contexts), seconds)
-        planning = anew
-        if encoded is not None:  # as it is while playing
-            contexts = contexts._replace(encoded=encoded)
-            plan(params, keys, contexts)
-            planning = fastest(partial(plan, params, keys, contexts), seconds)
+        anew = planning = fastest(partial(plan, params, keys, contexts, None), seconds)
+        if cache is not None:  # as it is while playing
+            plan(params, keys, contexts, cache)
+            planning = fastest(partial(plan, params, keys, contexts, cache), seconds)
         # On as many devices as the planner.
         mesh = sharding.make_mesh(batch)
         split = sharding.split_batches(lambda _, *given: encode(*given), mesh)
-        placed = jax.device_put(contexts, NamedSharding(mesh, sharding.SPLIT))
-        encoding = partial(split, None, sharding.replicate(params, mesh), placed)
+        placed = jax.device_put((contexts, cache), NamedSharding(mesh, sharding.SPLIT))
+        encoding = partial(split, None, sharding.replicate(params, mesh), *placed)
         jax.block_until_ready(encoding())
         rows.append(
             {
@@ -143,7 +149,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
                 "anew_seconds": anew,  # where nothing is known of past states
                 "encoding_seconds": fastest(encoding, seconds),
                 "playing_seconds": playing_seconds(domain, batch),
-                "encoding_flops": matmul_flops(encode, params, contexts),
+                "encoding_flops": matmul_flops(encode, params, contexts, cache),
                 "peak_gflops": peak,
             }
         )

@@ -51,7 +51,7 @@ def rewrite() -> None:
 
 
 def rows_of(root: Path, *names: str) -> list[Row]:
-    """The rows of some experiments.
+    """Reads the rows of some experiments, each with its episodes where they are recorded.
 
     Raises:
         UserError: a row that tables could not be made from, or of another experiment.
@@ -60,13 +60,14 @@ def rows_of(root: Path, *names: str) -> list[Row]:
     for name in names:
         path = root / "results" / f"{name}.jsonl"
         schema = results.OF_ANALYSIS if name in ANALYSES else results.OF_EXPERIMENT
+        recorded = results.read_episodes(path)
         for row in results.read(path, schema):
             if row["experiment"] != name:
                 raise UserError(
                     f"{path}: a row of {row['experiment'][:40]}, hash {row['hash'][:20]}: move it "
                     "to the file of its experiment"
                 )
-            found.append(row)
+            found.append({**row, "recorded": recorded.get(row["hash"])})
     return found
 
 

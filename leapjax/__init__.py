@@ -36,7 +36,12 @@ if TYPE_CHECKING:
     from leapjax.pretrained import Pretrained, load
     from leapjax.pure import PureEnvironment, compile_rollout
     from leapjax.rollouts import Episodes, evaluate
-    from leapjax.scores import aggregate, interval_over_seeds, wilson_interval
+    from leapjax.scores import (
+        aggregate,
+        interval_of_episodes,
+        interval_over_seeds,
+        wilson_interval,
+    )
     from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
     from leapjax.version import __version__ as __version__
 
@@ -70,6 +75,7 @@ __all__ = [
     "fit",
     "from_total",
     "gibbs",
+    "interval_of_episodes",
     "interval_over_seeds",
     "load",
     "make_domain",
@@ -112,7 +118,12 @@ _DEFINED = {
     "leapjax.pretrained": ("Pretrained", "load"),
     "leapjax.pure": ("PureEnvironment", "compile_rollout"),
     "leapjax.rollouts": ("Episodes", "evaluate"),
-    "leapjax.scores": ("aggregate", "interval_over_seeds", "wilson_interval"),
+    "leapjax.scores": (
+        "aggregate",
+        "interval_of_episodes",
+        "interval_over_seeds",
+        "wilson_interval",
+    ),
     "leapjax.types": ("Agent", "Context", "Demonstration", "Energy", "Plan", "TrainState"),
     "leapjax.version": ("__version__",),
 }

@@ -11,10 +11,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from leapjax import compilation, sharding
-from leapjax.checks import check_counts, check_integer, check_seed, check_seeds
+from leapjax.checks import check_counts, check_integer, check_kind, check_seed, check_seeds
 from leapjax.errors import UserError
-from leapjax.planners import PlannerConfig, bind
-from leapjax.types import Array, Energy, Params, Plan, PyTree
+from leapjax.planners import PlannerConfig, find_planner
+from leapjax.types import Array, EncodeNext, Energy, Params, Plan, PyTree
 
 CHUNK_SIZES = (1, 16, 128)
 KEYS = "threefry2x32"  # the kind of all keys made here, whatever JAX is set to: see `plan_keys`
@@ -47,16 +47,28 @@ class CompiledPlanner:
         config: PlannerConfig,
         chunk_sizes: Sequence[int],
         devices: Sequence[jax.Device] | None,
+        encode_next: EncodeNext | None,
     ) -> None:
         self.chunk_sizes = tuple(sorted({*check_counts("chunk sizes", chunk_sizes, 1).tolist()}))
         if not self.chunk_sizes:
             raise ValueError("chunk sizes: expected at least one")
-        planner = bind(energy, config)
-        self.num_actions = energy.num_actions
+        planner = find_planner(config)
+        self.num_actions = check_kind(energy, Energy).num_actions
 
-        def plan_rows(kind: str, params: Params, key_data: jax.Array, contexts: PyTree) -> Plan:
+        def plan_one(
+            params: Params, key: jax.Array, context: PyTree, cache: PyTree
+        ) -> tuple[Plan, PyTree]:
+            if encode_next is None:
+                memory, cache = energy.encode(params, context), None
+            else:
+                memory, cache = encode_next(params, context, cache)
+            return planner(energy, params, key, memory, config), cache
+
+        def plan_rows(
+            kind: str, params: Params, key_data: jax.Array, contexts: PyTree, cache: PyTree
+        ) -> tuple[Plan, PyTree]:
             keys = jax.random.wrap_key_data(key_data, impl=kind)
-            return jax.vmap(planner, in_axes=(None, 0, 0))(params, keys, contexts)
+            return jax.vmap(plan_one, in_axes=(None, 0, 0, 0))(params, keys, contexts, cache)
 
         nothing = jax.tree.structure(())
         self._last: tuple[list[Array], Any, dict[int, Params]] = ([], nothing, {})
@@ -82,6 +94,28 @@ class CompiledPlanner:
                 of 64 bits, in contexts or parameters, that do not fit 32; or a call inside of
                 `jit`, `vmap` or `grad`.
             NotANumber: the energy of some action was NaN or -inf; it holds the plans.
+        """
+        return self.plan_next(params, keys, contexts, None)[0]
+
+    def plan_next(
+        self, params: Params, keys: Array, contexts: PyTree, cache: PyTree
+    ) -> tuple[Plan, PyTree]:
+        """Plans for the next contexts of B episodes, of which some has been encoded before.
+
+        Args:
+            params: of the energy.
+            keys: as in a call.
+            contexts: as in a call.
+            cache: that the plans of the contexts one action earlier returned, rows in the order of
+                these contexts; None: all episodes begin here, or several actions were executed.
+
+        Returns:
+            The plans, and the cache for the next ones: None if there was no `encode_next`, else
+            opaque NumPy arrays with a leading `[B]`.
+
+        Raises:
+            ValueError: as in a call.
+            NotANumber: as in a call.
         """
         leaves = jax.tree.leaves((params, keys, contexts))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
@@ -122,7 +156,7 @@ class CompiledPlanner:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
         else:
             kind = _kind_of(keys)
-        inputs = jax.tree.map(np.asarray, (keys, contexts))
+        inputs = jax.tree.map(np.asarray, (keys, contexts, cache))
         chunks = split_batch(batch, self.chunk_sizes)
         placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
         plans = []
@@ -136,7 +170,7 @@ class CompiledPlanner:
             jax.tree.map(lambda leaf, n=used: np.asarray(leaf)[:n], plan)
             for plan, (_, _, used) in zip(plans, chunks, strict=True)
         ]
-        plan = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        plan, cache = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
         if not plan.valid.all():
             raise NotANumber(
                 f"the energy is NaN or -inf for {np.sum(~plan.valid)} of {batch} contexts (the "
@@ -144,7 +178,7 @@ class CompiledPlanner:
                 "that are +inf or all -inf",
                 plan,
             )
-        return plan
+        return plan, cache
 
     def _place(self, params: Params, meshes: set[Mesh]) -> dict[int, Params]:
         """The parameters on the devices of each mesh, by its size.
@@ -165,7 +199,7 @@ class CompiledPlanner:
             self._last = leaves, structure, placed  # at once: another thread sees all or nothing
         return placed
 
-    def compile(self, params: Params, context: PyTree, batch: int = 1) -> None:
+    def compile(self, params: Params, context: PyTree, batch: int = 1, again: bool = True) -> None:
         """Compiles what batches of at most `batch` plans need, so that later calls start at once.
 
         It plans once for each chunk size, and drops the plans.
@@ -174,6 +208,8 @@ class CompiledPlanner:
             params: of the energy; their shapes and types count.
             context: of one plan, without a leading `[B]`; its shapes and types count.
             batch: B, the largest number of contexts in a call.
+            again: also compile plans after the first of an episode, which use a cache if there is
+                one (see `plan_next`).
 
         Raises:
             ValueError: see `__call__`; or `batch` is not positive.
@@ -182,7 +218,9 @@ class CompiledPlanner:
             contexts = jax.tree.map(lambda leaf, n=size: np.stack([np.asarray(leaf)] * n), context)
             keys = plan_keys(0, np.arange(size), np.zeros(size, int))
             with contextlib.suppress(NotANumber):  # these numbers are nobody's
-                self(params, keys, contexts)
+                _, cache = self.plan_next(params, keys, contexts, None)
+                if again and cache is not None:
+                    self.plan_next(params, keys, contexts, cache)
 
     def sizes_up_to(self, batch: int) -> list[int]:
         """The chunk sizes that batches of at most so many plans can need."""
@@ -195,6 +233,7 @@ def compile_planner(
     config: PlannerConfig,
     chunk_sizes: Sequence[int] = CHUNK_SIZES,
     devices: Sequence[jax.Device] | None = None,
+    encode_next: EncodeNext | None = None,
 ) -> CompiledPlanner:
     """Builds, once, the planner that serves batches of any size.
 
@@ -213,13 +252,15 @@ def compile_planner(
         chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
             split over as many of the devices as divide it.
         devices: to plan on; all of this process, if not given.
+        encode_next: `energy.encode` with a cache, of `Agent.encode_next`; None: each context is
+            encoded as a whole.
 
     Raises:
         TypeError: a `config` that is of no planner.
         ValueError: chunk sizes that are not positive.
     """
     compilation.use_disk_cache()
-    return CompiledPlanner(energy, config, chunk_sizes, devices)
+    return CompiledPlanner(energy, config, chunk_sizes, devices, encode_next)
 
 
 def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:

@@ -18,9 +18,9 @@ from leapjax.errors import UserError, did_you_mean
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
 
 if TYPE_CHECKING:
-    import flax.linen as nn
     import gymnasium as gym
 
+    from leapjax.models.encoder import Encoder
     from leapjax.models.trajectory import ModelConfig
 
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
@@ -149,9 +149,7 @@ class Domain(NamedTuple):
         actions: names; the last is the end action.
         max_steps: of the longest episode.
         blank: an observation of zeros, as NumPy arrays: shapes and types.
-        encoders: by architecture, (model, K) -> module; see `leapjax.models.trajectory`. One of
-            `paper` may have `of_all` too, (B contexts) -> tokens `[B, K + 1, D]`, where training
-            is faster with it.
+        encoders: by architecture, (model, K) -> encoder.
         augmentations: each (key, window) -> window; (f, g) makes f(g(window)) of a window.
         measure: (demonstrations) -> what encoders must know of the training data.
         with_statistics: (what was measured) -> the same level with encoders that know it; None:
@@ -181,7 +179,7 @@ class Domain(NamedTuple):
     actions: tuple[str, ...]
     max_steps: int
     blank: PyTree
-    encoders: Mapping[str, Callable[["ModelConfig", int], "nn.Module"]]
+    encoders: Mapping[str, Callable[["ModelConfig", int], "Encoder"]]
     augmentations: Sequence[Augmentation] = ()
     measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
     with_statistics: Callable[[Statistics], "Domain"] | None = None
@@ -248,12 +246,6 @@ def check_context(context: Context, domain: Domain, length: int) -> None:
         UserError: says what has which shape.
     """
     blank = blank_context(domain, length)
-    if context.encoded is not None and context.encoded.shape[0] != length:
-        raise UserError(
-            f"a context in which {context.encoded.shape[0]} past states are encoded, but this "
-            f"network was made for {length}"
-        )
-    context = context._replace(encoded=None)
     structures = [str(jax.tree.structure(tree)) for tree in (context, blank)]
     if structures[0] != structures[1]:
         raise UserError(

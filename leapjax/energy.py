@@ -21,7 +21,6 @@ from leapjax.types import (
     check_num_actions,
     mask_token,
     no_violation,
-    nothing_encoded,
 )
 
 EncodeFn = Callable[[Params, PyTree], PyTree]
@@ -315,10 +314,7 @@ def constrain(
         mine = jnp.maximum(judge(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
 
-    return energy._replace(
-        encode=encode, conditional=conditional, total=total, violation=violation,
-        encoded=lambda memory: energy.encoded(memory[0]),
-    )  # fmt: skip
+    return energy._replace(encode=encode, conditional=conditional, total=total, violation=violation)
 
 
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
@@ -326,15 +322,12 @@ def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
 
     A constraint of this energy sees the same, `function(context)`, and still counts. To judge
     plans by the whole context, constrain what `view` returns.
-
-    All of a context is seen anew for each plan: what was made of a state may change with what the
-    function shows of it.
     """
 
     def encode(params: Params, context: PyTree) -> PyTree:
         return energy.encode(params, function(context))
 
-    return check_kind(energy, Energy)._replace(encode=encode, encoded=nothing_encoded)
+    return check_kind(energy, Energy)._replace(encode=encode)
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:

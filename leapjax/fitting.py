@@ -140,7 +140,7 @@ def fit(
     placed = sharding.replicate(steps_of_all, mesh)
     state = train(step, state, placed, key, training.steps, report)
     params = jax.tree.map(jnp.asarray, sharding.to_host(state.params))
-    plan = compile_planner(agent.energy, planner)
+    plan = compile_planner(agent.energy, planner, encode_next=agent.encode_next)
     return Pretrained(specification, agent.energy, params, plan, domain)
 
 

@@ -1,6 +1,7 @@
-"""Planners: `(energy, params, key, context, config) -> Plan`, pure, for one context.
+"""Planners: `(energy, params, key, memory, config) -> Plan`, pure, for one context.
 
-They know only `Energy`. `leapjax.batching` makes one of them plan for any number of contexts.
+They know only `Energy`; `memory` is what its `encode` made of the context. `leapjax.batching` makes
+one of them plan for any number of contexts.
 """
 
 import dataclasses
@@ -193,7 +194,7 @@ def guard_shapes(energy: Energy) -> Energy:
 
 
 def gibbs(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: GibbsConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: GibbsConfig
 ) -> Plan:
     """Gibbs sampling over action tokens (paper, algorithm 1): N passes in all.
 
@@ -215,7 +216,6 @@ def gibbs(
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
     energy = guard_shapes(energy)
-    memory = energy.encode(params, context)
     chain = functools.partial(_gibbs_chain, energy, params, memory, config=config)
     if config.restarts == 1:
         actions, trace, valid = chain(key)
@@ -401,11 +401,10 @@ def _random_plans(key: jax.Array, choices: jax.Array, count: int) -> jax.Array:
 
 
 def random_shooting(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: ShootingConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: ShootingConfig
 ) -> Plan:
     """The random plan of least energy (paper, appendix, ablation), of those that can be."""
     energy = guard_shapes(energy)
-    memory = energy.encode(params, context)
     choices = _choices(energy, params, memory, config.horizon)
     plans = _random_plans(key, choices, config.candidates)
     energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
@@ -420,7 +419,7 @@ def random_shooting(
 
 
 def cross_entropy_method(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: CrossEntropyConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: CrossEntropyConfig
 ) -> Plan:
     """Keep the elites, change one token in each child (paper, appendix, ablation).
 
@@ -428,7 +427,6 @@ def cross_entropy_method(
     that is also the best ever seen.
     """
     energy = guard_shapes(energy)
-    memory = energy.encode(params, context)
     count, horizon = config.candidates, config.horizon
     choices = _choices(energy, params, memory, horizon)
 
@@ -480,7 +478,7 @@ class _Beams(NamedTuple):
 
 
 def beam_search(
-    energy: Energy, params: Params, key: jax.Array, context: PyTree, config: BeamConfig
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: BeamConfig
 ) -> Plan:
     """The plan of least summed conditional energy among W that began well, T passes in all.
 
@@ -501,7 +499,6 @@ def beam_search(
             "only (accepts_mask is False): use another planner"
         )
     energy = guard_shapes(energy)
-    memory = energy.encode(params, context)
     actions = energy.num_actions
 
     def extend(
@@ -566,12 +563,11 @@ def _drawn(
     return after(likelihoods), after(ranks)
 
 
-def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
-    """`(params, key, context) -> Plan`: the planner that a configuration belongs to.
+def find_planner(config: PlannerConfig) -> Callable[..., Plan]:
+    """Returns the planner that takes a configuration: `gibbs`, `beam_search` and so on.
 
     Raises:
-        UserError: the energy is no `Energy`.
-        TypeError: the configuration belongs to no planner.
+        TypeError: no planner takes such a configuration.
     """
     planners: dict[type, Callable[..., Plan]] = {
         GibbsConfig: gibbs,
@@ -579,15 +575,23 @@ def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, 
         CrossEntropyConfig: cross_entropy_method,
         BeamConfig: beam_search,
     }
-    check_kind(energy, Energy)
     if type(config) not in planners:
         known = ", ".join(kind.__name__ for kind in planners)
         raise TypeError(f"no planner takes a {type(config).__name__}: expected one of {known}")
-    planner = planners[type(config)]
+    return planners[type(config)]
+
+
+def bind(energy: Energy, config: PlannerConfig) -> Callable[[Params, jax.Array, PyTree], Plan]:
+    """Returns `(params, key, context) -> Plan`, which encodes the context and plans.
+
+    Raises:
+        UserError: the energy is no `Energy`.
+        TypeError: no planner takes such a configuration.
+    """
+    check_kind(energy, Energy)
+    planner = find_planner(config)
 
     def plan(params: Params, key: jax.Array, context: PyTree) -> Plan:
-        memory = energy.encode(params, context)
-        known = energy._replace(encode=lambda params, context: memory)
-        return planner(known, params, key, context, config)._replace(encoded=energy.encoded(memory))
+        return planner(energy, params, key, energy.encode(params, context), config)
 
     return plan

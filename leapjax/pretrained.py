@@ -148,18 +148,15 @@ class Pretrained:
         Args:
             batch: B, the largest number of contexts in a call.
             executed: actions of each plan in `leapjax.evaluate`; None for all. If it is 1, plans
-                after the first also use what is encoded already.
+                after the first use a cache.
 
         Raises:
             UserError: a number that is not a positive integer.
         """
         context = blank_context(self.domain, self.specification.context)
         executed, _ = rollouts.check_limits(executed, None)
-        self.plan.compile(self.params, context, batch)
-        one = self(plan_keys(0, np.zeros(1), np.zeros(1)), jax.tree.map(lambda x: x[None], context))
-        encoded = rollouts.kept(one, executed)
-        if encoded is not None:  # as it is after the first plan
-            self.plan.compile(self.params, context._replace(encoded=encoded[0]), batch)
+        again = 1 in (executed, self.specification.planner.horizon)
+        self.plan.compile(self.params, context, batch, again)
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Writes a folder that `leapjax.load` reads: a specification, and the parameters.
@@ -464,5 +461,7 @@ def load(
     specification = dataclasses.replace(
         specification, planner=planner or specification.planner, level=level or specification.level
     )
-    plan = compile_planner(agent.energy, specification.planner, chunk_sizes)
+    plan = compile_planner(
+        agent.energy, specification.planner, chunk_sizes, encode_next=agent.encode_next
+    )
     return Pretrained(specification, agent.energy, params, plan, domain)

@@ -80,7 +80,6 @@ class History:
         self._past: list[PyTree] = []
         self._actions: list[int] = []
         self._rewards: list[float] = []
-        self._encoded: Array | None = None
         self._structure: Any
         leaves, self._structure = jax.tree.flatten(to_plain_dicts(observation))
         self._shapes = list(map(np.shape, leaves))
@@ -92,21 +91,13 @@ class History:
         """The episode and the step that it is at, for messages."""
         return f"step {self.step}" + ("" if self._seed is None else f" of level seed {self._seed}")
 
-    @property
-    def has_encoded(self) -> bool:
-        """Whether contexts hold encoded states."""
-        return self._encoded is not None
-
-    def advance(
-        self, action: int, observation: PyTree, reward: float, encoded: Array | None = None
-    ) -> None:
+    def advance(self, action: int, observation: PyTree, reward: float) -> None:
         """Records one step.
 
         Args:
             action: that was taken.
             observation: what it led to.
             reward: what it gave.
-            encoded: `[K, D]` what is known of the states before it, if they are (see `kept`).
 
         Raises:
             UserError: an observation of other parts or shapes than the first; a number in it, a
@@ -121,7 +112,6 @@ class History:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
             self._rewards = [*self._rewards, reward][-self._length :]
-        self._encoded = encoded
         self.current = self._checked(observation)
         number = _read_number("reward", reward, self.where)
         self.return_so_far += reward
@@ -168,7 +158,6 @@ class History:
             rewards=np.array([0.0] * missing + self._rewards, np.float32),
             step=np.array(self.step, np.int32),
             return_so_far=np.array(self.return_so_far, np.float32),
-            encoded=self._encoded,
         )
 
 
@@ -251,15 +240,6 @@ def check_actions(of: str, planned: int, possible: int) -> None:
         )
 
 
-def kept(plans: Plan, executed: int | None) -> Array | None:
-    """What is known of past states when the next plans are made, `[B, K, D]`.
-
-    None if more than one action was executed: the states in between were not encoded.
-    """
-    single = executed == 1 or plans.actions.shape[1] == 1
-    return plans.encoded[:, 1:] if single and plans.encoded is not None else None
-
-
 def stack_contexts(histories: Sequence[History]) -> Context:
     """The contexts of B episodes, leaves with a leading `[B]`."""
     contexts = [history.context() for history in histories]
@@ -276,12 +256,39 @@ class _Episode:
         # What no other episode may step, by identity.
         self.owned = {id(part): part for part in (adapter, *environments_of(adapter))}
         self.replans = 0
+        self.cache: PyTree = None  # its row of what the planner returned with the last plan
+
+
+def plan_episodes(
+    plan: CompiledPlanner,
+    params: Params,
+    keys: Array,
+    histories: Sequence[History],
+    caches: Sequence[PyTree],
+    executed: int | None,
+) -> tuple[Plan, list[PyTree]]:
+    """Plans for B episodes, and returns the cache of each for its next plan.
+
+    Args:
+        plan: from `compile_planner`.
+        params: of the energy.
+        keys: `[B]`, see `CompiledPlanner`.
+        histories: of the episodes.
+        caches: of the episodes: all from their last plan, or all None.
+        executed: actions of each plan that will be executed; None for all. After more than one
+            there is no cache: the states in between are not encoded.
+    """
+    stacked = jax.tree.map(lambda *rows: np.stack(rows), *caches)
+    plans, cache = plan.plan_next(params, keys, stack_contexts(histories), stacked)
+    if cache is None or (executed != 1 and plans.actions.shape[1] != 1):
+        return plans, [None] * len(histories)
+    return plans, [jax.tree.map(lambda x, n=n: x[n], cache) for n in range(len(histories))]
 
 
 def _alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
-    """Episodes whose contexts can be stacked: those with encoded states, and those without."""
-    for has_encoded in (True, False):
-        group = [each for each in episodes if each.history.has_encoded == has_encoded]
+    """Episodes that can be planned for together: those with a cache, and those without."""
+    for begun in (True, False):
+        group = [each for each in episodes if (each.cache is not None) == begun]
         if group:
             yield group
 
@@ -366,8 +373,8 @@ def evaluate(
         owned.update(episode.owned)
         return episode
 
-    def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray, Array | None]]:
-        """Plans for some episodes: the actions `[executed]` of each, and what stays known."""
+    def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray]]:
+        """Plans for some episodes: the actions `[executed]` of each."""
         nonlocal planned, planning_seconds
         before = time.perf_counter()
         keys = plan_keys(
@@ -375,17 +382,18 @@ def evaluate(
             np.array([episode.seed for episode in group], np.uint32),
             np.array([episode.replans for episode in group], np.uint32),
         )
-        plans = plan(params, keys, stack_contexts([episode.history for episode in group]))
+        histories, known = zip(*((each.history, each.cache) for each in group), strict=True)
+        plans, caches = plan_episodes(plan, params, keys, histories, known, executed)
         if iteration is not None and iteration > plans.trace.shape[1]:
             raise UserError(f"iteration {iteration} is not in 1 .. {plans.trace.shape[1]}")
         chosen = plans.actions if iteration is None else plans.trace[:, iteration - 1]
-        encoded = kept(plans, executed)
+        for episode, cache in zip(group, caches, strict=True):
+            episode.cache = cache
         planning_seconds += time.perf_counter() - before
         planned += len(group)
-        rows = itertools.repeat(None) if encoded is None else encoded
-        return zip(group, np.asarray(chosen)[:, :executed], rows, strict=False)
+        return zip(group, np.asarray(chosen)[:, :executed], strict=True)
 
-    def act(episode: _Episode, actions: np.ndarray, encoded: Array | None) -> bool:
+    def act(episode: _Episode, actions: np.ndarray) -> bool:
         """Executes a plan; whether the episode is over."""
         place, history = episode.place, episode.history
         episode.replans += 1
@@ -398,9 +406,7 @@ def evaluate(
                     f"step of {type(episode.adapter).__name__} returned {type(found).__name__}: "
                     "expected a leapjax.environments.Transition"
                 )
-            history.advance(
-                found.executed(int(action)), found.observation, found.reward, encoded
-            )  # fmt: skip
+            history.advance(found.executed(int(action)), found.observation, found.reward)
             score = _read_number("score", found.counted, history.where)
             if not math.isfinite(score):
                 raise UserError(f"the environment gave a score of {score} at {history.where}")
@@ -423,12 +429,12 @@ def evaluate(
             if not active:
                 break
             decided = [each for group in _alike(active) for each in decide(group)]
-            for episode, actions, _ in decided:
+            for episode, actions in decided:
                 if episode.eager is not None and actions[0] < end:
                     episode.eager.begin(int(actions[0]))
             active = []
-            for episode, actions, encoded in decided:
-                if act(episode, actions, encoded):
+            for episode, actions in decided:
+                if act(episode, actions):
                     close(opened.pop(episode.place))
                     owned.difference_update(episode.owned)
                     over += 1

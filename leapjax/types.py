@@ -37,8 +37,6 @@ class Context(NamedTuple):
         rewards: `[K]` float32, what each of them gave; 0 before the start.
         step: `[]` int32, environment steps since the episode began.
         return_so_far: `[]` float32, the sum of all rewards since then.
-        encoded: `[K, D]` what a network has made of each past state, where that is kept from one
-            decision to the next; None: the network reads all of them again.
     """
 
     observation: PyTree
@@ -47,7 +45,6 @@ class Context(NamedTuple):
     rewards: Array
     step: Array
     return_so_far: Array
-    encoded: Array | None = None
 
 
 class Demonstration(NamedTuple):
@@ -112,7 +109,6 @@ class Plan(NamedTuple):
         energy: `[]` float32, of the plan; only if asked for (`score`), since it costs T passes.
         trace_energies: `[N]` float32, after every iteration; only if asked for (`score_trace`),
             since it costs N * T passes.
-        encoded: `[K + 1, D]`, see `Energy`.
     """
 
     actions: jax.Array
@@ -121,12 +117,6 @@ class Plan(NamedTuple):
     valid: jax.Array
     energy: jax.Array | None = None
     trace_energies: jax.Array | None = None
-    encoded: jax.Array | None = None
-
-
-def nothing_encoded(memory: PyTree) -> None:
-    """What an energy can tell of states if it reads each context as a whole."""
-    del memory
 
 
 def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
@@ -151,8 +141,6 @@ class Energy(NamedTuple):
         accepts_mask: whether actions may be MASK; if not, planning starts from uniform actions.
         violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
             positive.
-        encoded: (memory) -> `[K + 1, D]`, what `encode` made of each state, for the `encoded` of
-            later contexts; None: there is nothing that could be kept.
     """
 
     encode: Callable[[Params, PyTree], PyTree]
@@ -161,7 +149,6 @@ class Energy(NamedTuple):
     num_actions: int
     accepts_mask: bool = True
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
-    encoded: Callable[[PyTree], jax.Array | None] = nothing_encoded
 
 
 def mask_token(num_actions: int) -> int:
@@ -199,6 +186,11 @@ class TrainState(NamedTuple):
     extra: PyTree = ()
 
 
+EncodeNext = Callable[[Params, Context, PyTree], tuple[PyTree, PyTree]]
+# (params, context, cache) -> (memory, cache): as an energy's `encode`, for consecutive states of an
+# episode. The cache is what the network keeps from plan to plan; None at the first
+
+
 class Agent(NamedTuple):
     """What every method has in common, so that one training and one rollout serve all.
 
@@ -208,9 +200,12 @@ class Agent(NamedTuple):
         update: (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself.
         energy: what is minimised to act; a method that chooses one action at a time has plans of
             one.
+        encode_next: `energy.encode` with a cache, for `compile_planner`; None: a cache would save
+            nothing.
     """
 
     init: Callable[[jax.Array], TrainState]
     batch: Callable[[jax.Array, PyTree], PyTree]
     update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
     energy: Energy
+    encode_next: EncodeNext | None = None

@@ -12,6 +12,7 @@ from leapjax.configuration import AnyConfig, change
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
+from leapjax.models.encoder import Encoder
 from leapjax.presets import common, environments
 
 LEVEL = "FrozenLake-v1"
@@ -23,7 +24,7 @@ class Settings:
     """FrozenLake has no options."""
 
 
-class Cell(nn.Module):
+class Cell(Encoder):
     """The cell that the agent is in, as one token."""
 
     width: int

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.data import windows
+from leapjax.models.encoder import Encoder
 from leapjax.types import Demonstration
 from tests import toy
 from tests.toy import FARTHEST, LEFT, RIGHT
@@ -13,7 +14,7 @@ from tests.toy import FARTHEST, LEFT, RIGHT
 PLACES = np.array([x for x in range(-FARTHEST, FARTHEST + 1) if x])
 
 
-class Place(nn.Module):
+class Place(Encoder):
     """A token for each place: a table, so that values are learned one by one."""
 
     width: int
@@ -24,7 +25,7 @@ class Place(nn.Module):
         return nn.Embed(2 * FARTHEST + 1, self.width)(place)[None]
 
 
-class Places(nn.Module):
+class Places(Encoder):
     """The same for each state of a context, as the paper's encoder has it."""
 
     width: int

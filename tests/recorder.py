@@ -3,7 +3,7 @@
 import jax
 
 import leapjax as leap
-from leapjax.types import Context, Plan
+from leapjax.types import Context, Plan, PyTree
 
 
 class Recorder:
@@ -12,6 +12,7 @@ class Recorder:
     def __init__(self, plan: leap.CompiledPlanner) -> None:
         self.plan = plan
         self.contexts: list[Context] = []
+        self.caches: list[PyTree] = []
         self.plans: list[Plan] = []
 
     @property
@@ -19,9 +20,10 @@ class Recorder:
         """As many as the other one's."""
         return self.plan.num_actions
 
-    def __call__(self, params, keys, contexts) -> Plan:
+    def plan_next(self, params, keys, contexts, cache) -> tuple[Plan, PyTree]:
         """The plans of the other one."""
-        plans = self.plan(params, keys, contexts)
+        plans, after = self.plan.plan_next(params, keys, contexts, cache)
         self.contexts.append(contexts)
+        self.caches.append(cache)
         self.plans.append(jax.device_get(plans))
-        return plans
+        return plans, after

@@ -12,6 +12,7 @@ from leapjax import batching
 from leapjax.agents import bc
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import toy
@@ -63,7 +64,7 @@ def test_its_energy_is_minus_the_logits_and_the_end_is_never_chosen(trained):
     np.testing.assert_array_equal(energies, [*-memory["logits"][-1], np.inf])
 
 
-class States(nn.Module):
+class States(Encoder):
     """A token for each state of a context, as the paper's encoder has."""
 
     @nn.compact

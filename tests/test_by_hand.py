@@ -314,9 +314,14 @@ def test_plate():
         lambda: windows.concatenate(toy.demonstrations()),
     )  # fmt: skip
     actions, setup = case.batch.actions, case.setup
-    call = caller(plate.AlternatingModel(setup.model, setup.sizes, setup.encoder()))
+    module = plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+    call = caller(module)
 
-    reached = call(case.state.params, "encode_unrolled", case.batch.context)[0][:, 1 - horizon :]
+    def unrolled(params):
+        tokens = module.apply(params, case.batch.context, method="encode_batch")
+        return call(params, "encode_unrolled", case.batch.context, tokens)
+
+    reached = unrolled(case.state.params)[0][:, 1 - horizon :]
     ends = [[int(action) == toy.END for action in plan] for plan in actions]
     chosen = jnp.array([[not any(plan[:place]) for place in range(horizon)] for plan in ends])
     acted = jnp.array([[not any(plan[: place + 1]) for place in range(horizon)] for plan in ends])
@@ -324,7 +329,7 @@ def test_plate():
     assert not chosen.all() and chosen.all(axis=1).any()
 
     def loss(params):
-        states, between = call(params, "encode_unrolled", case.batch.context)
+        states, between = unrolled(params)
         logits, led = call(params, "read", states, between)
         errors = jnp.where(acted, ((led - reached) ** 2).mean(axis=-1), 0).sum(axis=1)
         errors = errors / jnp.maximum(acted.sum(axis=1), 1)

@@ -591,12 +591,14 @@ class Bare:
 def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
     contexts = []
 
-    def plan(params, keys, context):
-        contexts.append(context)
-        return Plan(np.zeros((len(keys), 1), np.int32), *[None] * 3)
+    class Planner:
+        num_actions = 3
 
-    plan.num_actions = 3
-    episodes = evaluate(lambda: adapter(Moody()), [1, 2, 3], plan, (), context=2)
+        def plan_next(self, params, keys, context, cache):
+            contexts.append(context)
+            return Plan(np.zeros((len(keys), 1), np.int32), *[None] * 3), None
+
+    episodes = evaluate(lambda: adapter(Moody()), [1, 2, 3], Planner(), (), context=2)
     assert list(episodes.lengths) == [11, 10, 9]
     assert all(set(each.past) == {"a", "b"} and type(each.past) is dict for each in contexts)
     np.testing.assert_array_equal(contexts[2].past["b"], [[2, 3], [3, 4], [4, 5]])

@@ -468,7 +468,7 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
         return module.logits(module.encode(context, returns=returns), actions, positions)
 
     def over_all(module, actions):
-        prefix, tokens, _ = module.encode(context, returns=returns)
+        prefix, tokens = module.encode(context, returns=returns)
         assert prefix is None and len(tokens) == 3 * (past + HORIZON)
         asked = 3 * (past + np.arange(HORIZON)) + 1
         x = tokens.at[asked + 1].add(jnp.tanh(module.action(actions)))
@@ -516,17 +516,6 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
         np.testing.assert_array_equal(each, later[0])
     assert (np.abs(later[0] - now).max() > 1e-4) == (not repeat_state)
 
-    @quick_jit
-    def again(params, context):
-        """As where what was seen is given; without what lies ahead, that is encoded alone."""
-        seen = module.apply(params, context, method="see")
-        return [
-            module.apply(params, context, seen=given, method="encode").tokens
-            for given in (seen, seen._replace(ahead=None))
-        ]
-
-    for tokens in again(params, here):
-        np.testing.assert_allclose(tokens[::2][past:], states(here), rtol=1e-4, atol=1e-5)
     assert differ(pose=(here.observation.pose + 1) % 4).tolist() == [True] + [repeat_state] * 2
     assert differ(goal=(here.observation.goal + 1) % SIDE).all()
     assert differ(grid=here.observation.grid[::-1].copy()).all()

@@ -21,7 +21,6 @@ from leapjax.planners import (
     PlannerConfig,
     ShootingConfig,
     bind,
-    gibbs,
 )
 from leapjax.types import Energy
 from tests.enumerable import (
@@ -218,7 +217,7 @@ def greedy_traces(order, fill="together"):
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(200)])
     config = GibbsConfig(HORIZON, iterations=16, order=order, fill=fill)
     keys = jax.random.split(jax.random.key(1), len(tables))
-    plan = quick_jit(jax.vmap(lambda p, k: gibbs(ENUMERABLE, p, k, NO_TILT, config)))(tables, keys)
+    plan = quick_jit(jax.vmap(lambda p, k: bind(ENUMERABLE, config)(p, k, NO_TILT)))(tables, keys)
     return np.asarray(plan.trace), [joint_probabilities(table) for table in tables]
 
 
@@ -263,7 +262,7 @@ def test_the_most_certain_position_is_filled_first(fill):
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(100)])
     config = GibbsConfig(HORIZON, iterations=HORIZON, fill=fill)
     plan = quick_jit(
-        jax.vmap(lambda params: gibbs(ENUMERABLE, params, jax.random.key(0), NO_TILT, config))
+        jax.vmap(lambda params: bind(ENUMERABLE, config)(params, jax.random.key(0), NO_TILT))
     )
     firsts = set()
     for table, trace in zip(tables, np.asarray(plan(tables).trace), strict=True):
@@ -462,12 +461,6 @@ def test_a_child_differs_from_its_parent_in_one_token_that_is_possible(forbidden
         assert fit_p_value(counts, share) > ACCEPTED
     shifts = ((trace[:, 1:] - trace[:, :-1]) % ACTIONS)[..., 1:][changed[..., 1:]]
     assert fit_p_value(np.bincount(shifts, minlength=ACTIONS), [0, 0.5, 0.5]) > ACCEPTED
-
-
-def test_energies_of_another_shape_are_refused():
-    wrong = COUNTER._replace(conditional=lambda *_: jnp.zeros(5))
-    with pytest.raises(UserError, match=r"energies of shape \(5,\): expected \(1, 5\)"):
-        gibbs(wrong, (), jax.random.key(0), (), GibbsConfig(horizon=1, iterations=1))
 
 
 # Beam search.

@@ -77,7 +77,10 @@ def test_the_future_is_encoded_as_the_present_is(architecture, past):
     _, params, batch = untrained(architecture, past)
     module = network(architecture, past)
     unrolled = jax.tree.map(lambda x: x[1], batch.context)
-    states, actions = module.apply(params, unrolled, method="encode_unrolled")
+    (tokens,) = module.apply(
+        params, jax.tree.map(lambda x: x[1:2], batch.context), method="encode_batch"
+    )
+    states, actions = module.apply(params, unrolled, tokens, method="encode_unrolled")
     shown = past if architecture == "paper" else 0
     assert states.shape[0] == shown + HORIZON and actions.shape == (shown + HORIZON - 1,)
     for place in range(HORIZON):

@@ -5,10 +5,12 @@ import math
 import subprocess
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from experiments.tables import measured
 from leapjax.errors import UserError
+from leapjax.rollouts import Episodes
 from leapjax.running import results
 from tests.programs import ROOT
 
@@ -143,3 +145,32 @@ def test_a_row_is_json_or_refused(tmp_path, field, value):
     with pytest.raises(UserError, match=f"{field} of a new row is not finite"):
         results.record(path, {"hash": "a", field: value})
     assert not path.exists()
+
+
+def test_episodes_are_kept_with_their_rows(tmp_path):
+    def played(*lengths):
+        seeds = np.arange(len(lengths))
+        return Episodes(seeds, seeds > 0, np.array(lengths), seeds / 3, 1, 1.0, 1.0)
+
+    def kept():
+        return {name: each["length"].tolist() for name, each in results.read_episodes(path).items()}
+
+    path = tmp_path / "babyai.jsonl"
+    assert kept() == {}
+    results.record(path, {**ROW, "hash": "a"}, played(3, 4))
+    results.record(path, {**ROW, "hash": "b"}, played(5))
+    assert kept() == {"a": [3, 4], "b": [5]}
+    table = results.read_episodes(path)["a"]
+    assert table["seed"].tolist() == [0, 1] and table["success"].tolist() == [False, True]
+    assert table["return"].tolist() == [0, 1 / 3]
+    results.record(path, {**ROW, "hash": "a"}, played(7))
+    results.record(path, {**ROW, "hash": "b"})  # another outcome, of which no episodes are known
+    assert kept() == {"a": [7]}
+    results.record(path, {**ROW, "hash": "a"})
+    assert kept() == {}
+    archive = tmp_path / "episodes" / "babyai.npz"
+    for damage in (lambda: archive.write_bytes(archive.read_bytes()[:10]),
+                   lambda: np.savez(archive, a=np.zeros(3))):  # fmt: skip
+        damage()
+        with pytest.raises(UserError, match=r"babyai\.npz"):
+            results.record(path, {**ROW, "hash": "c"}, played(1))

@@ -741,31 +741,32 @@ def test_what_goes_wrong_first_is_what_is_told():
         corridor.reset(0)
 
 
-def remembering() -> leap.Energy:
-    """Goes right; says how many of the last two states a context holds encoded."""
+@pytest.mark.parametrize("executed", [1, 2])
+def test_a_cache_is_passed_on_within_an_episode_after_plans_of_one_action(executed, monkeypatch):
+    monkeypatch.setattr(rollouts, "MOST_OPEN", 2)
 
-    def encode(params, context: Context):
-        known = jnp.zeros((2, 1)) if context.encoded is None else context.encoded
-        return context.step, jnp.concatenate([known, jnp.ones((1, 1))])
+    def encode_next(params, context, cache):
+        count = 1 if cache is None else cache["plans"] + 1
+        return None, {"plans": count, "observation": context.observation}
 
     def total(params, memory, actions):
         return jnp.sum(actions != RIGHT).astype(jnp.float32)
 
-    energy = leap.from_total(encode, total, NUM_ACTIONS)
-    return energy._replace(encoded=lambda memory: memory[1])
-
-
-def test_an_episode_that_begins_later_has_no_encoded_states_yet(monkeypatch):
-    monkeypatch.setattr(rollouts, "MOST_OPEN", 2)
-    recorder = Recorder(compiled(remembering()))
-    seeds = [3, 5, 0]  # the second is over first
-    episodes = leap.evaluate(Corridor, seeds, recorder, None, context=2, executed=1)
+    energy = leap.from_total(lambda params, context: None, total, NUM_ACTIONS)
+    config = GibbsConfig(2, iterations=3, order="sequential")
+    recorder = Recorder(leap.compile_planner(energy, config, (1, 4), encode_next=encode_next))
+    seeds = [3, 5, 0]  # the second is over first, and the third begins
+    episodes = leap.evaluate(Corridor, seeds, recorder, None, context=0, executed=executed)
     np.testing.assert_array_equal(episodes.lengths, [GOAL - start(seed) for seed in seeds])
-    assert episodes.plans == episodes.lengths.sum()
-    for contexts in recorder.contexts:  # what was encoded is that of the very episode
-        known = np.minimum(contexts.step, 2)
-        held = 0 if contexts.encoded is None else contexts.encoded.sum(axis=(1, 2))
-        np.testing.assert_array_equal(held, known)
+    for contexts, cache in zip(recorder.contexts, recorder.caches, strict=True):
+        if executed == 2:
+            assert cache is None
+        elif cache is None:
+            np.testing.assert_array_equal(contexts.step, 0)
+        else:
+            np.testing.assert_array_equal(contexts.step, cache["plans"])
+            position = cache["observation"]["position"]
+            np.testing.assert_array_equal(contexts.observation["position"], position + 1)
 
 
 # What episodes share.

@@ -14,6 +14,7 @@ from leapjax.agents.batches import run_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from tests import toy
 from tests.parameters import random_state
@@ -25,7 +26,7 @@ MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0
 TRAINING = TrainingConfig(steps=10, batch=12, run=RUN, windows="step")
 
 
-class StateTokens(nn.Module):
+class StateTokens(Encoder):
     """A token for each state of a context."""
 
     width: int

@@ -1,3 +1,5 @@
+import inspect
+import json
 import math
 
 import numpy as np
@@ -6,13 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from experiments import report
+from experiments.tables.cells import outcomes
+from leapjax import scores
 from leapjax.scores import (
-    SHARED,
     aggregate,
     interquartile_mean,
+    interval_of_episodes,
     interval_over_seeds,
+    variance_components,
     wilson_interval,
 )
+from tests.programs import LONG, ROOT
 
 counts = st.integers(1, 100_000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -55,38 +62,77 @@ def test_one_seed_has_the_interval_of_its_episodes():
 
 
 def test_seeds_that_differ_widen_the_interval():
-    def width(*successes):
-        low, high = interval_over_seeds(successes, [500] * len(successes))
+    def width(*successes, **correlation):
+        low, high = interval_over_seeds(successes, [500] * len(successes), **correlation)
         return high - low
 
-    alike, apart = width(450, 450, 450), width(400, 450, 500)
-    # They play the same levels: three seeds do not say as much as three times the levels would.
-    low, high = wilson_interval(round(450 / SHARED), round(500 / SHARED))
-    assert alike == pytest.approx(high - low, rel=0.05)
-    assert apart > 3 * alike
+    for correlation in (0, 0.6, 1):
+        alike = width(450, 450, 450, correlation=correlation)
+        # Three seeds on the same levels tell less than three times as many levels would.
+        count = 3 * 500 / (1 + 2 * correlation)
+        low, high = wilson_interval(round(0.9 * count), round(count))
+        assert alike == pytest.approx(high - low, rel=0.05)
+        assert width(400, 450, 500, correlation=correlation) > 3 * alike
 
 
-def test_where_episodes_are_many_it_is_the_bootstrap_over_seeds():
-    rates = np.array([0.2, 0.5, 0.9])
-    low, high = interval_over_seeds((rates * 10**9).astype(int), [10**9] * 3)
-    # Three of three seeds are the least, or the best, one time in 27: more often than 2.5%. From
-    # their mean that is further by the root of 3 / 2, for which three seeds vary too little.
-    mean = rates.mean()
-    expected = mean + math.sqrt(3 / 2) * (rates[[0, 2]] - mean)
-    assert (low, high) == pytest.approx(tuple(expected), abs=1e-3)
+def test_where_episodes_are_many_it_is_students_interval_of_the_seeds():
+    rates = np.array([0.52, 0.55, 0.56])
+    found = interval_over_seeds((rates * 10**9).astype(int), [10**9] * 3)
+    expected = stats.t.interval(0.95, 2, rates.mean(), stats.sem(rates))
+    assert found == pytest.approx(expected, abs=5e-3)
 
 
-def test_the_interval_over_seeds_holds_the_truth_as_often_as_it_says():
-    """Of seeds that differ, and fail on the same levels more often than chance has it."""
-    rng = np.random.default_rng(1)
-    held = 0
-    for _ in range(200):
-        hard, alone = rng.normal(size=200), rng.normal(size=(3, 200))
-        needed = stats.norm.ppf(np.clip(rng.normal(0.8, 0.02, 3), 0, 1))
-        solved = np.sqrt(0.6) * hard + np.sqrt(0.4) * alone < needed[:, None]
-        low, high = interval_over_seeds(solved.sum(axis=1), [200] * 3)
-        held += low <= 0.8 <= high
-    assert 185 <= held <= 199
+def test_a_planner_without_failures_may_fail():
+    for seeds in (1, 3):
+        low, high = interval_of_episodes(np.ones((seeds, 200), bool))
+        assert low == pytest.approx(stats.beta.ppf(0.025, 200.5, 0.5), abs=1e-3) and high == 1
+    assert interval_of_episodes(np.zeros((3, 200), bool))[0] == 0
+
+
+def test_variance_components_are_those_of_the_outcomes_drawn():
+    rng = np.random.default_rng(0)
+    seeds, levels, _ = variance_components(draw_outcomes(rng, 400, 2000, 0.7, 0, deviation=0.1))
+    assert seeds == pytest.approx(0.01, rel=0.2) and levels == pytest.approx(0, abs=1e-4)
+    seeds, levels, rest = variance_components(draw_outcomes(rng, 100, 8000, 0.7, 0.6))
+    assert seeds == pytest.approx(0, abs=1e-4) and levels + rest == pytest.approx(0.21, rel=0.02)
+    assert levels / (levels + rest) == pytest.approx(0.6, rel=0.05)
+
+
+def draw_outcomes(rng, seeds, levels, rate, correlation, deviation=0.0):
+    """Outcomes [S, L] of seeds whose rates deviate, correlated on the same level."""
+    common, own = rng.random(levels), rng.random((seeds, levels))
+    shared = rng.random((seeds, levels)) < math.sqrt(correlation)
+    return np.where(shared, common, own) < rng.normal(rate, deviation, (seeds, 1))
+
+
+@pytest.mark.parametrize("correlation", [0, 0.6])
+@pytest.mark.parametrize("rate", [0.5, 0.95])
+@pytest.mark.parametrize("seeds", [1, 3, 5])
+def test_intervals_contain_the_truth_as_often_as_they_say(seeds, rate, correlation, monkeypatch):
+    monkeypatch.setattr(scores, "BOOTSTRAPS", 4000)
+    rng = np.random.default_rng(0)
+    held, count = np.zeros(2), 4000 if LONG else 400
+    for _ in range(count):
+        solved = draw_outcomes(rng, seeds, 200, rate, correlation)
+        counts = solved.sum(axis=1), [200] * seeds
+        found = interval_of_episodes(solved), interval_over_seeds(*counts, 0.95, correlation)
+        held += [low <= rate <= high for low, high in found]
+    assert (0.92 * count <= held).all() and (held <= 0.98 * count).all()
+
+
+def test_the_default_correlation_is_that_of_the_recorded_episodes():
+    """Pooled over the settings of BabyAI that have several seeds."""
+    rows = report.rows_of(ROOT, "babyai")
+    by_setting = {}
+    for row in rows:
+        setting = {**row["configuration"], "seed": None}
+        by_setting.setdefault(json.dumps(setting, sort_keys=True), []).append(row)
+    found = [outcomes(of) for of in by_setting.values() if len(of) > 1]
+    matrices = [each for each in found if isinstance(each, np.ndarray)]
+    assert len(matrices) > 50
+    _, levels, rest = np.sum([variance_components(each) for each in matrices], axis=0)
+    default = inspect.signature(interval_over_seeds).parameters["correlation"].default
+    assert levels / (levels + rest) == pytest.approx(default, abs=0.05)
 
 
 COUNTS = [(0, 0), (-1, 5), (6, 5), *((each, 5) for each in NO_COUNTS)]
@@ -108,7 +154,15 @@ SEEDS = [
             for level in (0, 1, 95, math.nan, "0.9")
         ),
         (lambda: aggregate([([1], [2])], None), "level must be"),
-        (lambda: aggregate([]), "no levels"),
+        (lambda: aggregate([]), "no tasks"),
+        *(
+            (lambda x=solved: interval_of_episodes(x), "outcomes must be an array")
+            for solved in (np.ones(3, bool), np.ones((2, 3)), np.ones((2, 0), bool), 1)
+        ),
+        *(
+            (lambda x=each: interval_over_seeds([1], [2], correlation=x), "correlation must be")
+            for each in (-0.1, 1.1, math.nan, "1")
+        ),
         (lambda: aggregate([([1], [1]), ([2], [1])]), "successes of"),
     ],
 )
@@ -130,10 +184,11 @@ def test_an_aggregate_is_stratified_by_level():
     middle, (low, high) = aggregate(levels)
     assert middle == pytest.approx((0.55 + 0.8) / 2)  # the best and the worst do not count
     assert low < middle < high
-    # Of many episodes only the seeds of the first level are left to differ.
+    # With many episodes only the seeds of the first level differ.
     certain = [([g * 10**7 for g in good], [c * 10**7 for c in of]) for good, of in levels]
-    far = 0.05 * math.sqrt(2)
-    expected = [(0.55 - far + 0.8) / 2, (0.55 + far + 0.8) / 2]
-    assert aggregate(certain)[1] == pytest.approx(expected, abs=1e-3)
+    low, high = interval_over_seeds(*certain[0])
+    assert aggregate(certain)[1] == pytest.approx(((low + 0.8) / 2, (0.9 + 0.8) / 2), abs=0.01)
     one = aggregate([([190], [200])])
     assert one == (0.95, interval_over_seeds([190], [200]))
+    solved = np.arange(200)[None] < 190
+    assert aggregate([solved]) == (0.95, interval_of_episodes(solved))

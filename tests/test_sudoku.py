@@ -147,7 +147,8 @@ def test_a_position_of_a_plan_is_the_cell_that_it_fills():
         )
 
     params = random_like(jax.eval_shape(module.init, jax.random.key(0), context(0)))
-    places = jax.jit(functools.partial(module.apply, params, horizon=cells, method="places"))
+    encode = functools.partial(module.apply, horizon=cells, method="encode_positions")
+    places = jax.jit(functools.partial(encode, params))
     tokens = module.apply(params, context(0))
     assert tokens.shape == (cells + 1, 8)
     whole = np.asarray(places(context(0)))

@@ -549,40 +549,9 @@ def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
     assert_same_step(actual, expected)
 
 
-@pytest.mark.parametrize("microbatch", [0, 2, 3])
-def test_what_is_prepared_for_all_examples_has_its_part_in_the_gradient(microbatch):
-    def prepare(params, extra, examples):
-        seen = jnp.tanh(extra * params["first"] * examples)
-        return seen, jnp.sin(params["both"]).repeat(len(examples))
-
-    def loss(params, extra, example, key, seen, both):
-        noise = jax.random.uniform(key)
-        value = jnp.sum((params["second"] + noise) * seen) * both + extra * params["both"]
-        return value, {"seen": seen.sum()}
-
-    def alone(params, extra, example, key):
-        prepared = prepare(params, extra, example[None])
-        return loss(params, extra, example, key, *(each[0] for each in prepared))
-
-    params = {"first": jnp.arange(1.0, 4), "second": jnp.array(0.5), "both": jnp.array(0.7)}
-    batch = jax.random.normal(jax.random.key(1), (6, 3))
-    optimizer = optax.trace(0.0)  # which remembers the gradient
-    state = TrainState(params, optimizer.init(params), jnp.int32(0), jnp.array(2.0))
-
-    def gradient(example_loss, **options):
-        update = jax.jit(learning.make_update(example_loss, optimizer, **options))
-        state_after, metrics = update(state, batch, jax.random.key(2))
-        return state_after.optimizer.trace, metrics
-
-    expected = gradient(alone)
-    assert all(jnp.abs(leaf).min() > 1e-3 for leaf in jax.tree.leaves(expected[0]))
-    actual = gradient(loss, microbatch=microbatch, prepare=prepare)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), actual, expected)
-
-
 @only_long
 @pytest.mark.parametrize("repeat_state", [True, False])
-def test_what_the_papers_network_sees_is_prepared_for_all(repeat_state, local_demonstrations):
+def test_a_step_of_the_papers_network_in_parts_is_that_of_all(repeat_state, local_demonstrations):
     data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
     settings = leap.Settings(masking="each", repeat_state=repeat_state)
     model, key = dataclasses.replace(MODEL, architecture="paper"), jax.random.key(0)
@@ -656,10 +625,10 @@ def average_agent(mesh) -> Agent:
     """Least squares against half of its own slow average."""
     optimizer = optax.sgd(RATE, MOMENTUM)
 
-    def loss(params, extra, example, key):
-        inputs, targets = example
+    def loss(params, extra, batch, keys):
+        inputs, targets = batch
         wanted = targets + 0.5 * inputs @ extra["average"]
-        return 0.5 * jnp.sum((inputs @ params["w"] - wanted) ** 2), {}
+        return 0.5 * jnp.sum((inputs @ params["w"] - wanted) ** 2, axis=1).mean(), {}
 
     def next_extra(extra, params):
         average = KEPT * extra["average"] + (1 - KEPT) * params["w"]

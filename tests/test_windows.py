@@ -372,10 +372,9 @@ def test_the_recent_part_of_a_context_is_its_end(length):
     context = Context(
         observation=np.int32(9), past=np.arange(3), actions=np.array([4, 5, 6]),
         rewards=np.array([0.1, 0.2, 0.3]), step=np.int32(3), return_so_far=np.float32(0.6),
-        encoded=np.ones((3, 2)),
     )  # fmt: skip
     found = windows.recent(context, length)
     assert found.past.tolist() == [0, 1, 2][3 - length :]
     assert found.actions.tolist() == [4, 5, 6][3 - length :]
     assert found.rewards.tolist() == [0.1, 0.2, 0.3][3 - length :]
-    assert found.encoded is None and (found.observation, found.step) == (9, 3)
+    assert (found.observation, found.step) == (9, 3)

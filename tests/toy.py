@@ -7,6 +7,7 @@ import numpy as np
 
 from leapjax import training
 from leapjax.domain import Domain
+from leapjax.models.encoder import Encoder
 from leapjax.types import Demonstration
 from tests.quick import quick_jit
 
@@ -14,7 +15,7 @@ LEFT, RIGHT, WAIT, END = range(4)
 FARTHEST = 5
 
 
-class Token(nn.Module):
+class Token(Encoder):
     """The current state as the only token of a context."""
 
     width: int

@@ -295,8 +295,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
             "versions": work.versions,
             **said,
         }
-        results.write_episodes(results.episodes_path(work.rows, name), episodes)
-        results.record(work.rows, row)
+        results.record(work.rows, row, episodes)
         rows[name] = row
     for name, way in ways.items():
         before = "" if name in missing else ", recorded already"

@@ -1,53 +1,45 @@
 """The Atari tables: scores, the data, energies against rewards, the price of a decision."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from experiments.atari import data_name, game_of
-from experiments.tables.cells import table
-from experiments.tables.settings import Setting, of_setting
+from experiments.tables.cells import Columns, listed, table
+from experiments.tables.settings import Setting, select
 from leapjax import scores
 from leapjax.domains.atari.domain import LONGEST
 from leapjax.domains.atari.encoders import STACK
-from leapjax.domains.atari.games import GAMES, Game
+from leapjax.domains.atari.games import GAMES
 from leapjax.presets.atari import PAPER_TRANSITIONS
 from leapjax.running.results import Row
 
 COLUMNS = {
-    "LEAP": Setting("LEAP", "leapjax"),
-    "LEAP without return": Setting(
-        "LEAP", "leapjax", changes={"method_settings": {"returns": False}}
-    ),
-    "BC": Setting("BC", "leapjax", "bc"),
-    "DT": Setting("DT", "leapjax", "dt"),
-    "CQL": Setting("CQL", "leapjax", "cql"),
-    "QR-DQN": Setting("QR-DQN", "leapjax", "qr_dqn"),
-    "REM": Setting("REM", "leapjax", "rem"),
-    "random": Setting("random", "leapjax", "random"),
+    "LEAP": Setting("leapjax"),
+    "LEAP without return": Setting("leapjax", changes={"method_settings": {"returns": False}}),
+    "BC": Setting("leapjax", "bc"),
+    "DT": Setting("leapjax", "dt"),
+    "CQL": Setting("leapjax", "cql"),
+    "QR-DQN": Setting("leapjax", "qr_dqn"),
+    "REM": Setting("leapjax", "rem"),
+    "random": Setting("leapjax", "random"),
 }
 # At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
 RUNS = {"training": {"run": 16}, "domain_settings": {"max_steps": LONGEST}}
 LARGE = {
-    "LEAP": Setting("LEAP", "paper", changes=RUNS),
+    "LEAP": Setting("paper", changes=RUNS),
     "LEAP without return": Setting(
-        "LEAP", "paper", changes={**RUNS, "method_settings": {"returns": False}}
+        "paper", changes={**RUNS, "method_settings": {"returns": False}}
     ),
 }
-COLD = {
-    title: dataclasses.replace(
-        setting, changes={**setting.changes, "planner": {"temperature": 0.1}}
-    )
-    for title, setting in LARGE.items()
-}
+COLD = {title: setting.searching(temperature=0.1) for title, setting in LARGE.items()}
+USED = (*COLUMNS.values(), *LARGE.values(), *COLD.values())
 
 
 def uses(row: Row) -> bool:
     """Whether a row is in a table."""
-    settings = (*COLUMNS.values(), *LARGE.values(), *COLD.values())
-    return any(setting.has(row) for setting in settings)
+    return any(setting.has(row) for setting in USED)
 
 
 def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
@@ -58,7 +50,6 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     columns = [*COLUMNS, "the data"]
     lines = []
     for name, game in GAMES.items():
-        ours = [row for row in rows if row["level"] == name]
         theirs = {"LEAP without return": game.paper_without_return} | {
             title: game.paper[setting.method]
             for title, setting in COLUMNS.items()
@@ -68,9 +59,9 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         few = data.get(name, ())
         many = data.get(data_name(name, PAPER_TRANSITIONS), ())
         found = {"paper": papers}
-        found["ours"], found["score"] = _scores(ours, game, COLUMNS, few)
-        found["ours, preset `paper`"], found["its score"] = _scores(ours, game, LARGE, many)
-        found["the same, temperature 0.1"], found["that score"] = _scores(ours, game, COLD, many)
+        found["ours"], found["score"] = _scores(rows, name, COLUMNS, few)
+        found["ours, preset `paper`"], found["its score"] = _scores(rows, name, LARGE, many)
+        found["the same, temperature 0.1"], found["that score"] = _scores(rows, name, COLD, many)
         for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
@@ -79,13 +70,14 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
 
 def _scores(
     rows: Sequence[Row],
-    game: Game,
+    level: str,
     settings: Mapping[str, Setting],
     games: Sequence[Mapping[str, Any]],
 ) -> tuple[dict[str, str], dict[str, str]]:
     """By column: normalised scores, and as they are, of settings and of the games learned from."""
-    of = {title: of_setting(rows, setting) for title, setting in settings.items()}
-    cells = {title: _mean_score(found) for title, found in of.items() if found}
+    found = select(rows, [level], settings)
+    cells = {title: _mean_score(of) for (_, title), of in found.items() if of}
+    game = GAMES[level]
     scale = game.human - game.random
     normal = {
         title: _with_error(game.normalised(mean), error and 100 * error / scale)
@@ -170,13 +162,23 @@ def encoding(row: Row) -> list[str]:
 
 def decisions(rows: Sequence[Row]) -> str:
     """What decisions are made of in games that are played together, in milliseconds."""
-    lines = []
-    for row in rows:
-        parts = ("planning", "encoding", "anew", "playing")
-        spent = [row[f"{part}_seconds"] for part in parts]
-        rate = row["batch"] / (row["planning_seconds"] + row["playing_seconds"])
-        cells = [f"{1e3 * seconds:.1f}" for seconds in spent]
-        cells = [f"`{row['preset']}`", str(row["batch"]), *cells, f"{rate:,.0f}", *encoding(row)]
-        lines.append(cells)
-    header = "preset | games | planner | of it encoder | past encoded anew | emulator | decisions/s"
-    return table(f"{header} | states encoded/s | encoder GFLOP/s | of the peak", lines)
+
+    def milliseconds(part: str) -> Callable[[Row], str]:
+        return lambda row: f"{1e3 * row[f'{part}_seconds']:.1f}"
+
+    def rate(row: Row) -> str:
+        return f"{row['batch'] / (row['planning_seconds'] + row['playing_seconds']):,.0f}"
+
+    columns: Columns = {
+        "preset": "`{preset}`",
+        "games": "{batch}",
+        "planner": milliseconds("planning"),
+        "of it encoder": milliseconds("encoding"),
+        "past encoded anew": milliseconds("anew"),
+        "emulator": milliseconds("playing"),
+        "decisions/s": rate,
+        "states encoded/s": lambda row: encoding(row)[0],
+        "encoder GFLOP/s": lambda row: encoding(row)[1],
+        "of the peak": lambda row: encoding(row)[2],
+    }
+    return listed(rows, columns)

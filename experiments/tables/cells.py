@@ -1,22 +1,36 @@
 """What tables are made of: rates with their intervals, means, Markdown."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
 
 from leapjax import scores
 from leapjax.running.results import Row
+
+Columns = Mapping[str, str | Callable[[Row], str]]
 
 
 def rate(rows: Sequence[Row]) -> str:
     """Mean success of some rows, one for each seed, with its interval and how many there are."""
     if not rows:
         return "-"
-    successes = [row["successes"] for row in rows]
-    episodes = [row["episodes"] for row in rows]
-    low, high = scores.interval_over_seeds(successes, episodes)
+    _, (low, high) = scores.aggregate([outcomes(rows)])
     said = with_interval(mean_rate(rows), 100 * low, 100 * high)
     if rows[0]["method"] == "rules":  # nothing was trained
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
+
+
+def outcomes(rows: Sequence[Row]) -> scores.Outcomes:
+    """Returns the outcomes of some rows, one for each seed: of every episode if all are recorded.
+
+    They must be of the same levels, too; otherwise only the counts are used.
+    """
+    recorded = [row["recorded"] for row in rows if row.get("recorded") is not None]
+    levels = {each["seed"].tobytes() for each in recorded}
+    if len(recorded) == len(rows) and len(levels) == 1:
+        return np.stack([each["success"] for each in recorded])
+    return [row["successes"] for row in rows], [row["episodes"] for row in rows]
 
 
 def with_interval(mean: float, low: float, high: float) -> str:
@@ -54,6 +68,20 @@ def minutes(rows: Sequence[Row]) -> str:
     seconds = sum(row[kind] for row in rows for kind in kinds)
     gpu = any("NVIDIA" in row["versions"]["machine"] for row in rows)
     return f"{seconds / len(rows) / 60:.1f}{'*' if gpu else ''}"
+
+
+def listed(rows: Sequence[Row], columns: Columns) -> str:
+    """A table in Markdown with a line for each row.
+
+    Args:
+        rows: in order.
+        columns: by title, a cell: a format of the row's fields, or a function of the row.
+    """
+    lines = [
+        [cell.format(**row) if isinstance(cell, str) else cell(row) for cell in columns.values()]
+        for row in rows
+    ]
+    return table(" | ".join(columns), lines)
 
 
 def table(header: str, lines: Sequence[Sequence[str]]) -> str:

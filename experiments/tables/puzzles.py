@@ -1,28 +1,28 @@
 """The tables of stars and Sudoku, whose plans are executed whole: every way to search."""
 
-import dataclasses
 from collections.abc import Sequence
 
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from experiments.tables.cells import rate, table
-from experiments.tables.settings import Setting, of_setting
+from experiments.tables.settings import Setting, select
 from leapjax.presets import find_preset
 from leapjax.running.results import Row
 
 LEARNED = ", learned"
 MINIMISED = {
-    LEARNED: Setting("learned", "leapjax"),
-    ", rules": Setting("rules", "leapjax", "rules"),
-    ", learned and rules": Setting("both", "leapjax", changes={"rules": 1.0}),
+    LEARNED: Setting("leapjax"),
+    ", rules": Setting("leapjax", "rules"),
+    ", learned and rules": Setting("leapjax", changes={"rules": 1.0}),
 }
-ONE_ACTION = tuple(Setting(method, "leapjax", method) for method in ("bc", "dt"))
+ONE_ACTION = {(f"`--method {name}`", "T"): Setting("leapjax", name) for name in ("bc", "dt")}
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
 
 
 def uses(row: Row) -> bool:
     """Whether a row is in a table."""
-    searched = any(of for each in rows_by_search([row]).values() for _, _, of in each)
-    return searched or any(of for _, _, of in rows_by_arms([row]))
+    return bool(rows_by_search([row])) or any(
+        of for _, by_count in rows_by_arms([row]) for of in by_count
+    )
 
 
 def searches(rows: Sequence[Row]) -> str:
@@ -41,19 +41,18 @@ def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[R
     Each has the same ways to search, whether there are rows or not.
     """
     found = {}
-    for domain, level in {(row["domain"], row["level"]): None for row in rows}:
-        mine = [row for row in rows if (row["domain"], row["level"]) == (domain, level)]
+    for domain, level in dict.fromkeys((row["domain"], row["level"]) for row in rows):
         horizon = find_preset(domain, level, "leap", "leapjax").planner.horizon
         for suffix, setting in MINIMISED.items():
-            ways: list[tuple[str, str, list[Row]]] = []
-            for search in (*SEARCHES, BEST_OF_MANY):
-                of = of_setting(mine, setting, **search.of(horizon))
-                ways.append((search.name, search.cost, of))
-            for one in ONE_ACTION:
-                of = of_setting(mine, one) if suffix == LEARNED else []
-                ways.append((f"`--method {one.method}`", "T", of))
-            if any(of for _, _, of in ways):
-                found[f"{level}{suffix}"] = ways
+            settings = {
+                (search.name, search.cost): setting.searching(**search.of(horizon))
+                for search in (*SEARCHES, BEST_OF_MANY)
+            }
+            # Methods of one action stand beside what was learned alone.
+            beside = rows if suffix == LEARNED else []
+            ways = select(rows, [level], settings) | select(beside, [level], ONE_ACTION)
+            if any(ways.values()):
+                found[f"{level}{suffix}"] = [(*way, of) for (_, way), of in ways.items()]
     return found
 
 
@@ -71,27 +70,26 @@ def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]
 
 def arms(rows: Sequence[Row]) -> str:
     """Success on star graphs of other numbers of arms than were learned."""
-    by_search: dict[str, list[list[Row]]] = {}
-    for name, _, of in rows_by_arms(rows):
-        by_search.setdefault(name, []).append(of)
     lines = [
-        [name, *(rate(of) for of in each)]
-        for name, each in by_search.items()
-        if sum(map(bool, each)) > 1
+        [name, *map(rate, by_count)]
+        for name, by_count in rows_by_arms(rows)
+        if sum(map(bool, by_count)) > 1
     ]
     return table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
 
 
-def rows_by_arms(rows: Sequence[Row]) -> list[tuple[str, int, list[Row]]]:
-    """Of what has learned graphs of three arms: the search, arms that it was played on, rows."""
-    trained = [row for row in rows if row["level"] == ARMS_LEVEL]
+def rows_by_arms(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
+    """By search: rows of what learned graphs of three arms, for each of `ARMS` it was played on."""
     horizon = find_preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
+    levels = [f"Star{count}x{horizon}" for count in ARMS]
     found = []
     for search in SEARCHES:
-        for count in ARMS:
-            level = f"Star{count}x{horizon}"
-            play = {} if level == ARMS_LEVEL else {"play": level}
-            setting = dataclasses.replace(MINIMISED[LEARNED], changes=play)
-            of = of_setting(trained, setting, **search.of(horizon))
-            found.append((f"{search.name}, {search.cost}", count, of))
+        settings = {
+            level: Setting(
+                "leapjax", changes={} if level == ARMS_LEVEL else {"play": level}
+            ).searching(**search.of(horizon))
+            for level in levels
+        }
+        of = select(rows, [ARMS_LEVEL], settings).values()
+        found.append((f"{search.name}, {search.cost}", list(of)))
     return found

@@ -2,47 +2,35 @@
 
 from collections.abc import Sequence
 
-from experiments.tables.cells import table
+from experiments.tables.cells import Columns, listed, table
 from leapjax.running.results import Row
 
 
 def speed(rows: Sequence[Row]) -> str:
     """Plans per second at batch 256 and alone."""
-    lines = []
-    for row in rows:
-        if row["batch"] != 256:
-            continue
-        same = ("preset", "horizon", "iterations")
-        alone = [r for r in rows if r["batch"] == 1 and all(r[key] == row[key] for key in same)]
-        lines.append(
-            [
-                f"T = {row['horizon']}, N = {row['iterations']}",
-                f"`{row['preset']}`",
-                f"{row['plans_per_second']:,.0f}",
-                f"{row['fraction_of_peak']:.0%}",
-                f"{1e3 * alone[0]['seconds']:.1f} ms" if alone else "-",
-            ]
-        )
-    header = "plan | preset | plans per second | of the matrix-multiply peak | one alone"
-    return table(header, lines)
+
+    def plan(row: Row) -> tuple:
+        return row["preset"], row["horizon"], row["iterations"]
+
+    alone = {plan(row): f"{1e3 * row['seconds']:.1f} ms" for row in rows if row["batch"] == 1}
+    columns: Columns = {
+        "plan": "T = {horizon}, N = {iterations}",
+        "preset": "`{preset}`",
+        "plans per second": "{plans_per_second:,.0f}",
+        "of the matrix-multiply peak": "{fraction_of_peak:.0%}",
+        "one alone": lambda row: alone.get(plan(row), "-"),
+    }
+    return listed([row for row in rows if row["batch"] == 256], columns)
 
 
 def planning(rows: Sequence[Row]) -> str:
     """Every measurement of planning."""
-    lines = [
-        [
-            f"`{row['preset']}`",
-            f"{row['horizon']}, {row['iterations']}",
-            str(row["batch"]),
-            f"{row['plans_per_second']:,.0f}",
-            f"{row['gflops']:.0f}",
-            f"{row['peak_gflops']:.0f}",
-            f"{row['fraction_of_peak']:.0%}",
-        ]
-        for row in rows
-        if row["batch"] in (1, 16, 256, 1024)
-    ]
-    return table("preset | T, N | batch | plans/s | GFLOP/s | peak | fraction", lines)
+    columns: Columns = {
+        "preset": "`{preset}`", "T, N": "{horizon}, {iterations}", "batch": "{batch}",
+        "plans/s": "{plans_per_second:,.0f}", "GFLOP/s": "{gflops:.0f}",
+        "peak": "{peak_gflops:.0f}", "fraction": "{fraction_of_peak:.0%}",
+    }  # fmt: skip
+    return listed([row for row in rows if row["batch"] in (1, 16, 256, 1024)], columns)
 
 
 def quality(rows: Sequence[Row]) -> str:
@@ -52,45 +40,39 @@ def quality(rows: Sequence[Row]) -> str:
         rate, milliseconds = row["successes"] / row["episodes"], 1e3 / row["plans_per_second"]
         return f"{rate:.1%}, {row['mean_length']:.1f}, {milliseconds:.2f}"
 
-    planners = list(dict.fromkeys((row["level"], row["preset"]) for row in rows))
-    found = {(row["level"], row["preset"], row["variant"]): cell(row) for row in rows}
-    titles = [f"{level}, `{preset}`" for level, preset in planners]
-    lines = [
-        [variant, *(found.get((*planner, variant), "-") for planner in planners)]
-        for variant in dict.fromkeys(row["variant"] for row in rows)
-    ]
-    return table(" | ".join(["search", *titles]), lines)
+    found = {(row["variant"], f"{row['level']}, `{row['preset']}`"): cell(row) for row in rows}
+    variants, planners = (dict.fromkeys(key[i] for key in found) for i in (0, 1))
+    lines = [[name, *(found.get((name, of), "-") for of in planners)] for name in variants]
+    return table(" | ".join(["search", *planners]), lines)
 
 
 def training(rows: Sequence[Row]) -> str:
     """Every measurement of training."""
-    lines = [
-        [
-            row["level"],
-            f"`{row['preset']}`" + (f", `--run {row['run']}`" if row["run"] > 1 else ""),
-            f"{1e3 / row['steps_per_second']:.0f}",
-            f"{row['flops_per_step'] / 1e9:.1f}",
-            f"{row['gflops']:.0f}",
-            f"{row['fraction_of_peak']:.0%}",
-            f"{row['training_seconds']:,.0f} s for {row['steps']:,} steps",
-        ]
-        for row in rows
-    ]
-    header = "level | preset | ms/step | GFLOP/step | GFLOP/s | of the peak | a run"
-    return table(header, lines)
+    columns: Columns = {
+        "level": "{level}",
+        "preset": lambda row: (
+            f"`{row['preset']}`" + (f", `--run {row['run']}`" if row["run"] > 1 else "")
+        ),
+        "ms/step": lambda row: f"{1e3 / row['steps_per_second']:.0f}",
+        "GFLOP/step": lambda row: f"{row['flops_per_step'] / 1e9:.1f}",
+        "GFLOP/s": "{gflops:.0f}",
+        "of the peak": "{fraction_of_peak:.0%}",
+        "a run": "{training_seconds:,.0f} s for {steps:,} steps",
+    }
+    return listed(rows, columns)
 
 
 def parts(rows: Sequence[Row]) -> str:
     """Where the time of a step goes, of every measurement of training."""
-    lines = []
-    for row in rows:
-        step = 1e3 / row["steps_per_second"]
-        found = [f"{part['ms']:.1f}" for part in row["parts"]]
-        rates = [
-            f" ({part['gflop'] / part['ms'] * 1e3:.0f})" if part["gflop"] else ""
-            for part in row["parts"]
-        ]
-        cells = [ms + rate for ms, rate in zip(found, rates, strict=True)]
-        lines.append([row["level"], f"`{row['preset']}`", f"{step:.1f}", *cells])
+
+    def cell(part: Row) -> str:
+        rate = f" ({part['gflop'] / part['ms'] * 1e3:.0f})" if part["gflop"] else ""
+        return f"{part['ms']:.1f}{rate}"
+
+    lines = [
+        [row["level"], f"`{row['preset']}`", f"{1e3 / row['steps_per_second']:.1f}",
+         *map(cell, row["parts"])]
+        for row in rows
+    ]  # fmt: skip
     names = [part["part"] for part in rows[0]["parts"]] if rows else []
     return table(" | ".join(["level", "preset", "step", *names]), lines)

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.learning import Method, Setup
-from leapjax.agents.q_learning import look_around, seen_around
+from leapjax.agents.q_learning import encode_around, look_around
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.models.policy import Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -48,8 +48,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     module = setup.policy(("q", choices), ("behaviour", choices))
     optimizer = learning.make_optimizer(setup.training)
 
-    def say(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context)
+    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, tokens=tokens)
 
     def likely(said: Said) -> jax.Array:
         return likely_values(said, settings.threshold)
@@ -58,12 +58,12 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         params: Params,
         target: PyTree,
         transition: TransitionWindow,
+        tokens: PyTree,
         key: jax.Array,
-        *seen: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
-        now, later, held = look_around(module, params, target, context, key, *seen)
+        now, later, held = look_around(module, params, target, context, tokens, key)
         # Chosen by the one network and valued by the other, as in double Q-learning.
         best = jnp.argmax(likely(later), axis=1)
         values = losses.of_action(held["q"], best)  # [P]
@@ -79,12 +79,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     init = learning.make_init(
         setup, module, learning.say_all, optimizer, target=lambda params: params
     )
-    update = learning.make_update(
-        transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch, setup.seen_at_once(seen_around(module)),
-    )  # fmt: skip
+    mean_loss = learning.average_loss(setup, transition_loss, encode_around(module))
+    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
     energy = learning.acting_energy(setup, say, likely)
-    return Agent(init, transition_batches(setup), update, energy)
+    encode_next = learning.make_encode_next(setup, module, say)
+    return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
 def likely_values(said: Said, threshold: float) -> jax.Array:

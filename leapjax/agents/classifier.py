@@ -41,19 +41,18 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = classifier(learning.context_encoder(encode, setup), degree, sizes.num_actions)
 
     def window_loss(
-        params: Params, extra: PyTree, window: Window, key: jax.Array
+        params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Squared error of the degree of corruption of one corrupted window."""
         del extra
         corrupted, target = corrupt(key, window.actions, window.imitated, sizes.num_actions)
-        memory = module.apply(params, window.context, method="encode")
+        memory = module.apply(params, window.context, tokens, method="encode")
         found = module.apply(params, memory, corrupted, method="degree")
         assert isinstance(found, jax.Array)
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
-    update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch
-    )
+    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
+    update = learning.make_update(mean_loss, optimizer, mesh)
     init = learning.make_init(setup, module, _encode_and_judge, optimizer)
     return Agent(init, window_batches(setup), update, energy)
 

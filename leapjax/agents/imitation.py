@@ -30,21 +30,17 @@ def make_imitator(
     wanted = wanted or nothing_wanted
     optimizer = learning.make_optimizer(setup.training)
 
-    def say(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, returns=wanted(context))
+    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, returns=wanted(context), tokens=tokens)
 
     def window_loss(
-        params: Params,
-        extra: PyTree,
-        window: Window,
-        key: jax.Array,
-        tokens: jax.Array | None = None,
+        params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions of one context and of the one that followed."""
         del extra
         said: Any = module.apply(
             params, window.context, deterministic=False, rngs={"dropout": key},
-            returns=wanted(window.context, window.return_to_go), seen=tokens,
+            returns=wanted(window.context, window.return_to_go), tokens=tokens,
         )  # fmt: skip
         logits = said["logits"]  # [P, A - 1]
         taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)
@@ -55,10 +51,9 @@ def make_imitator(
         del actions
         return module(context, returns=wanted(context))["logits"]
 
-    update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch,
-        prepare=setup.seen_at_once(learning.sees(module)),
-    )  # fmt: skip
+    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
+    update = learning.make_update(mean_loss, optimizer, mesh)
     init = learning.make_init(setup, module, touch, optimizer)
     energy = learning.acting_energy(setup, say)
-    return Agent(init, window_batches(setup), update, energy)
+    encode_next = learning.make_encode_next(setup, module, say)
+    return Agent(init, window_batches(setup), update, energy, encode_next)

@@ -62,20 +62,27 @@ class Networks(nn.Module):
         return self.policy(context), self.critic(context)
 
     def act(
-        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+        self, context: Context, tokens: jax.Array | None = None, deterministic: bool = True
     ) -> Said:
-        """What the policy says of a context."""
-        return self.policy(context, deterministic, seen=seen)
+        """What the policy says of a context, given its tokens or not."""
+        return self.policy(context, deterministic, tokens=tokens)
 
     def judge(
-        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+        self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
     ) -> tuple[Said, Said]:
         """What the critic says before and after the step of a transition."""
-        return self.critic.transition(context, deterministic, seen)
+        return self.critic.transition(context, tokens, deterministic)
 
-    def see_all(self, earlier: Context, contexts: Context) -> tuple[jax.Array, jax.Array]:
-        """What the policy sees before the step of B transitions, and the critic around it."""
-        return self.policy.see_all(earlier), self.critic.see_all(contexts)
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """Returns the policy's tokens of a context, given those of its past states."""
+        return self.policy.encode_next(context, known)
+
+    def encode_transitions(
+        self, contexts: Context
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Returns the policy's tokens before the steps of transitions, the critic's around them."""
+        earlier = jax.vmap(windows.before)(contexts)
+        return self.policy.encode_batch(earlier), self.critic.encode_transitions(contexts)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
@@ -85,34 +92,32 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     module = Networks(setup.policy(("logits", choices)), critic)
     optimizer = learning.make_optimizer(setup.training)
 
-    def say(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, method="act")
+    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, tokens, method="act")
 
-    def see(
-        params: Params, target: Params, examples: TransitionWindow
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """What policy and critic see of each state, and the target of those before the step."""
-        earlier = jax.vmap(windows.before)(examples.context)
-        mine: Any = module.apply(params, earlier, examples.context, method="see_all")
-        held: Any = critic.apply(target, earlier, method="see_all")
-        return (*mine, held)
+    def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
+        """Tokens of policy and critic, and those of the target network before the steps."""
+        earlier = jax.vmap(windows.before)(batch.context)
+        return (
+            module.apply(params, batch.context, method="encode_transitions"),
+            critic.apply(target, earlier, method="encode_batch"),
+        )
 
     def transition_loss(
         params: Params,
         target: PyTree,
         transition: TransitionWindow,
+        tokens: PyTree,
         key: jax.Array,
-        policy_tokens: jax.Array | None = None,
-        critic_tokens: jax.Array | None = None,
-        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
         context = transition.context
         earlier = windows.before(context)
+        (seen, around), before = tokens
         options: Any = {"deterministic": False, "rngs": {"dropout": key}}
-        policy: Any = module.apply(params, earlier, method="act", seen=policy_tokens, **options)
-        judged: Any = module.apply(params, context, method="judge", seen=critic_tokens, **options)
-        held: Any = critic.apply(target, earlier, seen=target_tokens)
+        policy: Any = module.apply(params, earlier, seen, method="act", **options)
+        judged: Any = module.apply(params, context, around, method="judge", **options)
+        held: Any = critic.apply(target, earlier, tokens=before)
         now, later = judged
         taken, known = losses.last_actions(context, len(held["value"]), choices)
         least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))
@@ -129,12 +134,13 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         }
 
     init = learning.make_init(setup, module, learning.say_all, optimizer, target=_critic)
+    mean_loss = learning.average_loss(setup, transition_loss, encode)
     update = learning.make_update(
-        transition_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic),
-        setup.training.microbatch, setup.seen_at_once(see),
-    )  # fmt: skip
+        mean_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic)
+    )
     energy = learning.acting_energy(setup, say)
-    return Agent(init, transition_batches(setup), update, energy)
+    encode_next = learning.make_encode_next(setup, module, say)
+    return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
 def loss(

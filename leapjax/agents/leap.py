@@ -1,7 +1,6 @@
 """LEAP: train a masked language model on demonstrations, plan by Gibbs sampling."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,9 @@ from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
+from leapjax.errors import UserError
 from leapjax.models import trajectory
-from leapjax.models.trajectory import Model, Seen
+from leapjax.models.trajectory import Model
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
 
@@ -67,8 +67,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def allowed(logits: jax.Array) -> jax.Array:
         return logits if setup.settings.end else logits.at[:, last].set(-jnp.inf)
 
-    def encode(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, returns=to_go(context), method="encode")
+    def encode(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, returns=to_go(context), tokens=tokens, method="encode")
 
     def logits(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
@@ -78,27 +78,18 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return allowed(result)
 
     energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
-    energy = learning.keeping(energy, setup, lambda memory: memory.states)
 
     def window_loss(
-        params: Params,
-        extra: PyTree,
-        window: Window,
-        key: jax.Array,
-        seen: Seen | None = None,
+        params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Masked cross-entropy of one window (paper, equation 1), and its accuracy.
-
-        `seen` is what the paper's network sees in it, if that is known.
-        """
+        """Masked cross-entropy of one window (paper, equation 1), and its accuracy."""
         del extra
-        given: Any = {} if seen is None else {"seen": seen}
         mask_key, encode_key, *_ = keys = jax.random.split(key, 2 + sizes.horizon)
         masks = schedules.sample_masks(mask_key, sizes.horizon, masking)  # [C, T]
         memory = module.apply(
             params, window.context, deterministic=False, method="encode",
             rngs={"dropout": encode_key}, returns=to_go(window.context, window.return_to_go),
-            **given,
+            tokens=tokens,
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
@@ -125,32 +116,44 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return -jnp.where(counted, likelihoods, 0).sum() / masks.sum(), {"accuracy": accuracy}
 
     def run_loss(
-        params: Params, extra: PyTree, run: Window, key: jax.Array
+        params: Params, extra: PyTree, run: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The mean of S windows in a row, `[S, ...]`; each of their states is encoded once.
+        """The mean of S windows in a row, `[S, ...]`, of which each state is encoded once.
 
         So a state sees the frames before it even at the front of a window, where those before
         the window are unknown if it is encoded alone (Atari's first three).
+
+        Args:
+            params: of the network.
+            extra: nothing.
+            run: the windows.
+            tokens: `[K + S, D]` of their states.
+            key: of masks and dropout.
         """
-        seen = module.apply(params, windows.joined(run), method="see")
-        assert isinstance(seen, Seen)
-        states = seen.states  # [K + S, D]
         keys = jax.random.split(key, run.actions.shape[0])
 
         def loss(window: Window, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
             place = window.context.step - run.context.step[0]
-            own = jax.lax.dynamic_slice_in_dim(states, place, sizes.context + 1)
-            return window_loss(params, extra, window, key, Seen(own))
+            own = jax.lax.dynamic_slice_in_dim(tokens, place, sizes.context + 1)
+            return window_loss(params, extra, window, own, key)
 
-        losses, metrics = jax.vmap(loss)(run, keys)
-        return losses.mean(), jax.tree.map(jnp.mean, metrics)
+        return jax.tree.map(jnp.mean, jax.vmap(loss)(run, keys))
+
+    def encode_runs(params: Params, extra: PyTree, runs: Window) -> PyTree:
+        """Tokens `[B, K + S, D]` of the states of B runs."""
+        del extra
+        return module.apply(params, jax.vmap(windows.joined)(runs), method="encode_batch")
 
     # To the other architecture, what a state is depends on the window that it is seen in.
     in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
-    update = learning.make_update(
-        run_loss if in_runs else window_loss, optimizer, mesh,
-        microbatch=setup.training.microbatch, prepare=setup.seen_at_once(learning.sees(module)),
-    )  # fmt: skip
+    if in_runs and not setup.settings.repeat_state:
+        raise UserError(
+            f"--run {setup.training.run} with --no-repeat-state: windows in a row have different "
+            "later states; drop one"
+        )
+    example = (run_loss, encode_runs) if in_runs else (window_loss, learning.encode_windows(module))
+    mean_loss = learning.average_loss(setup, *example)
+    update = learning.make_update(mean_loss, optimizer, mesh)
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
@@ -158,7 +161,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = learning.make_init(setup, module, touch, optimizer)
-    return Agent(init, batch, update, energy)
+    encode_next = learning.make_encode_next(setup, module, encode)
+    return Agent(init, batch, update, energy, encode_next)
 
 
 LEAP = Method(Settings, make_agent)

@@ -18,6 +18,7 @@ from leapjax.data.windows import Steps
 from leapjax.domain import Domain, blank_context, check_context
 from leapjax.energy import single_action
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import GibbsConfig
@@ -25,10 +26,12 @@ from leapjax.types import (
     Agent,
     Context,
     Demonstration,
+    EncodeNext,
     Energy,
     Params,
     PyTree,
     TrainState,
+    Window,
 )
 
 UNDECAYED = ("bias", "scale", "embedding")
@@ -89,38 +92,6 @@ class TrainingConfig:
             raise ValueError(f"unknown windows {self.windows!r}: expected one of {known}")
 
 
-Prepare = Callable[[Params, PyTree, PyTree], tuple[PyTree, ...]]
-# (params, extra, examples [B, ...]) -> what a loss is given of them beside themselves, [B, ...]
-
-
-def nothing_prepared(params: Params, extra: PyTree, examples: PyTree) -> tuple[()]:
-    """What a loss is given that needs nothing else."""
-    del params, extra, examples
-    return ()
-
-
-def sees(module: nn.Module) -> Prepare:
-    """What a network sees of all states of the examples, by `module.see_all`."""
-
-    def see(params: Params, extra: PyTree, examples: PyTree) -> tuple[PyTree, ...]:
-        del extra
-        return (module.apply(params, examples.context, method="see_all"),)
-
-    return see
-
-
-def both_see(
-    module: nn.Module, part: Callable[[Context], Context] = lambda context: context
-) -> Prepare:
-    """The same, and what the target network sees of a part of each example's context."""
-
-    def see(params: Params, target: Params, examples: PyTree) -> tuple[PyTree, ...]:
-        held = module.apply(target, jax.vmap(part)(examples.context), method="see_all")
-        return *sees(module)(params, target, examples), held
-
-    return see
-
-
 class Setup(NamedTuple):
     """What every method is made from.
 
@@ -146,7 +117,7 @@ class Setup(NamedTuple):
         domain = self.domain
         return Sizes(domain.num_actions, self.context, self.horizon, domain.max_steps)
 
-    def encoder(self) -> nn.Module:
+    def encoder(self) -> Encoder:
         """The domain's encoder for the model's architecture.
 
         Raises:
@@ -159,11 +130,6 @@ class Setup(NamedTuple):
                 f"expected one of {', '.join(self.domain.encoders)}"
             )
         return self.domain.encoders[name](self.model, self.context)
-
-    def seen_at_once(self, see: Prepare) -> Prepare:
-        """`see`, where the encoder has a better way for many contexts than one by one."""
-        paper = self.model.architecture == "paper" and self.training.run == 1
-        return see if paper and hasattr(self.encoder(), "of_all") else nothing_prepared
 
     def policy(self, *heads: tuple[str, int], conditioned: bool = False) -> PolicyModel:
         """The network of a method that chooses one action at a time.
@@ -225,52 +191,123 @@ def untrained(energy: Energy) -> Agent:
     return Agent(init, lambda key, steps: (), update, energy)
 
 
-ExampleLoss = Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
-# (params, extra, example, key, *prepared) -> loss [] and metrics
+BatchLoss = Callable[
+    [Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]
+]  # (params, extra, batch [B, ...], keys [B]) -> loss [] and metrics, means over the batch
+EncodeExamples = Callable[[Params, PyTree, PyTree], PyTree]
+# (params, extra, batch [B, ...]) -> tokens [B, ...] of the contexts of the examples
+ExampleLoss = Callable[
+    [Params, PyTree, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]
+]  # (params, extra, example, its tokens, key) -> loss [] and metrics
 Update = Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
 
 
+def average_loss(setup: Setup, example_loss: ExampleLoss, encode: EncodeExamples) -> BatchLoss:
+    """The mean of a loss of one example, over a batch whose contexts are encoded together.
+
+    The encoder has all contexts of a device at once, however few examples the loss takes at a time
+    (`TrainingConfig.microbatch`): products of few rows are slow (docs/performance.md).
+
+    Args:
+        setup: what the agent is made from.
+        example_loss: of an example and its tokens.
+        encode: the contexts of a batch.
+    """
+
+    def examples_loss(
+        params: Params, tokens: PyTree, extra: PyTree, rows: tuple[PyTree, jax.Array]
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        each = jax.vmap(example_loss, in_axes=(None, None, 0, 0, 0))
+        examples, keys = rows
+        return jax.tree.map(jnp.mean, each(params, extra, examples, tokens, keys))
+
+    in_parts = _take_in_parts(examples_loss, setup.training.microbatch)
+
+    def batch_loss(
+        params: Params, extra: PyTree, batch: PyTree, keys: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return in_parts(params, encode(params, extra, batch), extra, (batch, keys))
+
+    return batch_loss
+
+
+def _take_in_parts(loss: Callable[..., Any], most: int) -> Callable[..., Any]:
+    """A loss that is a mean over examples, taken for a few examples at a time.
+
+    Each part's gradient is computed with its value, so that nothing else of it is stored.
+
+    Args:
+        loss: (params, tokens, extra, rows) -> loss [] and metrics. Tokens and rows are of examples,
+            `[B, ...]`; gradients are by parameters and tokens.
+        most: examples in a part; 0 for all.
+    """
+    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+
+    @jax.custom_vjp
+    def mean(*inputs: PyTree) -> PyTree:
+        return forward(*inputs)[0]
+
+    def forward(
+        params: Params, tokens: PyTree, extra: PyTree, rows: PyTree
+    ) -> tuple[PyTree, tuple[Params, PyTree]]:
+        size = jax.tree.leaves(rows)[0].shape[0]
+        count = next(count for count in range(-(-size // most), size + 1) if size % count == 0)
+        parts = jax.tree.map(
+            lambda x: x.reshape(count, size // count, *x.shape[1:]), (tokens, rows)
+        )
+
+        def add(totals: PyTree, part: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+            means, (gradient, by_tokens) = differentiate(params, part[0], extra, part[1])
+            return jax.tree.map(jnp.add, totals, (means, gradient)), by_tokens
+
+        one = jax.tree.map(lambda x: x[0], parts)
+        means, (gradient, _) = jax.eval_shape(differentiate, params, one[0], extra, one[1])
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (means, gradient))
+        found = jax.lax.scan(add, zeros, parts)
+        (means, gradient), by_tokens = jax.tree.map(lambda x: x / count, found)
+        return means, (gradient, jax.tree.map(lambda x, y: x.reshape(y.shape), by_tokens, tokens))
+
+    def backward(gradients: PyTree, cotangents: PyTree) -> tuple[PyTree, ...]:
+        return *jax.tree.map(lambda x: cotangents[0] * x, gradients), None, None
+
+    mean.defvjp(forward, backward)
+    return mean if most else loss
+
+
+def encode_windows(module: nn.Module) -> EncodeExamples:
+    """Encodes the contexts of windows with a network, for `average_loss`."""
+
+    def encode(params: Params, extra: PyTree, batch: Window) -> PyTree:
+        del extra
+        return module.apply(params, batch.context, method="encode_batch")
+
+    return encode
+
+
 def make_update(
-    example_loss: ExampleLoss,
+    batch_loss: BatchLoss,
     optimizer: optax.GradientTransformation,
     mesh: Mesh | None = None,
     next_extra: Callable[[PyTree, Params], PyTree] = lambda extra, params: extra,
-    microbatch: int = 0,
-    prepare: Prepare = nothing_prepared,
 ) -> Update:
-    """An agent's `update`: the loss and the metrics are means over the batch.
+    """An agent's `update`.
 
     Args:
-        example_loss: of one example; its gradient is taken by the parameters and what is prepared.
+        batch_loss: means over the examples of a device.
         optimizer: turns gradients into updates.
         mesh: splits every batch, and the state as `sharding.parameter_specs` says; None for
             one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
-        microbatch: see `TrainingConfig`.
-        prepare: what the loss is given as well, arrays of floating-point numbers. It is computed
-            for all examples of a device at once, however few of them the loss takes at a time.
     """
-
-    def batch_loss(
-        params: Params, prepared: PyTree, extra: PyTree, batch: PyTree, key: jax.Array,
-        first: jax.Array | int,
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:  # fmt: skip
-        # Keys by place in the whole batch: however it is split, an example meets its own.
-        places = first + jnp.arange(jax.tree.leaves(batch)[0].shape[0])
-        keys = jax.vmap(lambda place: jax.random.fold_in(key, place))(places)
-        each = jax.vmap(example_loss, in_axes=(None, None, 0, 0, *(0 for _ in prepared)))
-        losses, metrics = each(params, extra, batch, keys, *prepared)
-        return losses.mean(), jax.tree.map(jnp.mean, metrics)
-
-    in_parts = _in_parts(jax.value_and_grad(batch_loss, argnums=(0, 1), has_aux=True), microbatch)
 
     def differentiate(
         params: Params, extra: PyTree, batch: PyTree, key: jax.Array, first: jax.Array | int
     ) -> PyTree:
         """((loss, metrics), gradients) of the examples of a device."""
-        prepared, pull_back = jax.vjp(lambda params: prepare(params, extra, batch), params)
-        means, (gradients, of_prepared) = in_parts(params, prepared, extra, batch, key, first)
-        return means, jax.tree.map(jnp.add, gradients, *pull_back(of_prepared))
+        # Keys by place in the whole batch: however it is split, an example meets its own.
+        places = first + jnp.arange(jax.tree.leaves(batch)[0].shape[0])
+        keys = jax.vmap(lambda place: jax.random.fold_in(key, place))(places)
+        return jax.value_and_grad(batch_loss, has_aux=True)(params, extra, batch, keys)
 
     def mean_gradient(params: Params, extra: PyTree, batch: PyTree, key: jax.Array) -> PyTree:
         """((loss, metrics), gradients) of a batch."""
@@ -306,45 +343,6 @@ def make_update(
         return state, {"loss": loss, **metrics, "gradient_norm": norm}
 
     return update
-
-
-def _in_parts(differentiate: Callable[..., PyTree], rows: int) -> Callable[..., PyTree]:
-    """`differentiate`, whose results are means over examples, for a few examples at a time.
-
-    Args:
-        differentiate: (params, prepared, extra, batch, key, place of its first example) ->
-            means, (gradients by the parameters, by what was prepared of each example).
-        rows: at most so many; 0 for the whole batch at once.
-    """
-
-    def accumulated(
-        params: Params, prepared: PyTree, extra: PyTree, batch: PyTree, key: jax.Array,
-        first: jax.Array | int,
-    ) -> PyTree:  # fmt: skip
-        size = jax.tree.leaves(batch)[0].shape[0]
-        if rows == 0 or size <= rows:
-            return differentiate(params, prepared, extra, batch, key, first)
-        count = next(count for count in range(-(-size // rows), size + 1) if size % count == 0)
-        parts = jax.tree.map(
-            lambda x: x.reshape(count, size // count, *x.shape[1:]), (prepared, batch)
-        )
-        places = first + jnp.arange(count) * (size // count)
-
-        def add(total: PyTree, part: PyTree) -> tuple[PyTree, PyTree]:
-            (prepared, batch), place = part
-            means, (gradients, each) = differentiate(params, prepared, extra, batch, key, place)
-            return jax.tree.map(jnp.add, total, (means, gradients)), each
-
-        one = jax.tree.map(lambda x: x[0], parts)
-        means, (gradients, _) = jax.eval_shape(
-            differentiate, params, one[0], extra, one[1], key, first
-        )
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (means, gradients))
-        total, each = jax.lax.scan(add, zeros, (parts, places))
-        (means, gradients), each = jax.tree.map(lambda x: x / count, (total, each))
-        return means, (gradients, jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), each))
-
-    return accumulated
 
 
 def say_all(module: nn.Module, context: Context, actions: jax.Array) -> PyTree:
@@ -426,6 +424,30 @@ def context_encoder(
     return checked
 
 
+def make_encode_next(
+    setup: Setup, module: nn.Module, encode: Callable[[Params, Context, jax.Array], PyTree]
+) -> EncodeNext | None:
+    """An agent's `encode_next`, whose cache are the tokens `[K, D]` of the last K states.
+
+    None where there is not a token for each state of a context, or no past.
+
+    Args:
+        setup: what the agent is made from.
+        module: the network, with `encode_next` of its encoder.
+        encode: (params, context, tokens of the encoder) -> memory.
+    """
+    if setup.model.architecture != "paper" or setup.context == 0:
+        return None
+
+    def encode_next(params: Params, context: Context, cache: PyTree) -> tuple[PyTree, PyTree]:
+        check_context(context, setup.domain, setup.context)
+        context = jax.tree.map(jnp.asarray, context)
+        tokens: Any = module.apply(params, context, cache, method="encode_next")
+        return encode(params, context, tokens), tokens[1 : setup.context + 1]
+
+    return encode_next
+
+
 def acting_energy(
     setup: Setup,
     say: Callable[[Params, Context], PyTree],
@@ -438,25 +460,11 @@ def acting_energy(
         say: (params, context) -> what its network says.
         scores: of what it says, `[P, A - 1]` logits or Q-values, at the current state last.
     """
-    energy = single_action(
+    return single_action(
         context_encoder(say, setup),
         lambda params, said: scores(said)[-1],
         setup.domain.num_actions,
     )
-    return keeping(energy, setup, lambda said: said["tokens"])
-
-
-def keeping(energy: Energy, setup: Setup, encoded: Callable[[PyTree], jax.Array]) -> Energy:
-    """An energy that keeps what it made of states, where there is a token for each of them.
-
-    Args:
-        energy: of the method.
-        setup: what the method is made from.
-        encoded: (memory) -> `[K + 1, D]` the tokens of the encoder.
-    """
-    if setup.model.architecture == "paper" and setup.context:
-        return energy._replace(encoded=encoded)
-    return energy
 
 
 def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:

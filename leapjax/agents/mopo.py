@@ -90,20 +90,23 @@ class Networks(nn.Module):
         """Of the last P states, `[P, D]`, of variance 1 each: errors in them have a scale."""
         return self.norm(self.trunk(context)["features"])
 
-    def act(self, context: Context) -> Said:
-        """The policy's logits, `[P, A - 1]`."""
-        said = self.trunk(context)
-        return {"logits": self.logits(self.norm(said["features"])), "tokens": said["tokens"]}
+    def act(self, context: Context, tokens: jax.Array | None = None) -> Said:
+        """The policy's logits, `[P, A - 1]`, given the tokens of the context or not."""
+        return {"logits": self.logits(self.norm(self.trunk(context, tokens=tokens)["features"]))}
 
-    def see_all(self, contexts: Context) -> jax.Array:
-        """What the trunk sees of each state of B contexts."""
-        return self.trunk.see_all(contexts)
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """Returns the tokens of a context, given those of its past states."""
+        return self.trunk.encode_next(context, known)
+
+    def encode_transitions(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
+        """Returns the tokens before and after the steps of transitions."""
+        return self.trunk.encode_transitions(contexts)
 
     def transition(
-        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+        self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
     ) -> tuple[jax.Array, jax.Array]:
         """Features `[P, D]` before and after the step of a transition."""
-        now, later = self.trunk.transition(context, deterministic, seen)
+        now, later = self.trunk.transition(context, tokens, deterministic)
         return self.norm(now["features"]), self.norm(later["features"])
 
     def logits(self, features: jax.Array) -> jax.Array:
@@ -202,20 +205,27 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         _, (found, differ) = jax.lax.scan(step, start, keys)
         return found.mean(), differ.mean()
 
+    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return call(params, "act", context, tokens)
+
+    def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
+        """Tokens of the network and of its target, before and after the steps."""
+        return tuple(call(p, "encode_transitions", batch.context) for p in (params, target))
+
     def transition_loss(
         params: Params,
         target: Params,
         transition: TransitionWindow,
+        tokens: PyTree,
         key: jax.Array,
-        tokens: jax.Array | None = None,
-        target_tokens: jax.Array | None = None,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of the policy on the data and on what is imagined, and of the ensemble."""
         context = transition.context
         drop_key, rollout_key = jax.random.split(key)
         options = {"deterministic": False, "rngs": {"dropout": drop_key}}
-        now, later = call(params, "transition", context, seen=tokens, **options)
-        seen, seen_later = call(target, "transition", context, seen=target_tokens)
+        mine, held = tokens
+        now, later = call(params, "transition", context, mine, **options)
+        seen, seen_later = call(target, "transition", context, held)
         taken, known = losses.last_actions(context, len(now), choices)
         rewards = context.rewards[-len(now) :]
 
@@ -234,8 +244,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         imagined, differ = imagine(params, target, seen[-1:], rollout_key)
         cloning, accuracy = losses.imitation(call(params, "behaviour", now), taken, known)
         share = settings.real_share
-        mine = losses.mean_where(share * real + ensemble, known)
-        loss = mine + (1 - share) * imagined + cloning
+        of_data = losses.mean_where(share * real + ensemble, known)
+        loss = of_data + (1 - share) * imagined + cloning
         return loss, {
             "accuracy": accuracy,
             "value": losses.mean_where(value, known),
@@ -246,12 +256,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     init = learning.make_init(
         setup, module, learning.say_all, optimizer, target=lambda params: params
     )
-    update = learning.make_update(
-        transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch, setup.seen_at_once(learning.both_see(module)),
-    )  # fmt: skip
-    energy = learning.acting_energy(setup, lambda params, context: call(params, "act", context))
-    return Agent(init, transition_batches(setup), update, energy)
+    mean_loss = learning.average_loss(setup, transition_loss, encode)
+    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
+    energy = learning.acting_energy(setup, say)
+    encode_next = learning.make_encode_next(setup, module, say)
+    return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
 MOPO = Method(Settings, make_agent, rewards=True)

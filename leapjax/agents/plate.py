@@ -62,11 +62,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     energy = autoregressive(learning.context_encoder(encode, setup), logits, sizes.num_actions)
 
     def window_loss(
-        params: Params,
-        extra: PyTree,
-        window: Window,
-        key: jax.Array,
-        tokens: jax.Array | None = None,
+        params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Cross-entropy of the actions; squared error of the states that they lead to."""
         del extra
@@ -85,10 +81,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         loss = cloning + setup.settings.state_weight * error
         return loss, {"accuracy": accuracy, "state_error": error}
 
-    update = learning.make_update(
-        window_loss, optimizer, mesh, microbatch=setup.training.microbatch,
-        prepare=setup.seen_at_once(learning.sees(module)),
-    )  # fmt: skip
+    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
+    update = learning.make_update(mean_loss, optimizer, mesh)
     init = learning.make_init(setup, module, _encode_and_score, optimizer)
     return Agent(init, window_batches(setup, windows.unrolled_window), update, energy)
 

@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import learning, losses
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import Prepare, Setup
+from leapjax.agents.learning import EncodeExamples, Setup
 from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
@@ -46,14 +46,26 @@ class Judged(NamedTuple):
     taken: jax.Array  # [P] int32: the action
 
 
+def encode_around(module: PolicyModel) -> EncodeExamples:
+    """Encodes the contexts before and after the steps of transitions, for `look_around`."""
+
+    def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
+        after = jax.vmap(windows.after)(batch.context)
+        return (
+            module.apply(params, batch.context, method="encode_transitions"),
+            module.apply(target, after, method="encode_batch"),
+        )
+
+    return encode
+
+
 def look_around(
     module: PolicyModel,
     params: Params,
     target: Params,
     context: Context,
+    tokens: PyTree,
     key: jax.Array,
-    tokens: jax.Array | None = None,
-    target_tokens: jax.Array | None = None,
 ) -> tuple[Said, Said, Said]:
     """What is said before and after the step of a transition, and after it by the target network.
 
@@ -62,21 +74,15 @@ def look_around(
         params: its parameters.
         target: those of the target network.
         context: of the transition.
+        tokens: of the transition, from `encode_around`.
         key: of dropout; the target network has none.
-        tokens: what `seen_around` has found, if it has: of the network,
-        target_tokens: and of the target network.
     """
+    around, after = tokens
     said: Any = module.apply(
-        params, context, deterministic=False, rngs={"dropout": key}, method="transition",
-        seen=tokens,
-    )  # fmt: skip
-    held: Any = module.apply(target, windows.after(context), seen=target_tokens)
+        params, context, around, deterministic=False, rngs={"dropout": key}, method="transition"
+    )
+    held: Any = module.apply(target, windows.after(context), tokens=after)
     return *said, held
-
-
-def seen_around(module: PolicyModel) -> Prepare:
-    """What both see of transitions, for `look_around`."""
-    return learning.both_see(module, windows.after)
 
 
 Returns = Callable[[jax.Array], jax.Array]
@@ -104,19 +110,19 @@ def make_agent(
     module = setup.policy(("q", width))
     optimizer = learning.make_optimizer(setup.training)
 
-    def say(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context)
+    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, tokens=tokens)
 
     def transition_loss(
         params: Params,
         target: PyTree,
         transition: TransitionWindow,
+        tokens: PyTree,
         key: jax.Array,
-        *seen: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         context = transition.context
         dropout_key, loss_key = jax.random.split(key)
-        said = look_around(module, params, target, context, dropout_key, *seen)
+        said = look_around(module, params, target, context, tokens, dropout_key)
         now, later, held = (each["q"] for each in said)
         taken, known = losses.last_actions(context, len(now), choices)
 
@@ -133,9 +139,8 @@ def make_agent(
     init = learning.make_init(
         setup, module, learning.say_all, optimizer, target=lambda params: params
     )
-    update = learning.make_update(
-        transition_loss, optimizer, mesh, learning.follow(settings.target_rate),
-        setup.training.microbatch, setup.seen_at_once(seen_around(module)),
-    )  # fmt: skip
+    mean_loss = learning.average_loss(setup, transition_loss, encode_around(module))
+    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
     energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
-    return Agent(init, transition_batches(setup), update, energy)
+    encode_next = learning.make_encode_next(setup, module, say)
+    return Agent(init, transition_batches(setup), update, energy, encode_next)

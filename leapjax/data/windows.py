@@ -230,13 +230,12 @@ def joined(run: Window) -> Context:
 
 
 def recent(context: Context, length: int) -> Context:
-    """The same context with only the last `length` of its past steps; nothing encoded is kept."""
+    """The same context with only the last `length` of its past steps."""
     first = context.actions.shape[0] - length
     return context._replace(
         past=jax.tree.map(lambda leaf: leaf[first:], context.past),
         actions=context.actions[first:],
         rewards=context.rewards[first:],
-        encoded=None,
     )
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.dropout import Dropout
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig, Sizes, check_plan, forbid_early_end
 from leapjax.models.transformer import (
     KeysValues,
@@ -37,7 +38,7 @@ class AlternatingModel(nn.Module):
 
     config: ModelConfig
     sizes: Sizes
-    encoder: nn.Module  # the domain's: context -> [K + 1, D], or [C, D]
+    encoder: Encoder  # the domain's: context -> [K + 1, D], or [C, D]
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
@@ -60,30 +61,41 @@ class AlternatingModel(nn.Module):
 
     def encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
         """States `[past + 1, D]` up to the current one, and the actions `[past]` between them."""
-        return self._states(context), context.actions[context.actions.shape[0] - self.past :]
+        return self._states(self.encoder(context)), context.actions[
+            context.actions.shape[0] - self.past :
+        ]
 
-    def encode_unrolled(
-        self, context: Context, seen: jax.Array | None = None
-    ) -> tuple[jax.Array, jax.Array]:
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the encoder's tokens of B unrolled windows.
+
+        Architecture `paper`: `[B, K + T, D]`, each state is encoded once; `leapjax`:
+        `[B, T, C, D]`, those of the context at each state of the plan.
+        """
+        if self.config.architecture == "paper":
+            return self.encoder.encode_batch(contexts)
+
+        def at(place: int) -> Context:
+            return jax.vmap(lambda each: windows.context_at(each, place, self.sizes.context))(
+                contexts
+            )
+
+        places = range(self.sizes.horizon)
+        return jnp.stack([self.encoder.encode_batch(at(place)) for place in places], axis=1)
+
+    def encode_unrolled(self, context: Context, tokens: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The same of an unrolled window: states `[past + T, D]`, actions `[past + T - 1]`.
 
-        `seen` is what `see_all` has made of its states, if it has.
+        Args:
+            context: of the window.
+            tokens: its row of what `encode_batch` returned.
         """
         count = self.past + self.sizes.horizon
+        actions = context.actions[context.actions.shape[0] - (count - 1) :]
         if self.config.architecture == "paper":
-            states = self._states(context, seen)  # each is encoded once
-        else:
-            places = range(self.sizes.horizon)
-            contexts = [windows.context_at(context, n, self.sizes.context) for n in places]
-            states = jnp.concatenate([self._states(each) for each in contexts])
-        return states, context.actions[context.actions.shape[0] - (count - 1) :]
+            return self._states(tokens), actions
+        return jnp.concatenate([self._states(each) for each in tokens]), actions
 
-    def see_all(self, contexts: Context) -> jax.Array:
-        """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
-        return self.encoder.of_all(contexts)
-
-    def _states(self, context: Context, seen: jax.Array | None = None) -> jax.Array:
-        tokens = self.encoder(context) if seen is None else seen
+    def _states(self, tokens: jax.Array) -> jax.Array:
         if self.config.architecture != "paper":
             tokens = tokens.reshape(1, -1)
         return self.norm(self.summary(tokens))

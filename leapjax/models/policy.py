@@ -6,11 +6,12 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.dropout import Dropout
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
 
-Said = dict[str, jax.Array]  # by head: [P, count]; as `tokens`, those of the encoder
+Said = dict[str, jax.Array]  # by head: [P, count]
 
 
 class PolicyModel(nn.Module):
@@ -25,7 +26,7 @@ class PolicyModel(nn.Module):
 
     config: ModelConfig
     sizes: Sizes
-    encoder: nn.Module  # the domain's: context -> [K + 1, D], or [C, D]
+    encoder: Encoder  # the domain's: context -> [K + 1, D], or [C, D]
     heads: tuple[tuple[str, int], ...]  # what is said: a name, and how many numbers
     conditioned: bool = False  # on returns to go
 
@@ -50,7 +51,7 @@ class PolicyModel(nn.Module):
         context: Context,
         deterministic: bool = True,
         returns: jax.Array | None = None,
-        seen: jax.Array | None = None,
+        tokens: jax.Array | None = None,
     ) -> Said:
         """What each head says, `[P, count]`, at the last P states, the current one last.
 
@@ -58,26 +59,45 @@ class PolicyModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
-            seen: the tokens of the states, if they are known; of a batch, by `see_all`.
+            tokens: the encoder's, from `encode_batch` or `encode_next`; None: encode the context.
         """
-        tokens = self.encoder(context) if seen is None else seen
+        tokens = self.encoder(context) if tokens is None else tokens
         return self._say(tokens, context, deterministic, returns)
 
-    def see_all(self, contexts: Context) -> jax.Array:
-        """A token for each state of B contexts, `[B, K + 1, D]`, of an encoder with `of_all`."""
-        return self.encoder.of_all(contexts)
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the encoder's tokens `[B, C, D]` of B contexts."""
+        return self.encoder.encode_batch(contexts)
+
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """Returns the encoder's tokens of a context, given those of its past states."""
+        return self.encoder.encode_next(context, known)
+
+    def encode_transitions(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
+        """Returns the encoder's tokens before and after the steps of transitions, `[B, C, D]` each.
+
+        Args:
+            contexts: of B `TransitionWindow`s.
+        """
+        if self.config.architecture != "paper":
+            earlier, later = (jax.vmap(f)(contexts) for f in (windows.before, windows.after))
+            return self.encode_batch(earlier), self.encode_batch(later)
+        states = self.encode_batch(contexts)  # [B, K + 2, D]: each is encoded once
+        return states[:, :-1], states[:, 1:]
 
     def transition(
-        self, context: Context, deterministic: bool = True, seen: jax.Array | None = None
+        self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
     ) -> tuple[Said, Said]:
-        """What is said before and after the step of a `TransitionWindow`, of its context."""
-        earlier, later = windows.before(context), windows.after(context)
-        if self.config.architecture != "paper":
-            return self(earlier, deterministic), self(later, deterministic)
-        states = self.encoder(context) if seen is None else seen  # [K + 2, D]: each is encoded once
+        """What is said before and after the step of a transition.
+
+        Args:
+            context: of the `TransitionWindow`.
+            tokens: its rows of what `encode_transitions` returned.
+            deterministic: without dropout.
+        """
+        earlier, later = tokens
         return (
-            self._say(states[:-1], earlier, deterministic, None),
-            self._say(states[1:], later, deterministic, None),
+            self._say(earlier, windows.before(context), deterministic, None),
+            self._say(later, windows.after(context), deterministic, None),
         )
 
     def _say(
@@ -86,8 +106,7 @@ class PolicyModel(nn.Module):
         goals = None if returns is None else jnp.tanh(self.goal(returns[:, None]))  # [K + 1, D]
         read = self._sequence if self.config.architecture == "paper" else self._question
         h = read(tokens, context, deterministic, goals)
-        found = {name: said(h) for (name, _), said in zip(self.heads, self.said, strict=True)}
-        return {**found, "tokens": tokens}
+        return {name: said(h) for (name, _), said in zip(self.heads, self.said, strict=True)}
 
     def _sequence(
         self, states: jax.Array, context: Context, deterministic: bool, goals: jax.Array | None

@@ -2,8 +2,8 @@
 
 Both models score actions from the same `Context`. No position of the plan carries a later
 state than the current one (paper, equation 4), so the memory is computed once per plan and only
-action tokens change from pass to pass. What a state looks like is the domain's: its encoder, a
-module `context -> tokens`, is a field of the model.
+action tokens change from pass to pass. What a state looks like is the domain's: its `Encoder`
+is a field of the model.
 """
 
 import dataclasses
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.checks import check_at_least, check_types
-from leapjax.errors import UserError
 from leapjax.models.dropout import Dropout
+from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
 from leapjax.types import Context, PyTree
 
@@ -103,14 +103,6 @@ class Memory(NamedTuple):
 
     prefix: list[KeysValues] | None  # of the context's tokens, per layer, where none sees a plan
     tokens: jax.Array  # embeddings of all other tokens
-    states: jax.Array  # [K + 1, D] what each state of the context looks like
-
-
-class Seen(NamedTuple):
-    """What the states that a plan is about look like, to the paper's network."""
-
-    states: jax.Array  # [K + 1, D] of the context
-    ahead: jax.Array | None = None  # [D] later ones of the plan; None: nobody has looked
 
 
 class PaperModel(nn.Module):
@@ -127,9 +119,9 @@ class PaperModel(nn.Module):
 
     config: ModelConfig
     sizes: Sizes
-    states: nn.Module  # the domain's: context -> [K + 1, D], a token for each of its states
+    states: Encoder  # the domain's: a token for each state of a context, [K + 1, D], of which the
+    # last stands at all positions of a plan (eq. 4); or one more, which stands at the later ones
     conditioned: bool = False  # on returns to go
-    repeat_state: bool = True  # the current one at all positions (eq. 4); or later `states.ahead`
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
@@ -146,26 +138,20 @@ class PaperModel(nn.Module):
         self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
-    def see(self, context: Context) -> Seen:
-        """A token for each state of a context of any length, and for those that follow."""
-        if self.repeat_state:
-            return Seen(self.states(context))
-        tokens = self.states(context, ahead=True)
-        return Seen(tokens[:-1], tokens[-1])
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the encoder's tokens `[B, K + 1, D]` of B contexts, or K + 2 of each."""
+        return self.states.encode_batch(contexts)
 
-    def see_all(self, contexts: Context) -> Seen:
-        """The same of B contexts, `[B, ...]`, of an encoder with `of_all`."""
-        if self.repeat_state:
-            return Seen(self.states.of_all(contexts))
-        tokens = self.states.of_all(contexts, ahead=True)
-        return Seen(tokens[:, :-1], tokens[:, -1])
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """Returns the encoder's tokens of a context, given those of its past states."""
+        return self.states.encode_next(context, known)
 
     def encode(
         self,
         context: Context,
         deterministic: bool = True,
         returns: jax.Array | None = None,
-        seen: Seen | None = None,
+        tokens: jax.Array | None = None,
     ) -> Memory:
         """What every pass shares: the context's keys and values, per layer, and embeddings.
 
@@ -177,19 +163,18 @@ class PaperModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
-            seen: what `see` has made of the context, if it has.
+            tokens: the encoder's, from `encode_batch` or `encode_next`; None: encode the context.
         """
         horizon = self.sizes.horizon
-        states, ahead = self.see(context) if seen is None else seen
-        if ahead is None:
-            ahead = states[-1] if self.repeat_state else self.states.ahead(context)
+        seen = self.states(context) if tokens is None else tokens
+        states, later = seen[: self.sizes.context + 1], seen[-1]
 
-        def with_plan(known: jax.Array, later: jax.Array) -> jax.Array:
-            return jnp.concatenate([known, jnp.repeat(later[None], horizon - 1, axis=0)])
+        def with_plan(known: jax.Array, ahead: jax.Array) -> jax.Array:
+            return jnp.concatenate([known, jnp.repeat(ahead[None], horizon - 1, axis=0)])
 
         actions = jnp.tanh(self.action(context.actions))
         actions = jnp.concatenate([actions, jnp.zeros((horizon, self.config.width))])
-        steps = [with_plan(states, ahead), actions]  # of [K + T, D]
+        steps = [with_plan(states, later), actions]  # of [K + T, D]
         if returns is not None:
             wanted = jnp.tanh(self.goal(returns[:, None]))
             steps.insert(0, with_plan(wanted, wanted[-1]))
@@ -197,11 +182,11 @@ class PaperModel(nn.Module):
         time = self.time(jnp.minimum(context.step, self.sizes.max_steps) + horizon)
         tokens = tokens + self.position(jnp.arange(tokens.shape[0])) + time
         if self.config.attention != "causal" or self.sizes.context == 0:
-            return Memory(None, tokens, states)
+            return Memory(None, tokens)
         known, planned = jnp.split(tokens, [self.each * self.sizes.context])
         known = self.drop(known, deterministic=deterministic)
         mask = causal_mask(known.shape[0])
-        return Memory(self.transformer.prefix(known, mask, deterministic), planned, states)
+        return Memory(self.transformer.prefix(known, mask, deterministic), planned)
 
     def logits(
         self,
@@ -212,7 +197,7 @@ class PaperModel(nn.Module):
     ) -> jax.Array:
         """Logits `[P, A]` at `positions [P]` of plan `actions [T]`, which may hold MASK."""
         check_plan(actions, self.sizes.horizon)
-        prefix, tokens, _ = memory
+        prefix, tokens = memory
         before = tokens.shape[0] - self.each * self.sizes.horizon  # tokens of the context
         asked = before + self.each * jnp.arange(self.sizes.horizon) + self.each - 2
         x = tokens.at[asked + 1].add(jnp.tanh(self.action(actions)))
@@ -236,13 +221,13 @@ class LeapModel(nn.Module):
     values are computed once per plan, and a pass runs over T action tokens only. Where it is
     conditioned on the return to go, that is one more token of the context.
 
-    An encoder that knows what a position of the plan is, such as a cell of a board, says so:
-    `places(context, T) -> [T, D]`. Elsewhere an embedding of the position is learned.
+    Where the encoder does not say what a position of the plan is (`encode_positions`), an
+    embedding of it is learned.
     """
 
     config: ModelConfig
     sizes: Sizes
-    context: nn.Module  # the domain's: context -> [C, D], a few tokens
+    context: Encoder  # the domain's: a few tokens of a context, [C, D]
     conditioned: bool = False  # on the return to go
 
     def setup(self) -> None:  # noqa: D102
@@ -259,8 +244,16 @@ class LeapModel(nn.Module):
         self.drop = Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the encoder's tokens `[B, C, D]` of B contexts."""
+        return self.context.encode_batch(contexts)
+
     def encode(
-        self, context: Context, deterministic: bool = True, returns: jax.Array | None = None
+        self,
+        context: Context,
+        deterministic: bool = True,
+        returns: jax.Array | None = None,
+        tokens: jax.Array | None = None,
     ) -> Prefix:
         """Keys and values of the prefix tokens, and what positions of a plan are.
 
@@ -268,16 +261,17 @@ class LeapModel(nn.Module):
             context: what is known.
             deterministic: without dropout.
             returns: `[K + 1]` the return to go at each state, where it is conditioned on it.
+            tokens: the encoder's, from `encode_batch`; None: encode the context.
         """
-        tokens = self.context(context)
+        tokens = self.context(context) if tokens is None else tokens
         if returns is not None:
             tokens = jnp.concatenate([tokens, jnp.tanh(self.goal(returns[-1:, None]))])
         tokens = self.drop(tokens, deterministic=deterministic)
         known = self.transformer.prefix(tokens, deterministic=deterministic)
-        horizon = self.sizes.horizon
-        if hasattr(self.context, "places"):
-            return Prefix(known, self.context.places(context, horizon))
-        return Prefix(known, self.position(jnp.arange(horizon)))
+        places = self.context.encode_positions(context, self.sizes.horizon)
+        if places is None:
+            places = self.position(jnp.arange(self.sizes.horizon))
+        return Prefix(known, places)
 
     def logits(
         self,
@@ -317,7 +311,7 @@ class SequenceClassifier(nn.Module):
 
     config: ModelConfig
     sizes: Sizes
-    context: nn.Module  # the domain's: context -> [C, D]
+    context: Encoder  # the domain's: context -> [C, D]
 
     def setup(self) -> None:  # noqa: D102
         c = self.config
@@ -326,9 +320,19 @@ class SequenceClassifier(nn.Module):
         self.recurrence = nn.RNN(nn.OptimizedLSTMCell(c.width))
         self.head = nn.Dense(1)
 
-    def encode(self, context: Context) -> PyTree:
-        """The LSTM's first carry, `[D]` and `[D]`."""
-        return tuple(jnp.split(self.begin(self.context(context).reshape(-1)), 2))
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the encoder's tokens `[B, C, D]` of B contexts."""
+        return self.context.encode_batch(contexts)
+
+    def encode(self, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        """The LSTM's first carry, `[D]` and `[D]`.
+
+        Args:
+            context: what is known.
+            tokens: the encoder's, from `encode_batch`; None: encode the context.
+        """
+        tokens = self.context(context) if tokens is None else tokens
+        return tuple(jnp.split(self.begin(tokens.reshape(-1)), 2))
 
     def degree(self, memory: PyTree, actions: jax.Array) -> jax.Array:
         """The degree of corruption `[]` of a complete plan `[T]`: 0 none of it, 1 all."""
@@ -343,7 +347,7 @@ Model = PaperModel | LeapModel
 def build(
     config: ModelConfig,
     sizes: Sizes,
-    encoder: nn.Module,
+    encoder: Encoder,
     conditioned: bool = False,
     repeat_state: bool = True,
 ) -> Model:
@@ -354,18 +358,15 @@ def build(
         sizes: of what it plans in.
         encoder: the domain's, for its architecture.
         conditioned: on returns to go.
-        repeat_state: see `PaperModel`.
+        repeat_state: at all positions of a plan (paper, equation 4); if not, later ones have one
+            without a pose.
 
     Raises:
         UserError: the state shall not be repeated, and nothing else can stand in its place.
     """
-    if not repeat_state and not hasattr(encoder, "ahead"):
-        raise UserError(
-            "--no-repeat-state is for architecture 'paper' on BabyAI: no other encoder says what "
-            "a state looks like of which the agent's pose is not known; elsewhere --repeat-state"
-        )
+    encoder = encoder if repeat_state else encoder.add_later_state()
     if config.architecture == "paper":
-        return PaperModel(config, sizes, encoder, conditioned, repeat_state)
+        return PaperModel(config, sizes, encoder, conditioned)
     return LeapModel(config, sizes, encoder, conditioned)
 
 

@@ -66,7 +66,9 @@ def _compile(run: "Run") -> Callable[[], Programs]:
     plays = run.plays and not config.rules  # with rules another planner plays: see `add_rules`
     mesh = make_mesh(config)
     agent = pretrained.make_agent(run.specification, domain, mesh)
-    plan = compile_planner(agent.energy, config.planner, chunk_sizes(config))
+    plan = compile_planner(
+        agent.energy, config.planner, chunk_sizes(config), encode_next=agent.encode_next
+    )
     like = learning.blank_steps(domain) if config.demos else ()
     state = jax.eval_shape(agent.init, jax.random.key(0))
     memory.check_state(state)

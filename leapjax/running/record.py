@@ -34,11 +34,8 @@ def record(
     run.log(config.training.steps, {f"evaluation/{k}": row[name] for k, name in measured.items()})
 
     def write() -> None:
-        beside = folder / "episodes.csv"
-        if config.record:
-            beside = results.episodes_path(run.rows, run.name)
-        results.write_episodes(beside, episodes)
-        results.record(run.rows, row)
+        results.write_csv(folder / "episodes.csv", episodes)
+        results.record(run.rows, row, episodes if config.record else None)
         if config.pictures:
             draw(run, planner)
             if experiment.animate is not None:

@@ -7,18 +7,19 @@ import math
 import platform
 import statistics
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from rich.table import Table
 
 from leapjax import compilation, scores
 from leapjax.checks import LARGEST_SEED
 from leapjax.errors import UserError, first_line
-from leapjax.files import only_process_in, read_text, write_text
+from leapjax.files import only_process_in, read_text, whole, write_text
 from leapjax.rollouts import Episodes
 from leapjax.running import jax_setup
 from leapjax.running.schema import (
@@ -37,6 +38,7 @@ from leapjax.serialization import read_json
 from leapjax.version import find_version
 
 Row = dict[str, Any]
+EPISODE = np.dtype([("seed", "<i8"), ("success", "?"), ("return", "<f8"), ("length", "<i4")])
 # What every row has; a float may be written as an integer.
 FIELDS = {
     "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
@@ -141,11 +143,16 @@ def folder(recorded: bool, runs: Path) -> Path:
     return Path("results") if recorded else runs
 
 
-def record(path: Path, row: Row) -> None:
-    """Adds a row, in the place of one of the same configuration, atomically.
+def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
+    """Adds a row, in the place of one of the same configuration, and its episodes, atomically.
+
+    Args:
+        path: file of rows.
+        row: to be added.
+        episodes: of the row; `read_episodes` returns them.
 
     Raises:
-        UserError: it holds a number that is not finite, which JSON has no word for.
+        UserError: the row holds a number that is not finite, which JSON has no word for.
     """
     for name, value in row.items():
         try:
@@ -154,6 +161,14 @@ def record(path: Path, row: Row) -> None:
             raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
     with only_process_in(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
+        # First, so that a process killed in between leaves episodes without a row, which the next
+        # one drops, and no row without its episodes.
+        known, hashes = read_episodes(path), {other["hash"] for other in rows}
+        tables = {name: each for name, each in known.items() if name in hashes}
+        if episodes is not None:
+            tables[row["hash"]] = as_table(episodes)
+        if tables or known:
+            _write_episodes(_episodes_path(path), tables)
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
         write_text(path, "".join(f"{line}\n" for line in lines))
 
@@ -171,18 +186,53 @@ def add(path: Path, name: str, value: Any) -> dict[str, Any]:
     return change(path, lambda known: {**(known or {}), name: value})
 
 
-def write_episodes(path: Path, episodes: Episodes) -> None:
-    """What became of each episode, for whoever wants to compute with more than a mean."""
+def as_table(episodes: Episodes) -> np.ndarray:
+    """Returns what became of each episode: an array `[E]` with the fields of `EPISODE`."""
     columns = episodes.seeds, episodes.successes, episodes.returns, episodes.lengths
-    table = ["seed,success,return,length"]
-    for seed, success, total, length in zip(*columns, strict=True):
-        table.append(f"{seed},{int(success)},{total:.6g},{length}")
-    write_text(path, "\n".join(table) + "\n")
+    return np.array(list(zip(*columns, strict=True)), EPISODE)
 
 
-def episodes_path(path: Path, name: str) -> Path:
-    """Where the episodes of a recorded row are, by the file of rows and the row's hash."""
-    return path.parent / "episodes" / f"{path.stem}-{name}.csv"
+def write_csv(path: Path, episodes: Episodes) -> None:
+    """Writes what became of each episode as text."""
+    lines = (f"{seed},{good:d},{total:.6g},{n}" for seed, good, total, n in as_table(episodes))
+    write_text(path, "\n".join([",".join(EPISODE.names or ()), *lines]) + "\n")
+
+
+def _episodes_path(path: Path) -> Path:
+    """Returns the file of the episodes of a file of rows."""
+    return path.parent / "episodes" / f"{path.stem}.npz"
+
+
+def read_episodes(path: Path) -> dict[str, np.ndarray]:
+    """Reads the episodes of rows, which not every row has.
+
+    Args:
+        path: file of the rows.
+
+    Returns:
+        By the hash of the row: `[E]` with the fields of `EPISODE`.
+
+    Raises:
+        UserError: the file of episodes is damaged.
+    """
+    path = _episodes_path(path)
+    if not path.exists():
+        return {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in archive.files}
+    except Exception as error:  # noqa: BLE001  # zipfile raises many kinds
+        raise UserError(f"cannot read {path}: {first_line(error)}") from None
+    for name, table in found.items():
+        if table.dtype != EPISODE or table.ndim != 1:
+            raise UserError(f"{path}: {name} is an array of {table.dtype}, not of episodes")
+    return found
+
+
+def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
+    # An array a row: where a row is added, git stores the new one and shares the others.
+    with whole(path) as scratch:
+        np.savez_compressed(scratch, **tables)  # type: ignore[arg-type]
 
 
 def find(path: Path, configuration: str) -> Row | None:

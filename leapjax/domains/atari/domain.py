@@ -5,7 +5,6 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 
-import flax.linen as nn
 import numpy as np
 
 from leapjax.checks import check_at_least, check_types, check_within
@@ -18,6 +17,7 @@ from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WI
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.extras import missing_explained
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
@@ -74,11 +74,11 @@ def make(name: str, settings: Settings) -> Domain:
 
         return AtariAdapter(game, settings.sticky, settings.max_steps)
 
-    def state_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def state_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return StateTokens(model.width, settings.features, model.dtype)
 
-    def current_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def current_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
+from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense
 from leapjax.types import Context
 
@@ -65,20 +66,23 @@ class Features(nn.Module):
         return x.reshape(x.shape[0], -1)
 
 
-class StateTokens(nn.Module):
+class StateTokens(Encoder):
     """A token for each state of a context: `[K + 1, D]`, as Decision Transformer has it.
 
-    The first three of them see black frames before the context, so that they are encoded anew at
-    each decision where others are known; the other architecture knows none.
+    The first three of them see black frames before the context, so that `encode_next` encodes them
+    anew, too.
     """
 
     width: int
     features: int  # of the first convolution
     dtype: Dtype = jnp.float32
 
-    @nn.compact
     def __call__(self, context: Context) -> jax.Array:  # noqa: D102
-        frames, known = seen(context), context.encoded
+        return self.encode_next(context, None)
+
+    @nn.compact
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:  # noqa: D102
+        frames = seen(context)
         cut = min(STACK - 1, len(frames) - 1)
         states = stacked(frames, len(frames))
         if known is not None:
@@ -92,7 +96,7 @@ class StateTokens(nn.Module):
         return jnp.concatenate([tokens[:-1], known[cut:], tokens[-1:]])
 
 
-class CurrentTokens(nn.Module):
+class CurrentTokens(Encoder):
     """A few tokens for the current state alone, and what changed before it: `[tokens, D]`.
 
     Before its start an episode is taken to have stood still. Frames that a shorter context does not

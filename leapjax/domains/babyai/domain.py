@@ -3,7 +3,6 @@
 import contextlib
 import functools
 
-import flax.linen as nn
 import numpy as np
 
 from leapjax.domain import Domain, DomainType
@@ -21,6 +20,7 @@ from leapjax.domains.babyai.levels import Level
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 
 
@@ -35,7 +35,7 @@ def make(name: str, options: Settings) -> Domain:
         side = max(env.width, env.height)
         longest, shortest = levels.longest_episode(level, env), levels.shortest_limit(env)
 
-    def state_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def state_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         if model.width % encoders.NORM_GROUPS:
             raise UserError(
@@ -44,7 +44,7 @@ def make(name: str, options: Settings) -> Domain:
             )
         return encoders.StateTokens(side, model.width, model.dtype)
 
-    def context_tokens(model: ModelConfig, context: int) -> nn.Module:
+    def context_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return encoders.ContextTokens(options, model.width, model.dtype)
 

@@ -18,8 +18,9 @@ from flax.typing import Dtype, Initializer
 from leapjax.domains.babyai import symmetries, vocabulary
 from leapjax.domains.babyai.adapter import NUM_ACTIONS
 from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.runs import map_runs
 from leapjax.domains.babyai.settings import Settings
-from leapjax.models import once
+from leapjax.models.encoder import Encoder
 from leapjax.models.linear import linear
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, pad_token
@@ -242,27 +243,34 @@ class PaperStateEncoder(nn.Module):
         return nn.relu(nn.Dense(self.width)(h.reshape(-1)))
 
 
-class StateTokens(nn.Module):
+class StateTokens(Encoder):
     """The appendix's: `[K + 1, D]`, a token for each state of the context, oldest first."""
 
     side: int
     width: int
     dtype: Dtype = jnp.float32
+    later: bool = False  # one more token, of later states, whose pose nobody knows: (0, 0, 0)
 
     def setup(self) -> None:  # noqa: D102
         self.instruction = InstructionEncoder(vocabulary.SIZE, self.width, LARGE)
         self.state = PaperStateEncoder(self.side, self.width, self.dtype)
 
-    def __call__(self, context: Context, ahead: bool = False) -> jax.Array:
-        """`[K + 1, D]`: the past states and the current one; last, if asked for, that of `ahead`.
+    def add_later_state(self) -> Encoder:  # noqa: D102
+        return self.clone(later=True)
 
-        In one batch, which takes less than one after the other; but what lies ahead differs from
-        now in the pose alone, which is read late: up to there both are one, apart from the past.
+    def __call__(self, context: Context) -> jax.Array:  # noqa: D102
+        return self.encode_next(context, None)
+
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """In one batch, which takes less than one state after the other.
+
+        A later state differs from the current one in the pose alone, which is read late: up to
+        there both are one, apart from the past.
         """
         instruction = self.instruction(context.observation.instruction).whole
-        now, past, known = context.observation, context.past, context.encoded
+        now, past = context.observation, context.past
         read = jax.vmap(self.state, in_axes=(0, None))
-        if not ahead:
+        if not self.later:
             states = jax.tree.map(lambda leaf: leaf[None], now)
             if known is None:
                 states = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), past, states)
@@ -274,31 +282,21 @@ class StateTokens(nn.Module):
                 known = read(past, instruction)
         return tokens if known is None else jnp.concatenate([known, tokens])
 
-    def of_all(self, contexts: Context, ahead: bool = False) -> jax.Array:
-        """The same of B contexts, `[B, ...]`, in which nothing is encoded yet: `[B, K + 1, D]`.
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """On a CPU a few states at a time, whose maps stay in a core's cache, and no state twice.
 
-        On a CPU a few states at a time, whose maps stay in a core's cache; and what stands in a
-        context for the time before its episode is always the same, so it is looked at once.
+        What stands in a context for the time before its episode is always the same, for example.
         """
         if not contexts.actions.shape[1] or jax.default_backend() != "cpu":
-            return jax.vmap(lambda context: self(context, ahead))(contexts)
+            return super().encode_batch(contexts)
         now = contexts.observation
-        later = [jax.vmap(_nowhere)(now)] if ahead else []
+        later = [jax.vmap(_nowhere)(now)] if self.later else []
         states = jax.tree.map(
             lambda past, *others: jnp.concatenate([past, *(x[:, None] for x in others)], axis=1),
             contexts.past, now, *later,
         )  # fmt: skip
         told = jax.vmap(lambda instruction: self.instruction(instruction).whole)(now.instruction)
-        first, total, which = once.runs(states)
-        length = which.shape[1]
-        each = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], states)
-        tokens = once.of_first(self.state, each, told[first // length], total, AT_A_TIME)
-        return tokens[which]
-
-    def ahead(self, context: Context) -> jax.Array:
-        """`[D]`: what later states of a plan are taken for, whose pose nobody knows: (0, 0, 0)."""
-        instruction = self.instruction(context.observation.instruction).whole
-        return self.state(_nowhere(context.observation), instruction)
+        return map_runs(self.state, states, told, AT_A_TIME)
 
 
 def _nowhere(observation: Observation) -> Observation:
@@ -478,7 +476,7 @@ def feature_at(image: jax.Array, position: jax.Array) -> jax.Array:
     return jnp.einsum("xyc,xy->c", image, one_cell(position, image.shape[0]))
 
 
-class ContextTokens(nn.Module):
+class ContextTokens(Encoder):
     """Ours: what a plan must know of its context, in a few tokens.
 
     The grid is turned so that the agent faces right; learned distances spread over it; it is

@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import flax.linen as nn
 import gymnasium as gym
 import jax
 import numpy as np
@@ -26,6 +25,7 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.domains.gymnasium.recorded import check_recorded, describe_environment
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
@@ -199,8 +199,8 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
         check_choices(space, observations, where)
         check_precision(space, observations, where)
 
-    def encoders(statistics: Statistics) -> dict[str, Callable[[ModelConfig, int], nn.Module]]:
-        def tokens(num_actions: int, model: ModelConfig, context: int) -> nn.Module:
+    def encoders(statistics: Statistics) -> dict[str, Callable[[ModelConfig, int], Encoder]]:
+        def tokens(num_actions: int, model: ModelConfig, context: int) -> Encoder:
             del context
             return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
 

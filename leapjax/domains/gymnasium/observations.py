@@ -28,6 +28,7 @@ from leapjax.domains.gymnasium.scaling import (
     scale_numbers,
 )
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, Demonstration, PyTree
 
@@ -267,7 +268,7 @@ def _with_channels(pictures: Any) -> Any:
     return pictures.transpose(0, 2, 3, 1) if first else pictures
 
 
-class StateTokens(nn.Module):
+class StateTokens(Encoder):
     """A token for each state of a context: `[K + 1, D]`, the current state last."""
 
     parts: tuple[Part, ...]
@@ -276,13 +277,16 @@ class StateTokens(nn.Module):
     dtype: Dtype = jnp.float32
     statistics: Statistics = ()  # of the training data, as `measure_parts` finds them
 
-    @nn.compact
     def __call__(self, context: Context) -> jax.Array:
         """Tokens of the K past states and the current one."""
+        return self.encode_next(context, None)
+
+    @nn.compact
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """The same, given the tokens of the past states."""
         current = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], context.observation)
-        known = () if context.encoded is None else (context.encoded,)
         states = current
-        if not known:
+        if known is None:
             states = jax.tree.map(lambda *both: jnp.concatenate(both), context.past, current)
         leaves = jax.tree.leaves(states)  # each [K + 1, ...], or [1, ...]
         measured = self.statistics or (UNMEASURED,) * len(self.parts)
@@ -296,7 +300,7 @@ class StateTokens(nn.Module):
         ]
         tokens = nn.gelu(sum(read, jnp.zeros((len(leaves[0]), self.width))))
         tokens = self._dense(nn.gelu(self._dense(tokens, "mixed")), "token")
-        tokens = jnp.concatenate([*known, tokens])
+        tokens = tokens if known is None else jnp.concatenate([known, tokens])
         if not self.num_actions:
             return tokens
         count = tokens.shape[0]

@@ -14,6 +14,7 @@ from leapjax.domain import Augmentation, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.models.transformer import dense
 from leapjax.types import Context
@@ -38,7 +39,7 @@ class Settings:
         check_types(self)
 
 
-class GraphTokens(nn.Module):
+class GraphTokens(Encoder):
     """A token for each edge, and one for where the agent is and where it should be."""
 
     labels: int
@@ -77,7 +78,7 @@ def make(name: str, settings: Settings) -> Domain:
         np.zeros((star.nodes - 1, 2), np.int32), np.zeros((), np.int32), np.zeros((), np.int32)
     )
 
-    def tokens(model: ModelConfig, context: int) -> nn.Module:
+    def tokens(model: ModelConfig, context: int) -> Encoder:
         del context
         return GraphTokens(labels, model.width, model.dtype)
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.errors import UserError
+from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import embed
 from leapjax.types import Context
 
@@ -33,11 +33,11 @@ class Settings:
         check_types(self)
 
 
-class BoardTokens(nn.Module):
+class BoardTokens(Encoder):
     """A token for each cell, and one for the cell that is written next.
 
-    It says of which cell an action of the plan is (`places`), so that which cells share a row, a
-    column or a box with it need not be learned for each of them.
+    It says of which cell an action of the plan is (`encode_positions`), so that which cells share
+    a row, a column or a box with it need not be learned for each of them.
     """
 
     side: int
@@ -56,7 +56,7 @@ class BoardTokens(nn.Module):
         task = self.task(jnp.zeros(1, jnp.int32))
         return jnp.concatenate([self._cells(context), task + here])
 
-    def places(self, context: Context, horizon: int) -> jax.Array:
+    def encode_positions(self, context: Context, horizon: int) -> jax.Array:
         """`[T, D]`: the cells that a plan fills, and what is in them."""
         ahead = context.observation.cell + jnp.arange(horizon)
         return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]

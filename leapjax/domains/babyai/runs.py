@@ -1,0 +1,106 @@
+"""Functions of states that stay the same for some steps: one call for each run of equal states."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.types import PyTree
+
+
+def map_runs(
+    function: Callable[[PyTree, jax.Array], jax.Array],
+    sequences: PyTree,
+    rows: jax.Array,
+    size: int,
+) -> jax.Array:
+    """Applies a function to B sequences of n elements: `[B, n, ...]`.
+
+    Of equal consecutive elements of a sequence it computes one. How many there are depends on the
+    data, so a loop ends when all are computed. JAX differentiates no such loop: its gradient is
+    written here.
+
+    Args:
+        function: (element, row of its sequence) -> array; it may capture arrays of floating-point
+            numbers, such as parameters.
+        sequences: leaves `[B, n, ...]` of any type, n > 0, by which no gradient is taken.
+        rows: floating-point numbers `[B, ...]`.
+        size: elements that are computed at a time. The gradient computes them again: to store
+            what it needs costs more.
+    """
+    first, total, which = _find_runs(sequences)
+    # Room for all elements; beyond the last run stands the first element.
+    first = jnp.pad(first, (0, -len(first) % size)).reshape(-1, size)
+    things = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], sequences)
+    rows = rows[first // which.shape[1]]
+    each, captured = jax.closure_convert(jax.vmap(function), *_at((things, rows), 0))
+    found = _map_parts(each, things, (total + size - 1) // size, rows, captured)
+    return found.reshape(-1, *found.shape[2:])[which]
+
+
+def _find_runs(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds runs of equal consecutive elements along axis 1.
+
+    Returns:
+        `[B * n]` the first element of each run, of all B * n, then zeros; `[]` how many runs there
+        are; `[B, n]` the run that each element is of.
+    """
+
+    def differs(leaf: jax.Array) -> jax.Array:
+        return jnp.any(leaf[:, 1:] != leaf[:, :-1], axis=range(2, leaf.ndim))
+
+    changed = jax.tree.reduce(jnp.logical_or, jax.tree.map(differs, sequences))  # [B, n - 1]
+    new = jnp.pad(changed, ((0, 0), (1, 0)), constant_values=True)
+    first = jnp.nonzero(new.reshape(-1), size=new.size)[0]
+    return first, jnp.sum(new), (jnp.cumsum(new) - 1).reshape(new.shape)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _map_parts(
+    each: Callable[..., jax.Array], things: PyTree, count: jax.Array, rows: PyTree, captured: list
+) -> jax.Array:
+    """`each` of the first `count []` of P parts, `[P, ...]`; then zeros."""
+
+    def step(part: jax.Array, found: jax.Array) -> jax.Array:
+        return _put(found, each(*_at((things, rows), part), *captured), part)
+
+    one = jax.eval_shape(each, *_at((things, rows), 0), *captured)
+    parts = jax.tree.leaves(things)[0].shape[0]
+    return jax.lax.fori_loop(0, count, step, jnp.zeros((parts, *one.shape), one.dtype))
+
+
+def _forward(
+    each: Callable[..., jax.Array], *given: PyTree
+) -> tuple[jax.Array, tuple[PyTree, ...]]:
+    return _map_parts(each, *given), given
+
+
+def _backward(
+    each: Callable[..., jax.Array], given: tuple[PyTree, ...], gradient: jax.Array
+) -> tuple[None, None, PyTree, list]:
+    things, count, rows, captured = given
+
+    def step(part: jax.Array, totals: tuple[PyTree, list]) -> tuple[PyTree, list]:
+        thing, row, cotangent = _at((things, rows, gradient), part)
+        _, pull_back = jax.vjp(functools.partial(each, thing), row, *captured)
+        of_row, *of_captured = pull_back(cotangent)
+        by_rows, by_captured = totals
+        return _put(by_rows, of_row, part), jax.tree.map(jnp.add, by_captured, of_captured)
+
+    nothing = jax.tree.map(jnp.zeros_like, (rows, captured))
+    return None, None, *jax.lax.fori_loop(0, count, step, nothing)
+
+
+_map_parts.defvjp(_forward, _backward)
+
+
+def _at(tree: PyTree, part: jax.Array | int) -> PyTree:
+    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, part, keepdims=False), tree)
+
+
+def _put(tree: PyTree, new: PyTree, part: jax.Array) -> PyTree:
+    def put(whole: jax.Array, each: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_update_index_in_dim(whole, each, part, 0)
+
+    return jax.tree.map(put, tree, new)

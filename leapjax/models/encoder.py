@@ -1,0 +1,63 @@
+"""What a domain's encoder offers to every network: tokens of a context, and optional abilities."""
+
+import flax.linen as nn
+import jax
+
+from leapjax.errors import UserError
+from leapjax.types import Context
+
+
+class Encoder(nn.Module):
+    """Turns a context into tokens. A subclass defines `__call__`; the rest has defaults.
+
+    For architecture `paper` there is a token for each state of the context, the current one
+    last: C = K + 1. For `leapjax` C is any number.
+    """
+
+    def __call__(self, context: Context) -> jax.Array:
+        """Returns the tokens `[C, D]` of one context."""
+        raise NotImplementedError
+
+    def encode_batch(self, contexts: Context) -> jax.Array:
+        """Returns the tokens `[B, C, D]` of B contexts, for training.
+
+        An encoder overrides this if it can do better than one context after the other.
+        """
+        each = nn.vmap(
+            lambda encoder, context: encoder(context),
+            variable_axes={"params": None}, split_rngs={"params": False},
+        )  # fmt: skip
+        tokens: jax.Array = each(self, contexts)
+        return tokens
+
+    def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
+        """Returns the tokens `[C, D]` of a context whose past states have been encoded before.
+
+        An encoder with a token for each state overrides this, to encode the new state only.
+
+        Args:
+            context: the current one, K > 0.
+            known: `[K, D]` the tokens of its past states, from the plan before; None: the
+                episode begins.
+        """
+        del known
+        return self(context)
+
+    def encode_positions(self, context: Context, horizon: int) -> jax.Array | None:
+        """Returns an embedding `[T, D]` of each position of a plan, such as a cell of a board.
+
+        None: the network learns an embedding of the position's number.
+        """
+        del context, horizon
+        return None
+
+    def add_later_state(self) -> "Encoder":
+        """Returns this encoder with one more token: of later states, whose pose is unknown.
+
+        Raises:
+            UserError: it cannot tell a pose from the rest of a state.
+        """
+        raise UserError(
+            "--no-repeat-state is for architecture 'paper' on BabyAI: no other encoder says what "
+            "a state looks like of which the agent's pose is not known; elsewhere --repeat-state"
+        )

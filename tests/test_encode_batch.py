@@ -1,0 +1,133 @@
+"""Contexts that are encoded together: as if each had been encoded alone, values and gradients."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.domains.babyai import encoders, runs
+from leapjax.methods import find_method
+from leapjax.models.encoder import Encoder
+from leapjax.models.trajectory import ModelConfig
+from tests import mixed
+from tests.parameters import random_state
+from tests.programs import only_long
+from tests.quick import quick_jit
+from tests.test_models import SIDE, random_context
+
+RUNS = np.array([[0, 0, 1, 1, 1], [2, 3, 3, 0, 0], [0, 0, 0, 0, 0]])
+
+
+@pytest.mark.parametrize("size", [1, 4, 16])
+def test_a_function_is_computed_once_for_each_run(size):
+    pair = jnp.array(RUNS[..., None] % 2), jnp.array(RUNS > 1)  # each hides a difference
+    rows, weights, parts = jnp.array([2.0, 3.0, 5.0]), np.arange(15.0).reshape(3, 5), []
+
+    def function(element, row, scale):
+        number = element[0][0] + 2 * element[1]
+        jax.debug.callback(lambda _: parts.append(1), row)
+        return scale * (1 + number) * jnp.log(row)
+
+    def gradient(over_all):
+        def total(rows, scale):
+            return (weights * over_all(rows, lambda *given: function(*given, scale))).sum()
+
+        return quick_jit(jax.value_and_grad(total, argnums=(0, 1)))(rows, 1.5)
+
+    found = gradient(lambda rows, function: runs.map_runs(function, pair, rows, size))
+    jax.effects_barrier()
+    computed = len(parts)
+    expected = gradient(lambda rows, f: jax.vmap(jax.vmap(f, (0, None)))(pair, rows))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5), found, expected)
+    assert computed == 2 * size * -(-6 // size)  # 6 runs, in whole parts, and again
+
+
+def contexts(past):
+    """A batch of them: all states of one are the same, and the past ones of another.
+
+    Not blank ones: they are normalised by next to nothing, so that rounding has large gradients.
+    """
+    each = [random_context(seed, past) for seed in range(4)]
+
+    def standing(place):
+        return jax.tree.map(lambda x: np.stack([x] * past), each[place].observation)
+
+    each[1], each[2] = each[1]._replace(past=standing(1)), each[2]._replace(past=standing(3))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+
+
+@pytest.mark.parametrize("differentiated", [False, pytest.param(True, marks=only_long)])
+def test_states_are_encoded_as_each_is_alone(differentiated, monkeypatch, past=3):
+    monkeypatch.setattr(encoders, "AT_A_TIME", 16)
+    encoder, batch = encoders.StateTokens(SIDE, 16).add_later_state(), contexts(past)
+    one = jax.tree.map(lambda leaf: leaf[0], batch)
+    params = quick_jit(encoder.init)(jax.random.key(0), one)
+    weights = np.random.default_rng(0).normal(size=(4, past + 2, 16)).astype(np.float32)
+
+    @jax.jit  # of the largest of equal cells, which is taken is a matter of rounding
+    def compared(params):
+        def gradient(encode):
+            return jax.grad(lambda params: (weights * jnp.tanh(encode(params))).sum())(params)
+
+        def alone(params):
+            return jax.vmap(functools.partial(encoder.apply, params))(batch)
+
+        def together(params):
+            return encoder.apply(params, batch, method="encode_batch")
+
+        return [gradient(f) if differentiated else f(params) for f in (alone, together)]
+
+    expected, found = compared(params)
+    assert_same(found, expected)
+
+
+def assert_same(found, expected):
+    """But for rounding, array by array."""
+
+    def same(one, other):
+        largest = np.abs(other).max()
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4 * largest)
+        return largest
+
+    assert max(jax.tree.leaves(jax.tree.map(same, found, expected))) > 1e-3
+
+
+METHODS = ("bc", "dt", "bcq", "iql", "mopo", "plate", "qr_dqn", "leap", "classifier")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "iql" else only_long) for name in METHODS]
+)
+def test_a_step_that_encodes_all_and_takes_parts_is_that_of_the_whole(name, monkeypatch):
+    """The loss, and the gradient of all parameters, the encoder's included."""
+    method, key, encoded = find_method(name), jax.random.key(0), []
+    horizon = 3 if name in ("leap", "plate", "classifier") else 1
+    model = ModelConfig("paper", layers=1, heads=2, width=16, dropout=0.1)
+    encode = Encoder.encode_batch
+
+    def encode_batch(encoder, contexts):
+        encoded.append(len(contexts.step))
+        return encode(encoder, contexts)
+
+    monkeypatch.setattr(Encoder, "encode_batch", encode_batch)
+
+    def step(microbatch):
+        training = TrainingConfig(batch=6, microbatch=microbatch)
+        agent = method.make_agent(
+            Setup(mixed.DOMAIN, 2, horizon, model, training, method.settings()), None
+        )
+        state = random_state(agent)
+        batch = quick_jit(agent.batch)(key, mixed.steps(episodes=1))
+        state, metrics = quick_jit(agent.update)(state, batch, key)
+        return jax.device_get((optax.tree.get(state.optimizer, "mu"), metrics))
+
+    found, expected = step(2), step(0)
+    assert set(encoded) == {6}
+    assert_same(found, expected)
+    leaves = jax.tree.leaves_with_path(expected[0])
+    table = [leaf for path, leaf in leaves if "Embed_0" in str(path)]
+    assert table and all(np.abs(leaf).max() > 1e-7 for leaf in table)
