@@ -26,6 +26,7 @@ from minari import DataCollector
 from experiments import gymnasium as program
 from leapjax import domains
 from leapjax.data import storage, windows
+from leapjax.data.storage.spaces import SPACES
 from leapjax.domain import Collection, Domain, blank_context
 from leapjax.domains.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.domains.gymnasium.observations import (
@@ -486,7 +487,7 @@ def saved_spaces(name, change):
     """Changes what a data set says of its spaces, as if it came from somewhere else."""
     path = storage.datasets_folder() / name / "data" / "metadata.json"
     metadata = json.loads(path.read_text())
-    spaces = {each: json.loads(metadata[each]) for each in storage.SPACES}
+    spaces = {each: json.loads(metadata[each]) for each in SPACES}
     change(spaces["observation_space"], spaces["action_space"])
     metadata |= {each: json.dumps(space) for each, space in spaces.items()}
     path.write_text(json.dumps(metadata))
