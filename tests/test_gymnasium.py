@@ -287,7 +287,7 @@ def test_tables_show_the_return_first_where_nobody_has_said_what_success_is():
         # No other name is proposed where the cause is another.
         ("no_such_module:Own-v0", "cannot be made: no module 'no_such_module': install it"),
         ("Pendulum-v1", "has actions Box.*: expected Discrete"),
-        ("Endless-v0", "no limit of steps, so an episode may never end: .*--max-steps"),
+        ("Endless-v0", "no limit of steps, so an episode may never end"),
         ("CartPole-v9", "provides versioned environments"),
         ("ALF/Pong-v5", "no ALF/ is registered: install the package that has it"),
         ("Broken-v0", "Box3D is not installed, run `pip install box3d`"),
