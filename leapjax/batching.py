@@ -100,18 +100,18 @@ class CompiledPlanner:
     def plan_next(
         self, params: Params, keys: Array, contexts: PyTree, cache: PyTree
     ) -> tuple[Plan, PyTree]:
-        """Plans for the next contexts of B episodes, of which some has been encoded before.
+        """Plans for B contexts, and returns a cache for the contexts one action later.
 
         Args:
             params: of the energy.
             keys: as in a call.
             contexts: as in a call.
-            cache: that the plans of the contexts one action earlier returned, rows in the order of
-                these contexts; None: all episodes begin here, or several actions were executed.
+            cache: from the plans for the contexts one action earlier, a row for each context; None:
+                episodes begin, or other states came in between.
 
         Returns:
-            The plans, and the cache for the next ones: None if there was no `encode_next`, else
-            opaque NumPy arrays with a leading `[B]`.
+            The plans; and the cache, opaque NumPy arrays with a leading `[B]`, or None if the
+            planner has no `encode_next`.
 
         Raises:
             ValueError: as in a call.
@@ -122,7 +122,7 @@ class CompiledPlanner:
             raise UserError(
                 "a compiled planner was called inside of jit, vmap or grad, where it sees no "
                 "numbers: call it outside, or use leap.gibbs (or the planner of its "
-                "configuration) there, with jax.vmap over keys and contexts"
+                "configuration) there, with jax.vmap over keys and what energy.encode returns"
             )
         if not hasattr(keys, "dtype"):
             if not isinstance(keys, Sequence) or isinstance(keys, str):
@@ -139,6 +139,8 @@ class CompiledPlanner:
         batch = keys.shape[0]
         if batch == 0:
             raise ValueError("no contexts to plan for")
+        if any(leaf.shape[0] != batch for leaf in jax.tree.leaves(cache)):
+            raise UserError(f"the cache must have a row for each of the {batch} contexts")
         for path, leaf in jax.tree.leaves_with_path(contexts):
             if np.ndim(leaf) == 0 or leaf.shape[0] != batch:
                 raise ValueError(

@@ -12,6 +12,7 @@ from leapjax import methods
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
+from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
@@ -21,6 +22,7 @@ from tests.quick import quick_jit
 from tests.recorder import Recorder
 
 MODEL = ModelConfig("paper", layers=1, heads=2, width=16, dropout=0.0, attention="causal")
+KEY = jax.random.key(0)
 LEVELS = {"babyai": "GoToLocalS7N5", "atari": "Pong", "gymnasium": "CartPole-v1"}
 
 
@@ -38,7 +40,7 @@ def level_of(name: str) -> Domain:
 def test_an_encoder_that_knows_the_past_returns_the_same_tokens(name, length):
     domain, rng, known, moved = level_of(name), np.random.default_rng(0), None, []
     encoder = domain.encoders["paper"](MODEL, length)
-    params = quick_jit(encoder.init)(jax.random.key(0), blank_context(domain, length))
+    params = quick_jit(encoder.init)(KEY, blank_context(domain, length))
     encode_next = quick_jit(functools.partial(encoder.apply, method="encode_next"))
     adapter = domain.make_adapter()
     history = History(adapter.reset(3), length, domain.num_actions)
@@ -116,3 +118,6 @@ def test_episodes_are_the_same_with_a_cache_and_without():
         np.testing.assert_array_equal(one.actions, other.actions)
     assert len({plan.actions.tobytes() for plan in cached.plans}) > 1
     assert played[0].lengths.tolist() == played[1].lengths.tolist() == [8, 8]
+    with pytest.raises(UserError, match="cache must have a row for each of the 1 contexts"):
+        context = jax.tree.map(lambda x: x[:1], cached.contexts[-1])
+        cached.plan.plan_next(params, jax.random.split(KEY, 1), context, cached.caches[-1])

@@ -374,10 +374,10 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(
     said = capsys.readouterr().err
     asked = '{"map_name": "8x8", "is_slippery": false}'
     assert "recorded in FrozenLake-v1 with other arguments" in said
-    assert f"--arguments '{asked}'" in said and said.count("\n") == 1
+    assert f"give it {asked} (--arguments)" in said and said.count("\n") == 1
     for other in ('{"is_slippery": false}', '{"map_name": "8x8"}'):  # and all are named again
         assert program.main([*options, "--arguments", other]) == 2
-        assert f"--arguments '{asked}'" in capsys.readouterr().err
+        assert f"give it {asked} (--arguments)" in capsys.readouterr().err
     assert program.main([*options, "--arguments", asked]) == 0
     assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [
         ["choices", 64, 0]

@@ -102,13 +102,12 @@ def test_the_plan_for_an_environment_is_the_first_that_is_played():
     assert search.startswith("  planner: GibbsConfig(horizon=5, ")
 
 
-@pytest.mark.parametrize(("executed", "kinds"), [(None, 1), (1, 2)])
-def test_compiling_ahead_knows_what_is_encoded_already(executed, kinds, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("executed", "again"), [(None, False), (1, True)])
+def test_plans_after_the_first_are_compiled_where_a_cache_is_used(
+    executed, again, tmp_path, monkeypatch
+):
     compiled = []
-    monkeypatch.setattr(
-        CompiledPlanner, "compile", lambda *given: compiled.append((given[2].encoded, given[3]))
-    )
+    monkeypatch.setattr(CompiledPlanner, "compile", lambda *given: compiled.append(given[3:]))
     planner = pretrained.load(untrained_run(tmp_path, "--architecture", "paper", "--context", "2"))
     planner.compile(40, executed)
-    assert [batch for _, batch in compiled] == [40] * kinds
-    assert [None if each is None else each.shape[0] for each, _ in compiled] == [None, 2][:kinds]
+    assert compiled == [(40, again)]

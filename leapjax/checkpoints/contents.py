@@ -67,7 +67,8 @@ def check_shapes(found: Shapes, like: PyTree, checkpoint: Path) -> None:
             raise UserError(
                 f"the checkpoint {checkpoint} does not fit its configuration: {name} is "
                 f"{found.get(name, 'missing')}, expected {expected.get(name, 'nothing')}; it was "
-                "made by another version: remove it, or use another --runs folder"
+                "made by another version: remove it, or use another folder",
+                "runs",
             )
 
 

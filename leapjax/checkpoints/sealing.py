@@ -48,7 +48,8 @@ def check_same(saved: np.ndarray, identity: str, checkpoint: Path) -> None:
         raise UserError(
             f"the checkpoint {checkpoint} is of another configuration than the one beside it: it "
             "was copied here from another run, or the specification was changed; put back what "
-            "was there, or train again in another --runs folder"
+            "was there, or train again in another folder",
+            "runs",
         )
 
 

@@ -33,7 +33,8 @@ def check_arguments(name: str, recorded: Described, domain: Domain) -> None:
     if recorded_with != played_with:
         raise UserError(
             f"{name} was recorded in {domain.level} with other arguments than it is played with: "
-            f"give --arguments '{json.dumps(recorded_with)}'"
+            f"give it {json.dumps(recorded_with)}",
+            "arguments",
         )
 
 

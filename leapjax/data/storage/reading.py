@@ -58,8 +58,9 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     version = find_version(name)
     if version is not None and version < FORMAT:
         raise UserError(
-            f"the data set {name!r} is of an earlier version, which kept no rewards: without "
-            "--demonstrations it is made anew"
+            f"the data set {name!r} is of an earlier version, which kept no rewards: make it "
+            "anew, as a run does that names no data set",
+            "demonstrations",
         )
     folder = get_dataset_path(name) / "data"
     with _explain_damage(name):

@@ -33,8 +33,8 @@ def source(domain: Domain, count: int, seed: int) -> Source:
         if found < count:
             also = f" that can be used ({dropped})" if dropped else ""
             raise UserError(
-                f"{name} has {found} episodes{also}, fewer than --demos {count}: "
-                f"use --demos {found}"
+                f"{name} has {found} episodes{also}, fewer than {count}: ask for {found}",
+                "demos",
             )
         return loaded
 
