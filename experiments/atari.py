@@ -83,7 +83,7 @@ def run(options: Collect) -> None:
             f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
         )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
-    from leapjax.domains.atari.collect import collect  # noqa: PLC0415  (ale-py is optional)
+    from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console(markup=False)
     transitions = options.transitions or presets.transitions(options.game)

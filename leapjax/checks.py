@@ -205,6 +205,24 @@ def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
     return narrow
 
 
+def check_range(name: str, values: np.ndarray, least: int, most: int) -> None:
+    """Checks that all numbers of an array are in a range.
+
+    Args:
+        name: of the numbers, for the message.
+        values: at least one.
+        least: the smallest value allowed.
+        most: the largest value allowed.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+    if values.min() < least or values.max() > most:
+        raise UserError(
+            f"{name} run from {values.min()} to {values.max()}, expected {least} to {most}"
+        )
+
+
 def check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
     """Returns real numbers as JAX's array of floats: unsigned integers have no negatives.
 

@@ -1,6 +1,7 @@
 """A domain that is no grid world of ours: Gymnasium's FrozenLake, in a few lines."""
 
 import dataclasses
+import functools
 from collections import deque
 
 import flax.linen as nn
@@ -47,21 +48,19 @@ def shortest_way(transitions) -> list[int]:
     return ways[GOAL]
 
 
-def make_environment():
-    return gym.make(LEVEL, is_slippery=False)
+def make_adapter():
+    return GymnasiumAdapter(gym.make(LEVEL, is_slippery=False))
 
 
-def collect(count, seed, progress):
-    adapter = GymnasiumAdapter(make_environment())
-    way = shortest_way(adapter.env.unwrapped.P)
-    return collect_solved(adapter, lambda: way, count, seed, progress)
+def solve(adapter) -> list[int]:
+    return shortest_way(adapter.env.unwrapped.P)
 
 
 def make(level: str, settings: Settings) -> Domain:
     return Domain(
         level=level,
-        make_adapter=lambda: GymnasiumAdapter(make_environment()),
-        collect=collect,
+        make_adapter=make_adapter,
+        collect=functools.partial(collect_solved, make_adapter, solve),
         actions=("left", "down", "right", "up", "end"),
         max_steps=100,
         blank=np.zeros((), np.int64),

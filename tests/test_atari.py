@@ -21,8 +21,9 @@ from experiments import atari, atari_energy
 from experiments.tables.atari import ENCODED, data, played
 from leapjax.configuration import configuration_hash
 from leapjax.data import windows
-from leapjax.domains.atari import augmentation, collect, domain, encoders, replay
+from leapjax.domains.atari import augmentation, domain, encoders, replay
 from leapjax.domains.atari.adapter import AtariAdapter
+from leapjax.domains.atari.demonstrators import collect, playing
 from leapjax.domains.atari.emulator import Emulator
 from leapjax.domains.atari.games import GAMES
 from leapjax.environments import Eager
@@ -419,9 +420,9 @@ def test_a_process_that_dies_ends_the_collection(tmp_path, monkeypatch):
 def test_processes_end_when_the_first_is_killed():
     program = (
         "import os, time\n"
-        "from leapjax.domains.atari.collect import _processes\n"
+        "from leapjax.domains.atari.demonstrators.workers import start_workers\n"
         "if __name__ == '__main__':\n"
-        "    with _processes(1) as pool:\n"
+        "    with start_workers(1) as pool:\n"
         "        print(pool.submit(os.getpid).result(), flush=True)\n"
         "        time.sleep(100)\n"
     )
@@ -456,7 +457,7 @@ def test_what_others_have_made_is_not_replaced(collected, tmp_path, capsys):
     assert atari.main([*arguments, "--folder", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert "holds files that were not made here" in error and error.count("\n") == 1
-    assert collect.shards(tmp_path, BREAKOUT, 100, 1) is None
+    assert collect.find_shards(tmp_path, BREAKOUT, 100, 1) is None
     assert not list(theirs.glob("manifest*"))
 
 
@@ -464,7 +465,7 @@ def test_games_of_another_length_or_noise_are_not_gone_on_with(collected, monkey
     _, arguments = collected
     assert atari.main([*arguments, "--longest", "90"]) == 2
     assert "cut off after 80 decisions, not after 90" in capsys.readouterr().err
-    monkeypatch.setattr(collect.demonstrators, "_NOISES", (0.2,))
+    monkeypatch.setattr(playing, "NOISES", (0.2,))
     assert atari.main(arguments) == 2
     assert "other shares of random actions than today's" in capsys.readouterr().err
 
@@ -485,11 +486,11 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
     old = {name: manifest[name] for name in manifest if name not in ("demonstrator", "rules")}
     path.write_text(json.dumps(old))
     assert atari.main(arguments) == 0
-    monkeypatch.setitem(collect.demonstrators._RULES, "Breakout", 2)
+    monkeypatch.setitem(playing.RULES, "Breakout", 2)
     assert atari.main(arguments) == 2
     assert "with rules 1, and today's is Paddle with rules 2" in capsys.readouterr().err
     # To learn from them is another matter.
-    assert collect.shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
+    assert collect.find_shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
 
 
 @pytest.mark.parametrize(("game", "run"), [("Pong", 1)])
@@ -510,8 +511,8 @@ def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path)
     folder, _ = collected
     copy = tmp_path / "atari"
     shutil.copytree(folder, copy)
-    wanted = collect.shards(copy, BREAKOUT, 100, 1)
-    assert wanted == range(1) and collect.shards(copy, BREAKOUT, 10_000, 1) is None
+    wanted = collect.find_shards(copy, BREAKOUT, 100, 1)
+    assert wanted == range(1) and collect.find_shards(copy, BREAKOUT, 10_000, 1) is None
     found = domain.source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
     logs = replay.replay_logs(copy, BREAKOUT, 1)
     shutil.rmtree(logs.parent / "leapjax")  # what was unpacked

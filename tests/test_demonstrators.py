@@ -8,7 +8,13 @@ pytest.importorskip("ale_py")  # an extra
 
 from ale_py.vector_env import AtariVectorEnv
 
-from leapjax.domains.atari.demonstrators import PlayedGame, look, make_demonstrator, noise_of, play
+from leapjax.domains.atari.demonstrators.playing import (
+    PlayedGame,
+    choose_noise,
+    make_demonstrator,
+    play,
+)
+from leapjax.domains.atari.demonstrators.seaquest import read_scene
 from leapjax.domains.atari.domain import LONGEST
 from leapjax.domains.atari.emulator import Emulator
 from leapjax.domains.atari.games import GAMES
@@ -86,7 +92,7 @@ def test_a_game_is_what_its_seed_and_noise_say_and_can_be_played_again(name):
     assert not same(game, played(name, seed=1, noise=0.5))
     noisy = played(name, noise=1.0)
     assert len(set(noisy.actions)) >= 4 and not same(played(name), noisy)
-    levels = [noise_of(GAMES[name], number) for number in range(6)]
+    levels = [choose_noise(GAMES[name], number) for number in range(6)]
     assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
     assert levels[2] <= (0.7 if name == "Seaquest" else 0.5)
     emulator = Emulator(GAMES[name])
@@ -139,7 +145,7 @@ def test_seaquest_sees_what_is_on_the_screen():
     for _ in range(40):
         for _ in range(15):
             emulator.step(demonstrator(emulator, np.random.default_rng(0)))
-        scene = look(emulator.ram())
+        scene = read_scene(emulator.ram())
         found = scene.enemies + scene.divers
         for across, lane, _ in found:
             rows, columns = slice(56 - 10 * lane, 62 - 10 * lane), across * 84 // 160

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from leapjax import files
 from leapjax.data.storage import UNKNOWN_SEED
 from leapjax.domains.atari import replay
 from leapjax.domains.atari.games import GAMES
-from leapjax.domains.atari.replay import CUT_AFTER, CUT_BEFORE, Episode
+from leapjax.domains.atari.replay import CUT_AFTER, CUT_BEFORE, Episode, writing
+from leapjax.domains.atari.replay.shards import write_header
 from leapjax.errors import UserError
 
 PONG = GAMES["Pong"]
@@ -305,7 +307,7 @@ def test_no_such_folder_game_run_or_shard(tmp_path, monkeypatch):
     logs = replay.replay_logs(tmp_path, PONG, 1)
     logs.mkdir(parents=True)
     assert f"no shards in {logs}" in refused(tmp_path)
-    monkeypatch.setattr(replay.files, "SPARE", 2**60)
+    monkeypatch.setattr(files, "SPARE", 2**60)
     assert "make room" in refused(tmp_path, run=2)
 
 
@@ -408,7 +410,7 @@ def test_a_small_file_of_very_many_rows_is_not_unpacked(tmp_path):
     for name, dtype in STORED.items():
         with gzip.open(logs / f"$store$_{name}_ckpt.0.gz", "wb") as file:
             shape = (rows, 84, 84) if name == "observation" else (rows,)
-            replay._write_header(file, np.dtype(dtype), shape)
+            write_header(file, np.dtype(dtype), shape)
             for _ in range(60 if name == "terminal" else 1):
                 file.write(bytes(10**6))
     (logs / f"{ACTION}_ckpt.0.gz").write_bytes((logs / f"{ACTION}_ckpt.0.gz").read_bytes() * 300)
@@ -449,7 +451,7 @@ def test_what_is_written_is_in_the_format(tmp_path):
 def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, killed_at, written_before):
     if written_before:
         replay.write_shard(tmp_path, 0, episodes([4]))
-    write, calls = replay._write, []
+    write, calls = writing._write_part, []
 
     def killed(*args):
         if len(calls) == killed_at:
@@ -457,7 +459,7 @@ def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, killed_a
         calls.append(args)
         write(*args)
 
-    monkeypatch.setattr(replay, "_write", killed)
+    monkeypatch.setattr(writing, "_write_part", killed)
     with pytest.raises(KeyboardInterrupt):
         replay.write_shard(tmp_path, 0, episodes([5, 6]))
     assert not replay.has_shard(tmp_path, 0)

@@ -31,7 +31,7 @@ from leapjax.checkpoints import Checkpoints
 from leapjax.configuration import configuration_hash, make_domain, resolved, specify
 from leapjax.data import storage
 from leapjax.domain import Collection
-from leapjax.domains.atari import collect
+from leapjax.domains.atari.demonstrators import collect
 from leapjax.domains.babyai import levels
 from leapjax.errors import UserError
 from leapjax.presets import find_preset

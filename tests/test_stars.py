@@ -82,7 +82,7 @@ def test_the_path_is_rewarded_and_any_other_step_is_the_last():
 
 
 def collected(count=4, seed=0):
-    return graphs.collect(STAR, count, seed, lambda done: None).demonstrations
+    return make("Star3x4", Settings()).collect(count, seed, lambda done: None).demonstrations
 
 
 def test_demonstrations_are_the_way():

@@ -94,9 +94,9 @@ def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
 @functools.cache
 def transformed(size):
     """The window at a cell of a demonstration, with another board: compiled once."""
-    data = boards.collect(size, 2, 0, lambda done: None).demonstrations
-    extras = make(f"Sudoku{size.side}x{size.clues}", Settings()).extras
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, extras))
+    domain = make(f"Sudoku{size.side}x{size.clues}", Settings())
+    data = domain.collect(2, 0, lambda done: None).demonstrations
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.extras))
 
     @jax.jit
     def draw(key, index):
@@ -272,7 +272,7 @@ def test_unknown_levels_are_one_line(name, message):
 
 def test_data_that_solve_no_board_are_refused():
     domain = make("Sudoku4x6", Settings())
-    (demonstration,) = boards.collect(SMALL, 1, 0, lambda done: None).demonstrations
+    (demonstration,) = domain.collect(1, 0, lambda done: None).demonstrations
     states = demonstration.observations
     domain.check(states, "here")
     for wrong, message in (

@@ -1,4 +1,4 @@
-"""Damaged checkpoints: how to tell them from those that cannot be read now, and what to do."""
+"""Damaged checkpoints: detects them, describes them and sets them aside."""
 
 import errno
 import shutil

@@ -1,7 +1,8 @@
-"""Demonstrations of worlds whose solution is known once an episode has begun."""
+"""Demonstrations of environments that know the solution of an episode when it begins."""
 
 import itertools
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -12,32 +13,34 @@ from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration
 
+A = TypeVar("A", bound=Adapter)
+
 
 def collect_solved(
-    adapter: Adapter,
-    solve: Callable[[], Array],
+    make_adapter: Callable[[], A],
+    solve: Callable[[A], Array],
     count: int,
     seed: int,
     progress: Callable[[int], None],
 ) -> Collection:
-    """`count` demonstrations, of a training seed, of a world whose solution is known.
+    """Collects demonstrations of an environment whose solution is known.
 
     Args:
-        adapter: the environment.
-        solve: after a reset, the actions that solve it.
-        count: how many.
+        make_adapter: makes the environment.
+        solve: returns the actions that solve an environment after its reset.
+        count: number of demonstrations.
         seed: of the training run; see `leapjax.data.seeds`.
         progress: called with the number of demonstrations so far.
 
     Raises:
-        UserError: none are asked for.
+        UserError: `count` is less than 1.
     """
     if count < 1:
         raise UserError(f"at least one demonstration is needed, got {count}")
-    found = []
+    adapter, found = make_adapter(), []
     for level_seed in itertools.islice(seeds.training_seeds(seed), count):
         states = [adapter.reset(level_seed)]
-        actions = np.array(solve(), np.int32)
+        actions = np.array(solve(adapter), np.int32)
         played = [adapter.step(int(action)) for action in actions]
         states += [transition.observation for transition in played]
         found.append(

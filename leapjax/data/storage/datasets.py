@@ -60,7 +60,7 @@ def exists(name: str) -> bool:
     # A folder without data is a namespace: others may be below it.
     try:
         return (datasets_folder() / name / "data").exists()
-    except OSError:  # no file may have that name, or nobody may look
+    except OSError:  # not a possible name of a file, or not readable
         return False
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from leapjax.checks import MOST, check_fits
+from leapjax.checks import MOST, check_fits, check_range
 from leapjax.data.storage.spaces import name_parts
 from leapjax.domain import Domain
 from leapjax.errors import UserError
@@ -59,11 +59,7 @@ def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Dem
             or types; numbers are out of range.
     """
     actions, rewards = check_actions(given.actions, where), check_rewards(given.rewards, where)
-    last = domain.num_actions - 2
-    if actions.max() > last:
-        raise UserError(
-            f"{where}: actions run from {actions.min()} to {actions.max()}, expected 0 to {last}"
-        )
+    check_range(f"{where}: actions", actions, 0, domain.num_actions - 2)
     if rewards.shape != actions.shape:
         raise UserError(f"{where}: rewards of shape {rewards.shape}, actions of {actions.shape}")
     observations = _arrange_like(domain.blank, given.observations, where)

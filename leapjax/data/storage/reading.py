@@ -77,7 +77,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     _check_memory(name, outlines[:most], domain)
     found: list[Demonstration] = []
     dropped: Counter[str] = Counter()
-    for episode, seed in _episodes(name):
+    for episode, seed in _read_episodes(name):
         if most is not None and len(found) >= most:
             break
         result = _make_demonstration(episode, seed, domain, _name_episode(episode.id, name))
@@ -112,7 +112,7 @@ def _explain_damage(name: str) -> Iterator[None]:
         ) from None
 
 
-def _episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
+def _read_episodes(name: str) -> Iterator[tuple[EpisodeData, int]]:
     """Reads the episodes of an inspected data set, one by one, with the seeds of their resets.
 
     Raises:
@@ -174,10 +174,10 @@ def _check_memory(name: str, outlines: Sequence[PyTree], domain: Domain) -> None
         UserError: they do not; says how much memory they need.
     """
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
-    kept = sum((len(outline["actions"]) + 1) * (state + 8) for outline in outlines)
+    needed = sum((len(outline["actions"]) + 1) * (state + 8) for outline in outlines)
     read = [sum(leaf.nbytes for leaf in jax.tree.leaves(outline)) for outline in outlines]
     # An episode is in memory twice while it is checked.
-    files.check_memory(kept + 2 * max(read, default=0), f"the Minari data set {name!r}")
+    files.check_memory(needed + 2 * max(read, default=0), f"the Minari data set {name!r}")
 
 
 def _name_episode(episode: int, name: str) -> str:

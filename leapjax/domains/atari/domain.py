@@ -104,9 +104,9 @@ def source(game: Game, settings: Settings) -> Source:
     count, run = settings.transitions, settings.replay_run
 
     def load(where: str, seed: int) -> Collection:
-        from leapjax.domains.atari.collect import shards  # noqa: PLC0415  (ale-py is optional)
+        from leapjax.domains.atari.demonstrators.collect import find_shards  # noqa: PLC0415  (ale-py is optional)
 
-        ours = shards(Path(where), game, count, run)
+        ours = find_shards(Path(where), game, count, run)
         found = replay.read(Path(where), game, count, seed, run, ours)
         held = sum(len(each.actions) for each in found.demonstrations)
         if held < count:
@@ -117,13 +117,13 @@ def source(game: Game, settings: Settings) -> Source:
         return found
 
     def write(where: str, progress: Callable[[int], None]) -> str:
-        from leapjax.domains.atari.collect import collect  # noqa: PLC0415  (so)
+        from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (so)
 
         collect(Path(where), game, count, run, LONGEST, progress=progress)
         return f"{count} transitions of {game.name} in {where}"
 
     def exists(where: str) -> bool:
-        from leapjax.domains.atari.collect import is_whole  # noqa: PLC0415  (so)
+        from leapjax.domains.atari.demonstrators.collect import is_whole  # noqa: PLC0415  (so)
 
         return is_whole(Path(where), game, count, run, LONGEST)
 

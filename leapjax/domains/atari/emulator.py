@@ -11,6 +11,7 @@ from ale_py import roms
 
 from leapjax.domains.atari.games import FRAME_SKIP, HEIGHT, MAX_FRAMES, WIDTH, Game
 
+NOOP = 0  # the action that does nothing, in every game
 MOST_NOOPS = 30  # actions that do nothing, with which a game may start
 SCREEN = (210, 160)  # rows and columns
 

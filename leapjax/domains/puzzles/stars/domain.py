@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax.typing import Dtype
 
-from leapjax.checks import check_types
+from leapjax.checks import check_range, check_types
+from leapjax.data.solved import collect_solved
 from leapjax.domain import Augmentation, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
-from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 from leapjax.models.transformer import dense
@@ -62,17 +62,17 @@ class GraphTokens(Encoder):
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """A level by name, such as Star3x5.
+    """Makes a level by name, such as Star3x5.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such level.
     """
     star = graphs.find_level(name)
-    labels = star.labels
+    labels, make_adapter = star.labels, functools.partial(StarAdapter, star)
     augmentations: list[Augmentation] = []
     if settings.augment:
         augmentations.append(functools.partial(graphs.relabel, labels=labels))
-    if settings.augment and settings.fewer_arms:  # it comes first: it leaves edges in their order
+    if settings.augment and settings.fewer_arms:  # applied first, as it keeps the order of edges
         augmentations.append(functools.partial(graphs.leave_out_arms, star=star))
     blank = Graph(
         np.zeros((star.nodes - 1, 2), np.int32), np.zeros((), np.int32), np.zeros((), np.int32)
@@ -84,8 +84,8 @@ def make(name: str, settings: Settings) -> Domain:
 
     return Domain(
         level=name,
-        make_adapter=lambda: StarAdapter(star),
-        collect=functools.partial(graphs.collect, star),
+        make_adapter=make_adapter,
+        collect=functools.partial(collect_solved, make_adapter, lambda adapter: adapter.path),
         actions=(*(str(label) for label in range(labels)), "end"),
         max_steps=star.length,
         blank=blank,
@@ -97,17 +97,13 @@ def make(name: str, settings: Settings) -> Domain:
 
 
 def check(states: Graph, where: str, labels: int) -> None:
-    """Refuses labels that there are not.
+    """Checks that the labels of nodes are in range.
 
     Raises:
-        UserError: says which there are.
+        UserError: one is not.
     """
     for field, values in states._asdict().items():
-        if values.min() < 0 or values.max() >= labels:
-            raise UserError(
-                f"{where}: {field} run from {values.min()} to {values.max()}, expected 0 to "
-                f"{labels - 1}"
-            )
+        check_range(f"{where}: {field}", values, 0, labels - 1)
 
 
 STARS = DomainType(Settings, make, graphs.LEVELS)

@@ -6,7 +6,6 @@ its goal, the end of one arm. Which first step is right can only be told by foll
 step from the steps before it do not learn to look ahead.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
-from leapjax.data.solved import collect_solved
-from leapjax.domain import Collection, level_numbers
+from leapjax.domain import level_numbers
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Window
@@ -97,16 +95,6 @@ class StarAdapter:
             self._graph = before._replace(node=np.int32(action))
         success = moved and action == before.goal
         return Transition(self._graph, float(success), success or not moved, False, success)
-
-
-def collect(star: Star, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
-    """`count` demonstrations of the way to the goal, of a training seed.
-
-    Raises:
-        UserError: none are asked for.
-    """
-    adapter = StarAdapter(star)
-    return collect_solved(adapter, lambda: adapter.path, count, seed, progress)
 
 
 def relabel(key: jax.Array, window: Window, labels: int) -> Window:

@@ -6,7 +6,6 @@ an episode is the digit of cell t, and a clue must be repeated.
 
 import functools
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
-from leapjax.data.solved import collect_solved
-from leapjax.domain import Collection, level_numbers
+from leapjax.domain import level_numbers
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration, Window, pad_token
@@ -184,16 +182,6 @@ class SudokuAdapter:
             self._board = Board(digits, np.int32(cell + 1))
         success = right and cell + 1 == self.size.cells
         return Transition(self._board, float(success), success or not right, False, success)
-
-
-def collect(size: Size, count: int, seed: int, progress: Callable[[int], None]) -> Collection:
-    """`count` demonstrations of boards, solved cell by cell, of a training seed.
-
-    Raises:
-        UserError: none are asked for.
-    """
-    adapter = SudokuAdapter(size)
-    return collect_solved(adapter, lambda: adapter.solution - 1, count, seed, progress)
 
 
 class Puzzle(NamedTuple):

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.checks import check_types
+from leapjax.checks import check_range, check_types
+from leapjax.data.solved import collect_solved
 from leapjax.domain import Domain, DomainType
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
@@ -73,17 +74,18 @@ class BoardTokens(Encoder):
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """A level by name, such as Sudoku9x36.
+    """Makes a level by name, such as Sudoku9x36.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such level.
     """
     size = boards.find_level(name)
+    make_adapter = functools.partial(SudokuAdapter, size)
     turn = functools.partial(boards.transform, side=size.side)
     return Domain(
         level=name,
-        make_adapter=lambda: SudokuAdapter(size),
-        collect=functools.partial(boards.collect, size),
+        make_adapter=make_adapter,
+        collect=functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
         actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
         max_steps=size.cells,
         blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
@@ -97,16 +99,13 @@ def make(name: str, settings: Settings) -> Domain:
 
 
 def check(states: Board, where: str, side: int) -> None:
-    """Refuses digits that there are not, and what does not solve a board cell by cell.
+    """Checks that an episode fills a board cell by cell with digits in range.
 
     Raises:
-        UserError: says what is expected.
+        UserError: it does not.
     """
     digits, cells = states.digits, side**2
-    if digits.min() < 0 or digits.max() > side:
-        raise UserError(
-            f"{where}: digits run from {digits.min()} to {digits.max()}, expected 0 to {side}"
-        )
+    check_range(f"{where}: digits", digits, 0, side)
     if not np.array_equal(states.cell, np.arange(cells + 1)) or digits[-1].min() < 1:
         raise UserError(f"{where} does not fill the {cells} cells of a board, one after the other")
 

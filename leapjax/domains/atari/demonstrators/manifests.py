@@ -1,0 +1,111 @@
+"""Manifests: which games a file holds, with which seeds, noise and rules they were played."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from leapjax import files
+from leapjax.domains.atari import replay
+from leapjax.domains.atari.demonstrators import playing
+from leapjax.domains.atari.games import Game
+from leapjax.errors import UserError
+
+Manifest = dict[str, Any]
+
+
+def manifest_path(logs: Path, number: int) -> Path:
+    """Returns the path of the manifest of a file."""
+    return logs / f"manifest.{number}.json"
+
+
+def read_manifest(
+    folder: Path, game: Game, run: int, number: int, longest: int | None = None
+) -> Manifest | None:
+    """Reads the manifest of a file that was made here; returns None if it was not.
+
+    Args:
+        folder: of all games.
+        game: to expect.
+        run: to expect.
+        number: of the file.
+        longest: decisions of a game, to check that the file equals one that would be made now;
+            None to skip this check.
+
+    Raises:
+        UserError: the manifest is damaged, of another game or run, or fails the check.
+    """
+    logs = replay.replay_logs(folder, game, run)
+    path = manifest_path(logs, number)
+    if not path.exists() or not replay.has_shard(logs, number):
+        return None
+    try:
+        manifest = json.loads(files.read_text(path))
+        count_transitions([manifest])
+        noises = [each["noise"] for each in manifest["games"]]
+        of = manifest["game"], manifest.get("run", run)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
+    if of != (game.name, run):
+        raise UserError(
+            f"{logs} holds games of {of[0]}, run {of[1]}, not of {game.name}, run {run}: give the "
+            "folder its own name again, or name another one"
+        )
+    if longest is None:
+        return manifest
+    another = "remove them, or name another folder"
+    found = manifest.get("longest", longest)
+    if found != longest:
+        raise UserError(
+            f"{logs} holds games that were cut off after {found} decisions, not after {longest}: "
+            f"{another}"
+        )
+    rules = playing.describe_rules(game)
+    # Manifests without these keys are from when all demonstrators had their first rules.
+    played = {"demonstrator": rules["demonstrator"], "rules": 1} | {
+        name: manifest[name] for name in rules if name in manifest
+    }
+    if played != rules:
+        raise UserError(
+            f"{logs} holds games of the demonstrator {played['demonstrator']} with rules "
+            f"{played['rules']}, and today's is {rules['demonstrator']} with rules "
+            f"{rules['rules']}: {another}"
+        )
+    if noises != [playing.choose_noise(game, number + index) for index in range(len(noises))]:
+        raise UserError(
+            f"{logs} holds games with other shares of random actions than today's demonstrators "
+            f"have: {another}"
+        )
+    return manifest
+
+
+def read_manifests(
+    folder: Path,
+    game: Game,
+    run: int,
+    transitions: int,
+    longest: int | None = None,
+    before: Sequence[Manifest] = (),
+) -> list[Manifest]:
+    """Reads the manifests of consecutive files until they hold so many transitions.
+
+    Args:
+        folder: of all games.
+        game: to expect.
+        run: to expect.
+        transitions: number of transitions after which to stop.
+        longest: as in `read_manifest`.
+        before: the first manifests, if they were read already.
+    """
+    made = list(before)
+    while count_transitions(made) < transitions:
+        manifest = read_manifest(folder, game, run, len(made), longest)
+        if manifest is None:
+            break
+        made.append(manifest)
+    return made
+
+
+def count_transitions(manifests: Sequence[Manifest]) -> int:
+    """Counts the transitions of files."""
+    return sum(int(game["transitions"]) for each in manifests for game in each["games"])

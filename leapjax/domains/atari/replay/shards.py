@@ -1,0 +1,112 @@
+"""The files of DQN-Replay: what a shard consists of, and where it is."""
+
+import gzip
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from leapjax.domains.atari.games import GAMES, HEIGHT, WIDTH, Game
+from leapjax.errors import UserError
+
+PADDING = 3  # rows before each episode
+STORED: dict[str, tuple[np.dtype, tuple[int, ...]]] = {  # by name: type, shape of a row
+    "action": (np.dtype(np.int32), ()),
+    "reward": (np.dtype(np.float32), ()),
+    "terminal": (np.dtype(np.uint8), ()),
+    "observation": (np.dtype(np.uint8), (HEIGHT, WIDTH)),
+}
+# The largest is written last: a shard that has it is complete.
+PARTS = tuple(f"$store$_{name}" for name in STORED)
+
+
+class Episode(NamedTuple):
+    """One game of n steps, played until it was over or cut off.
+
+    The format has one mark for both, and agents learn both as an end.
+
+    Attributes:
+        frames: `[n, 84, 84]` uint8, before each action.
+        actions: `[n]` int32.
+        rewards: `[n]` float32.
+    """
+
+    frames: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+
+
+def replay_logs(folder: Path, game: Game, run: int) -> Path:
+    """Returns the folder of a run's shards."""
+    return folder / game.name / str(run) / "replay_logs"
+
+
+def has_shard(folder: Path, number: int) -> bool:
+    """Returns whether all parts of a shard are in a folder."""
+    return all(part_path(folder, part, number).is_file() for part in PARTS)
+
+
+def part_path(logs: Path, part: str, number: int) -> Path:
+    """Returns the path of a part of a shard."""
+    return logs / f"{part}_ckpt.{number}.gz"
+
+
+def find_logs(folder: Path, game: Game, run: int) -> Path:
+    """Finds the folder of a run's shards.
+
+    Raises:
+        UserError: it does not exist; says what does, and how to get data.
+    """
+    logs = replay_logs(folder, game, run)
+    if logs.is_dir():
+        return logs
+    other = "" if run == 1 else f" --replay-run {run}"
+    expected = (
+        f"expected the shards of DQN-Replay in {logs}: copy them from "
+        "gs://atari-replay-datasets, or make such data with "
+        f"`python -m experiments.atari collect --game {game.name}{other}`"
+    )
+    if not folder.is_dir():
+        raise UserError(f"no folder {folder}; {expected}")
+    if not (folder / game.name).is_dir():
+        others = [name for name in GAMES if (folder / name).is_dir()]
+        only = f", only of {', '.join(others)}" if others else ""
+        raise UserError(f"no data of {game.name} in {folder}{only}; {expected}")
+    runs = sorted(path.parent.name for path in (folder / game.name).glob("*/replay_logs"))
+    only = f", only {', '.join(runs)}" if runs else ""
+    raise UserError(f"no run {run} of {game.name} in {folder}{only}; {expected}")
+
+
+def find_shards(logs: Path, chosen: Sequence[int] | None) -> list[int]:
+    """Returns the numbers of the shards in a folder, and checks their files.
+
+    Args:
+        logs: folder of the shards.
+        chosen: numbers of the shards to check; None for all in the folder.
+
+    Raises:
+        UserError: there are no shards, or a part of one is missing or empty.
+    """
+    pattern = rf"(?:{'|'.join(map(re.escape, PARTS))})_ckpt\.(\d+)\.gz"
+    found = (re.fullmatch(pattern, path.name) for path in logs.iterdir())
+    numbers = sorted({int(match[1]) for match in found if match} if chosen is None else chosen)
+    if not numbers:
+        raise UserError(
+            f"no shards in {logs}: expected files such as {part_path(logs, PARTS[-1], 0).name}"
+        )
+    again = "copy it again, or delete the other parts of its shard"
+    for path in (part_path(logs, part, number) for number in numbers for part in PARTS):
+        if not path.is_file():
+            raise UserError(f"{path} is missing, but other parts of its shard are there: {again}")
+        if path.stat().st_size == 0:
+            raise UserError(f"{path} is empty: {again}")
+    return numbers
+
+
+def write_header(file: IO[bytes] | gzip.GzipFile, dtype: np.dtype, shape: tuple[int, ...]) -> None:
+    """Writes the header of a `.npy`; its length does not depend on the number of rows."""
+    descr = np.lib.format.dtype_to_descr(dtype)
+    header = {"descr": descr, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)

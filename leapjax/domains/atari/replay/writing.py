@@ -1,0 +1,88 @@
+"""Writes episodes as a shard of DQN-Replay."""
+
+import contextlib
+import gzip
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from leapjax import files
+from leapjax.domains.atari.games import HEIGHT, WIDTH
+from leapjax.domains.atari.replay.shards import (
+    PADDING,
+    STORED,
+    Episode,
+    part_path,
+    write_header,
+)
+
+_LEVEL = 4  # of gzip: twice as fast as the default, and the files are hardly larger
+
+
+def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
+    """Writes episodes as one shard; a killed program leaves no shard that seems complete.
+
+    Clips the rewards, and adds a row of zeros in place of the last row, which nobody reads.
+
+    Args:
+        folder: of the run's shards, see `replay_logs`; made if it does not exist.
+        number: of the shard; an existing one is replaced.
+        episodes: at least one.
+
+    Raises:
+        ValueError: the arrays of an episode differ in length, or the frames in size.
+        UserError: the files cannot be written, for example because the disk is full.
+    """
+    for episode in episodes:
+        n = len(episode.actions)
+        shapes = [np.shape(part) for part in episode]
+        if n == 0 or shapes != [(n, HEIGHT, WIDTH), (n,), (n,)]:
+            raise ValueError(f"an episode of {n} steps with arrays of the shapes {shapes}")
+    if not episodes:
+        raise ValueError("a shard needs at least one episode")
+    columns: dict[str, Iterable[np.ndarray]] = {
+        "action": (e.actions for e in episodes),
+        "reward": (np.clip(e.rewards, -1, 1) for e in episodes),
+        "terminal": (np.arange(len(e.actions)) == len(e.actions) - 1 for e in episodes),
+        "observation": (e.frames for e in episodes),
+    }
+    added = sum(PADDING + len(e.actions) for e in episodes)
+    # Dopamine's range for stacks of four frames: one row before the next to write, and four on.
+    invalid = (added - 1 + np.arange(PADDING + 2)) % (added + 1)
+    # Remove the frames first, so that old and new parts never look like a complete shard.
+    with contextlib.suppress(OSError):  # missing, or not writable: the writes below say so
+        part_path(folder, "$store$_observation", number).unlink()
+    for part, array in (("add_count", np.array(added)), ("invalid_range", invalid)):
+        _write_part(part_path(folder, part, number), array.dtype, array.shape, [array])
+    for name, values in columns.items():
+        dtype, shape = STORED[name]
+        blocks = _pad(values, dtype, shape)
+        _write_part(
+            part_path(folder, f"$store$_{name}", number), dtype, (added + 1, *shape), blocks
+        )
+
+
+def _pad(
+    values: Iterable[np.ndarray], dtype: np.dtype, shape: tuple[int, ...]
+) -> Iterator[np.ndarray]:
+    """Yields the rows of a part of a shard, with padding before each episode."""
+    zeros = np.zeros((PADDING, *shape), dtype)
+    for value in values:
+        yield zeros
+        yield np.ascontiguousarray(value, dtype)
+    yield zeros[:1]
+
+
+def _write_part(
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], blocks: Iterable[np.ndarray]
+) -> None:
+    """Writes a part of a shard, atomically."""
+    with (
+        files.whole(path) as scratch,
+        scratch.open("wb") as raw,
+        gzip.GzipFile("", "wb", _LEVEL, raw, mtime=0) as file,  # the same bytes at any time
+    ):
+        write_header(file, dtype, shape)
+        for block in blocks:
+            file.write(block.data)
