@@ -10,10 +10,15 @@ class UserError(ValueError):
     """Input that cannot be used: says what was wrong, what was expected, what to do.
 
     It is one line, whatever the input that it quotes.
+
+    Args:
+        message: of any number of lines.
+        fields: of configurations that would have to change; a command line names its options.
     """
 
-    def __init__(self, message: str) -> None:
+    def __init__(self, message: str, *fields: str) -> None:
         super().__init__(" ".join(message.split())[:LONGEST])
+        self.fields = fields
 
 
 def first_line(error: Exception) -> str:

@@ -11,9 +11,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
-from leapjax import checkpoints, domains, pretrained
+from leapjax import domains, pretrained
 from leapjax.checkpoints import Checkpoints
 from leapjax.configuration import change, make_domain, specify
 from leapjax.files import only_process_in
@@ -137,7 +138,7 @@ class Place:
     def parameters(self, runs):
         """The final parameters of the only run in a folder."""
         (path,) = (self.folder / runs).glob(f"*/checkpoints/{STEPS}/default")
-        with checkpoints.ocp.PyTreeCheckpointer() as checkpointer:
+        with ocp.PyTreeCheckpointer() as checkpointer:
             return checkpointer.restore(path.absolute())["params"]
 
     def check_same_end(self, runs, tolerance=0.0):

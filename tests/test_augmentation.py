@@ -12,6 +12,7 @@ from minigrid.core.grid import Grid
 from leapjax.data import windows
 from leapjax.domains.babyai import augmentation, demonstrations, levels, vocabulary
 from leapjax.domains.babyai.adapter import END
+from leapjax.domains.babyai.augmentation.words import GridWords
 from leapjax.domains.babyai.dynamics import FORWARD, LAVA, roll
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
@@ -20,19 +21,19 @@ from tests.oracles import slow_path_lengths
 from tests.programs import only_long
 
 EMPTY, KEY, BALL, BOX = 1, 5, 6, 7
-GRID_WORDS = augmentation.GridWords(
+GRID_WORDS = GridWords(
     jnp.asarray(vocabulary.colour_words()),
     jnp.asarray(vocabulary.object_words((KEY, BALL, BOX))),
     jnp.asarray(vocabulary.mirrored_words()),
     *map(jnp.asarray, vocabulary.joining_words()),
 )
 
-augment = jax.jit(augmentation.augment, static_argnums=3)
-clutter = jax.jit(augmentation.clutter)
+augment = jax.jit(augmentation.apply_symmetries, static_argnums=3)
+clutter = jax.jit(augmentation.add_clutter)
 window_at = jax.jit(windows.window, static_argnums=(2, 3, 4))
 unrolled_at = jax.jit(windows.unrolled_window, static_argnums=(2, 3, 4))
 transition_at = jax.jit(windows.transition_window, static_argnums=(2, 3))
-lay_out = functools.partial(windows.concatenate, extras=augmentation.way)
+lay_out = functools.partial(windows.concatenate, extras=augmentation.mark_needed_cells)
 
 
 @functools.cache
@@ -293,7 +294,7 @@ def changed_by(augmentation_of, windows_of, keys=12):
 
 
 def test_a_false_start_leads_to_where_the_window_began():
-    change = jax.jit(lambda key, window: augmentation.false_start(key, window, 1.0))
+    change = jax.jit(lambda key, window: augmentation.add_false_start(key, window, 1.0))
     lengths = Counter()
     for before, after in changed_by(change, plain_windows()):
         state = after.context.observation
@@ -307,10 +308,10 @@ def test_a_false_start_leads_to_where_the_window_began():
     assert set(lengths) == set(range(1, 7))
 
 
-@pytest.mark.parametrize("name", ["false_start", pytest.param("detour", marks=only_long)])
+@pytest.mark.parametrize("name", ["add_false_start", pytest.param("add_detour", marks=only_long)])
 def test_what_begins_earlier_never_steps_on_lava(name):
     """Demonstrations walk around it: what is added to them must too."""
-    options = {"false_start": (1.0,), "detour": (1.0, GRID_WORDS)}[name]
+    options = {"add_false_start": (1.0,), "add_detour": (1.0, GRID_WORDS)}[name]
     change = jax.jit(lambda key, window: getattr(augmentation, name)(key, window, *options))
     walk = jax.jit(roll)  # compiled once, not for each window
     lava = changed = 0
@@ -329,7 +330,7 @@ def walked(state, actions):
 
 
 def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
-    change = jax.jit(lambda key, window: augmentation.detour(key, window, 1.0, GRID_WORDS))
+    change = jax.jit(lambda key, window: augmentation.add_detour(key, window, 1.0, GRID_WORDS))
     longer = things = 0
     for before, after in changed_by(change, plain_windows(horizon=24)):
         assert after.imitated.all()
@@ -350,7 +351,7 @@ def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
 
 
 def test_short_windows_get_detours_as_often_where_they_turn_as_where_they_move():
-    change = jax.jit(lambda key, window: augmentation.detour(key, window, 1.0, GRID_WORDS))
+    change = jax.jit(lambda key, window: augmentation.add_detour(key, window, 1.0, GRID_WORDS))
     short, keys = plain_windows(horizon=1), 12
     found = Counter(
         int(before.actions[0]) == FORWARD for before, _ in changed_by(change, short, keys)
@@ -362,7 +363,7 @@ def test_short_windows_get_detours_as_often_where_they_turn_as_where_they_move()
 
 @pytest.mark.parametrize("named", [True, False])
 def test_lookalikes_share_kind_or_colour_with_a_target_that_is_named_but_never_both(named):
-    fill = jax.jit(lambda key, window: augmentation.clutter(key, window, 1.0, GRID_WORDS))
+    fill = jax.jit(lambda key, window: augmentation.add_clutter(key, window, 1.0, GRID_WORDS))
 
     def unnamed(window):
         said = jnp.asarray(vocabulary.encode("go to the box", 5))
@@ -391,5 +392,5 @@ def test_half_of_the_sequences_are_said_the_other_way_round_and_settings_choose(
         for changed in (augment(jax.random.key(k), window, GRID_WORDS, True) for k in range(100))
     )
     assert min(said[False], said[True]) > 30
-    assert augmentation.chosen(Settings()) == []
-    assert len(augmentation.chosen(Settings(augment=True, clutter=1.0))) == 2
+    assert augmentation.choose_augmentations(Settings()) == []
+    assert len(augmentation.choose_augmentations(Settings(augment=True, clutter=1.0))) == 2

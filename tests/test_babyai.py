@@ -259,7 +259,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
         (["--seeds", "-1"], "a training seed must be at least 0"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
-        (["--demonstrations", MINE, "--demos", "7"], "fewer than --demos 7: use --demos 6"),
+        (["--demonstrations", MINE, "--demos", "7"], "fewer than 7: ask for 6"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
     ],
 )

@@ -26,6 +26,7 @@ from minari import DataCollector
 from experiments import gymnasium as program
 from leapjax import domains
 from leapjax.data import storage, windows
+from leapjax.data.storage.spaces import SPACES
 from leapjax.domain import Collection, Domain, blank_context
 from leapjax.domains.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.domains.gymnasium.observations import (
@@ -373,10 +374,10 @@ def test_data_of_other_arguments_are_refused_until_they_are_given(
     said = capsys.readouterr().err
     asked = '{"map_name": "8x8", "is_slippery": false}'
     assert "recorded in FrozenLake-v1 with other arguments" in said
-    assert f"--arguments '{asked}'" in said and said.count("\n") == 1
+    assert f"give it {asked} (--arguments)" in said and said.count("\n") == 1
     for other in ('{"is_slippery": false}', '{"map_name": "8x8"}'):  # and all are named again
         assert program.main([*options, "--arguments", other]) == 2
-        assert f"--arguments '{asked}'" in capsys.readouterr().err
+        assert f"give it {asked} (--arguments)" in capsys.readouterr().err
     assert program.main([*options, "--arguments", asked]) == 0
     assert make("FrozenLake-v1", Settings(arguments=asked)).signature["parts"] == [
         ["choices", 64, 0]
@@ -486,7 +487,7 @@ def saved_spaces(name, change):
     """Changes what a data set says of its spaces, as if it came from somewhere else."""
     path = storage.datasets_folder() / name / "data" / "metadata.json"
     metadata = json.loads(path.read_text())
-    spaces = {each: json.loads(metadata[each]) for each in storage.SPACES}
+    spaces = {each: json.loads(metadata[each]) for each in SPACES}
     change(spaces["observation_space"], spaces["action_space"])
     metadata |= {each: json.dumps(space) for each, space in spaces.items()}
     path.write_text(json.dumps(metadata))

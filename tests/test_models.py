@@ -538,7 +538,7 @@ def test_where_embeddings_of_the_paper_start():
 
 def test_only_some_encoders_know_no_pose():
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), 0)
-    with pytest.raises(UserError, match="--no-repeat-state is for architecture 'paper' on BabyAI"):
+    with pytest.raises(UserError, match="not repeated are for architecture 'paper' on BabyAI"):
         build(ModelConfig("paper"), Sizes(4, 0, HORIZON, 9), encoder, repeat_state=False)
 
 

@@ -132,7 +132,7 @@ def test_the_target_network_follows_slowly():
 @pytest.mark.parametrize("name", list(MODULES))
 def test_longer_plans_are_refused(name):
     setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), MODULES[name].Settings())
-    with pytest.raises(UserError, match="--horizon 5: .* one action at a time"):
+    with pytest.raises(UserError, match="a horizon of 5: .* one action at a time"):
         MODULES[name].make_agent(setup)
 
 

@@ -32,7 +32,7 @@ from experiments import (
 )
 from experiments.common import cases
 from leapjax import checkpoints, files, pretrained
-from leapjax.checkpoints import Checkpoints
+from leapjax.checkpoints import Checkpoints, states
 from leapjax.configuration import make_domain, specify
 from leapjax.data import storage
 from leapjax.domains.babyai import demonstrations, levels
@@ -133,7 +133,7 @@ def test_an_odd_name_holds_checkpoints(name, workplace):
 
 def test_a_checkpoint_that_is_written_somewhere_else(workplace, monkeypatch):
     """Whatever the reason: it is found out after the first, not by the next start."""
-    monkeypatch.setattr(checkpoints, "check_path", lambda folder: None)
+    monkeypatch.setattr(states, "check_path", lambda folder: None)
     saved = Checkpoints(workplace / "a\\b")
     saved.save(small(1.0))
     with pytest.raises(UserError, match="was written, but is not found in"):

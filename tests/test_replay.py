@@ -127,7 +127,7 @@ def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = recorded(NAMES["partial"], spoil=DONE)
     assert babyai.main([*TOY, "--demonstrations", name]) == 2
-    assert f"4 episodes that can be used (1 {replay.DONE}), fewer than --demos 6" in (
+    assert f"4 episodes that can be used (1 {replay.DONE}), fewer than 6" in (
         " ".join(capsys.readouterr().err.split())
     )
     few = ["--demos", "4", "--steps", "0", "--method", "random"]

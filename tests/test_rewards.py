@@ -212,7 +212,7 @@ def test_the_return_that_is_wanted_is_less_by_what_was_given():
 @pytest.mark.parametrize("name", list(MODULES))
 def test_longer_plans_are_refused(name):
     setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), SETTINGS[name])
-    with pytest.raises(UserError, match="--horizon 5: .* one action at a time"):
+    with pytest.raises(UserError, match="a horizon of 5: .* one action at a time"):
         MODULES[name].make_agent(setup)
 
 

@@ -134,7 +134,7 @@ def test_where_runs_win_nothing_they_are_refused():
         (bc.BC, single._replace(settings=bc.Settings())),
         (cql.CQL, single._replace(settings=cql.Settings())),
     ):
-        with pytest.raises(UserError, match="--run 4: only LEAP with architecture paper"):
+        with pytest.raises(UserError, match="runs of 4 windows: only LEAP with architecture paper"):
             method.make_agent(made, None)
     encoders = {"paper": lambda model, context: babyai.StateTokens(7, model.width)}
     with pytest.raises(UserError, match="--run 4 with --no-repeat-state"):

@@ -20,6 +20,7 @@ from PIL import Image
 
 from leapjax import files
 from leapjax.data import storage
+from leapjax.data.storage import inspection, writing
 from leapjax.domain import Collection, Domain
 from leapjax.domains.babyai import levels, observations
 from leapjax.domains.babyai.domain import BABYAI
@@ -174,7 +175,7 @@ def test_a_killed_save_leaves_nothing_under_the_name(
             patch.setattr(Path, "rename", die)
         with pytest.raises(Killed):
             save(local_demonstrations)
-    assert any(minari_folder.glob(f"{storage.SCRATCH}*"))  # what a killed program leaves behind
+    assert any(minari_folder.glob(f"{writing.SCRATCH}*"))  # what a killed program leaves behind
     assert not storage.exists(NAME)
     assert "no Minari data set" in refused()
     with warnings.catch_warnings():
@@ -183,7 +184,7 @@ def test_a_killed_save_leaves_nothing_under_the_name(
         save(local_demonstrations)
         assert list(minari.list_local_datasets()) == [NAME]
     assert_same(storage.load(NAME, LEVEL).demonstrations, local_demonstrations)
-    assert not any(minari_folder.glob(f"{storage.SCRATCH}*"))
+    assert not any(minari_folder.glob(f"{writing.SCRATCH}*"))
 
 
 def die(*args, **kwargs):
@@ -236,7 +237,7 @@ def test_several_processes_make_the_same_data_set(local_demonstrations, minari_f
             job.result()
     assert_same(storage.load(NAME, LEVEL).demonstrations, local_demonstrations)
     assert sorted(path.name for path in minari_folder.iterdir()) == [
-        storage.LOCK,
+        writing.LOCK,
         "leapjax",
     ]
 
@@ -543,7 +544,7 @@ def test_bytes_of_varying_length_that_the_file_does_not_hold(minari_folder, save
         h5py.File(file_of(minari_folder)) as file,
         pytest.raises(ValueError, match="words claims 10000 bytes, which are not there"),
     ):
-        storage._check_varying(file["episode_0/infos/words"], "words", 9_999)
+        inspection._check_varying(file["episode_0/infos/words"], "words", 9_999)
 
 
 def other_data_set(space, states, action_space=None, actions=None) -> None:

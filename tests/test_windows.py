@@ -9,7 +9,7 @@ from scipy import stats
 
 from leapjax.data import windows
 from leapjax.data.windows import Steps
-from leapjax.domains.babyai.augmentation import way
+from leapjax.domains.babyai.augmentation import mark_needed_cells
 from leapjax.domains.babyai.observations import Observation
 from leapjax.types import Context, Demonstration, Window
 from tests.oracles import assert_same_observation
@@ -45,7 +45,7 @@ def toy_demonstrations(seed: int = 0) -> list[Demonstration]:
 
 
 def laid_out(demonstrations: list[Demonstration]) -> Steps:
-    return windows.concatenate(demonstrations, extras=way)
+    return windows.concatenate(demonstrations, extras=mark_needed_cells)
 
 
 def on_device(steps: Steps) -> Steps:
@@ -329,7 +329,7 @@ def test_every_demonstration_every_step_or_every_start_counts_the_same():
 
 def test_padding_changes_no_window():
     steps = laid_out(toy_demonstrations())
-    padded = windows.concatenate(toy_demonstrations(), extras=way, padded=True)
+    padded = windows.concatenate(toy_demonstrations(), extras=mark_needed_cells, padded=True)
     assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
     assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
     # JAX's CPU devices share what begins so, and each copies what does not.

@@ -61,8 +61,9 @@ def _check_single(setup: Setup) -> None:
     """Refuses runs of windows, where nothing is won by them."""
     if setup.training.run > 1:
         raise UserError(
-            f"--run {setup.training.run}: only LEAP with architecture paper encodes the states of "
-            "windows in a row once"
+            f"runs of {setup.training.run} windows: only LEAP with architecture paper encodes the "
+            "states of windows in a row once",
+            "run",
         )
 
 

@@ -148,8 +148,10 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
     if in_runs and not setup.settings.repeat_state:
         raise UserError(
-            f"--run {setup.training.run} with --no-repeat-state: windows in a row have different "
-            "later states; drop one"
+            f"runs of {setup.training.run} windows without repeated states: windows in a row have "
+            "different later states; drop one",
+            "run",
+            "repeat_state",
         )
     example = (run_loss, encode_runs) if in_runs else (window_loss, learning.encode_windows(module))
     mean_loss = learning.average_loss(setup, *example)

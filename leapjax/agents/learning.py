@@ -152,8 +152,9 @@ class Setup(NamedTuple):
         """
         if self.horizon != 1:
             raise UserError(
-                f"--horizon {self.horizon}: this method chooses one action at a time, so its "
-                "horizon is 1"
+                f"a horizon of {self.horizon}: this method chooses one action at a time, so its "
+                "horizon is 1",
+                "horizon",
             )
 
 

@@ -40,8 +40,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     sizes, last = setup.sizes, setup.domain.num_actions - 1  # the end action
     if setup.model.architecture != "paper" and setup.horizon > MOST_LAYERS:
         raise UserError(
-            f"--horizon {setup.horizon}: PlaTe with architecture {setup.model.architecture} "
-            f"encodes each state of a plan by itself, so its horizon is at most {MOST_LAYERS}"
+            f"a horizon of {setup.horizon}: PlaTe with architecture {setup.model.architecture} "
+            f"encodes each state of a plan by itself, so its horizon is at most {MOST_LAYERS}",
+            "horizon",
         )
     module = AlternatingModel(setup.model, sizes, setup.encoder())
     optimizer = learning.make_optimizer(setup.training)

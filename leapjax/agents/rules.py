@@ -23,7 +23,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     del mesh
     if setup.domain.rules is None:
         raise UserError(
-            f"--method rules: {setup.domain.level} has no rules that are written as an energy"
+            f"{setup.domain.level} has no rules that are written as an energy: use another method",
+            "method",
         )
     return untrained(setup.domain.rules)
 

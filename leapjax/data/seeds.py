@@ -50,7 +50,8 @@ def check_disjoint(demonstrations: list[int], episodes: range) -> None:
     if shared:
         raise UserError(
             f"level seed {shared[0]} is both a demonstration and a test episode: "
-            "choose another --test-seed"
+            "choose another first seed of the tests",
+            "test_seed",
         )
 
 

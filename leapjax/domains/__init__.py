@@ -83,5 +83,5 @@ def check_imported(level: str, named_by: str) -> None:
     if colon and module not in sys.modules:
         raise UserError(
             f"{named_by} names the level {level}, which would run the module {module}: if you "
-            f"trust it, import {module} first, or name the level (level, --level, --env)"
+            f"trust it, import {module} first, or name the level yourself"
         )

@@ -58,6 +58,7 @@ class Encoder(nn.Module):
             UserError: it cannot tell a pose from the rest of a state.
         """
         raise UserError(
-            "--no-repeat-state is for architecture 'paper' on BabyAI: no other encoder says what "
-            "a state looks like of which the agent's pose is not known; elsewhere --repeat-state"
+            "states that are not repeated are for architecture 'paper' on BabyAI: no other encoder "
+            "says what a state with an unknown pose looks like; repeat states elsewhere",
+            "repeat_state",
         )

@@ -44,7 +44,9 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
                 rows.append(finish(experiment, again, seed, versions, console, interruption))
         except shell.FAILURES as error:
             if len(runs) > 1:  # the others can still be run
-                console.print(f"{config.level}, seed {seed}, failed: {error}")
+                console.print(
+                    f"{config.level}, seed {seed}, failed: {shell.name_options(error) if isinstance(error, UserError) else error}"
+                )
             failure = failure or error
     if rows:
         console.print(results.success_table(rows), results.time_table(rows))

@@ -231,8 +231,9 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
 
 def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
     # An array a row: where a row is added, git stores the new one and shares the others.
+    arrays: Any = tables  # NumPy's stubs take the arrays for its other arguments
     with whole(path) as scratch:
-        np.savez_compressed(scratch, **tables)  # type: ignore[arg-type]
+        np.savez_compressed(scratch, **arrays)
 
 
 def find(path: Path, configuration: str) -> Row | None:

@@ -81,7 +81,7 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
     except Interrupted as stopped:
         stop(module, arguments, stopped)
     except UserError as error:
-        return _end(f"error: {error}", 2)
+        return _end(f"error: {name_options(error)}", 2)
     except NotANumber as error:
         return _end(f"error: {error}", 1)
     except NonFiniteLoss as error:
@@ -103,6 +103,12 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         place = error.filename or "the working folder"
         return _end(f"error: {error.strerror}: {place}", 2)
     return 0
+
+
+def name_options(error: UserError) -> str:
+    """Returns what an error says, and the options that would have to change."""
+    options = [f"--{name.replace('_', '-')}" for name in error.fields]
+    return f"{error} ({', '.join(options)})" if options else str(error)
 
 
 def stoppable(module: str, arguments: Sequence[str], work: Callable[[Interruption], object]) -> int:

@@ -131,8 +131,8 @@ def make_environment(name: str, options: Settings) -> gym.Env:
         with contextlib.suppress(Exception):
             env.close()
         raise UserError(
-            f"{name} has no limit of steps, so an episode may never end: give it one with "
-            "--max-steps"
+            f"{name} has no limit of steps, so an episode may never end: give it one",
+            "max_steps",
         )
     return env
 

@@ -1,0 +1,61 @@
+"""Seals: hashes that show whether a checkpoint is intact, and to which configuration it belongs."""
+
+import hashlib
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from leapjax.errors import UserError
+from leapjax.serialization import IDENTITY, identity_digest
+from leapjax.types import PyTree
+
+
+def seal(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
+    """Adds the SHA-256 of the arrays of each part, and the digest of an identity.
+
+    The format of Orbax detects damage to its own structure, but not to the numbers.
+    """
+    return {
+        **parts,
+        "digests": {name: _hash_arrays(part) for name, part in parts.items()},
+        IDENTITY: identity_digest(identity),
+    }
+
+
+def unseal(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, PyTree]:
+    """Checks what `seal` added and returns the parts alone.
+
+    Raises:
+        ValueError: the numbers are damaged.
+        UserError: the numbers are intact, but the identity is another.
+    """
+    parts = {name: part for name, part in saved.items() if name not in ("digests", IDENTITY)}
+    for name, part in parts.items():
+        if not np.array_equal(_hash_arrays(part), saved["digests"][name]):
+            raise ValueError(f"the numbers of {name} are not those that were saved")
+    check_same(saved[IDENTITY], identity, path)
+    return parts
+
+
+def check_same(saved: np.ndarray, identity: str, checkpoint: Path) -> None:
+    """Checks that the saved digest `[32]` is that of an identity.
+
+    Raises:
+        UserError: the checkpoint was saved with another identity.
+    """
+    if not np.array_equal(saved, identity_digest(identity)):
+        raise UserError(
+            f"the checkpoint {checkpoint} is of another configuration than the one beside it: it "
+            "was copied here from another run, or the specification was changed; put back what "
+            "was there, or train again in another folder",
+            "runs",
+        )
+
+
+def _hash_arrays(tree: PyTree) -> np.ndarray:
+    """Returns the SHA-256 of the arrays of a tree, `[32]` uint8."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)

@@ -1,0 +1,88 @@
+"""Whether a data set was recorded in the environment in which its domain is played."""
+
+import json
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from leapjax.data.storage.datasets import UNKNOWN_SEED, find_version
+from leapjax.domain import Described, Domain
+from leapjax.environments import Adapter, closing
+from leapjax.errors import UserError
+from leapjax.types import Demonstration, PyTree
+
+COMPARED = 100  # steps to play again, at most
+
+
+def check_arguments(name: str, recorded: Described, domain: Domain) -> None:
+    """Checks that the environment of a data set was made with the arguments of a domain's.
+
+    Raises:
+        UserError: it was not; says how to play with the arguments of the data.
+    """
+    if domain.arguments is None or recorded.arguments is None:
+        return
+    # The way of rendering does not change an environment.
+    recorded_with, played_with = (
+        {key: value for key, value in arguments.items() if key != "render_mode"}
+        for arguments in (recorded.arguments, domain.arguments)
+    )
+    if recorded_with != played_with:
+        raise UserError(
+            f"{name} was recorded in {domain.level} with other arguments than it is played with: "
+            f"give it {json.dumps(recorded_with)}",
+            "arguments",
+        )
+
+
+def compare_with_play(
+    name: str, recorded: Described, domain: Domain, found: Sequence[Demonstration]
+) -> None:
+    """Plays an episode of a data set again, and warns if the environment behaves differently.
+
+    A data set need not say how its environment was made: Minari leaves that out if a wrapper has
+    a function as argument. This plays `COMPARED` steps of the first episode with a known seed.
+    """
+    made_here = find_version(name) is not None
+    if made_here or domain.replay is not None:  # `replay` plays all episodes again
+        return
+    known = next((each for each in found if each.seed != UNKNOWN_SEED), None)
+    problem = None
+    if known is not None:
+        with closing(domain.make_adapter()) as adapter:
+            problem = _find_difference(adapter, known)
+    elif found and recorded.level is None:
+        problem = "the data name neither their environment nor the seeds of its resets"
+    if problem is not None:
+        warnings.warn(
+            f"{name} may not have been recorded in {domain.level} as it is played: {problem}; look "
+            "for wrappers, other arguments or another version",
+            stacklevel=3,
+        )
+
+
+def _find_difference(adapter: Adapter, recorded: Demonstration) -> str | None:
+    """Plays an episode again and describes its first difference from the recording, if any."""
+
+    def differs(played: Any, stored: Any) -> bool:
+        pairs = zip(jax.tree.leaves(played), jax.tree.leaves(stored), strict=True)
+        return not all(np.allclose(one, other, rtol=1e-4, atol=1e-5) for one, other in pairs)
+
+    def state(step: int) -> PyTree:
+        return jax.tree.map(lambda leaf: leaf[step], recorded.observations)
+
+    again = f"an episode that is played again with its seed {recorded.seed} has another"
+    if differs(adapter.reset(recorded.seed), state(0)):
+        return f"{again} first observation"
+    for step, action in enumerate(recorded.actions[:COMPARED]):
+        found = adapter.step(int(action))
+        if differs(found.reward, recorded.rewards[step]):
+            return f"{again} reward at step {step}"
+        if differs(found.observation, state(step + 1)):
+            return f"{again} observation after step {step}"
+        if found.terminated or found.truncated:
+            break
+    return None

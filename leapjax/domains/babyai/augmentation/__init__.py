@@ -1,0 +1,56 @@
+"""More windows from the same demonstrations, one kind of augmentation a file.
+
+`equivalents` applies symmetries of the world and its language, `clutter` adds objects,
+`false_starts` and `detours` add moves before the window. The extras of a window are the cells
+that its demonstration needs free from here on: `[S, S]` bool.
+"""
+
+import numpy as np
+
+from leapjax.domain import Augmentation
+from leapjax.domains.babyai import symmetries
+from leapjax.domains.babyai.augmentation.clutter import add_clutter
+from leapjax.domains.babyai.augmentation.detours import add_detour
+from leapjax.domains.babyai.augmentation.equivalents import apply_symmetries
+from leapjax.domains.babyai.augmentation.false_starts import add_false_start
+from leapjax.domains.babyai.augmentation.words import find_words
+from leapjax.domains.babyai.settings import Settings
+from leapjax.types import Demonstration
+
+
+def choose_augmentations(settings: Settings) -> list[Augmentation]:
+    """Returns the augmentations that the settings ask for; the last of them is applied first."""
+    found: list[Augmentation] = []
+    if settings.augment:
+        found.append(
+            lambda key, w: apply_symmetries(key, w, find_words(), settings.exchange_objects)
+        )
+    if settings.false_starts:
+        found.append(lambda key, w: add_false_start(key, w, settings.false_starts))
+    if settings.detours:
+        found.append(lambda key, w: add_detour(key, w, settings.detours, find_words()))
+    if settings.clutter:
+        lookalikes = find_words() if settings.lookalikes else None
+        found.append(lambda key, w: add_clutter(key, w, settings.clutter, lookalikes))
+    return found
+
+
+def mark_needed_cells(demonstration: Demonstration) -> np.ndarray:
+    """Marks the cells that the rest of a demonstration needs free, from each step on.
+
+    The agent stands on them, or puts an object down on them.
+
+    Args:
+        demonstration: of n steps.
+
+    Returns:
+        `[n, S, S]` bool.
+    """
+    poses, actions = demonstration.observations.pose, demonstration.actions
+    needed = np.zeros((len(poses), *demonstration.observations.grid.shape[1:3]), bool)
+    needed[np.arange(len(poses)), poses[:, 0], poses[:, 1]] = True
+    drops = np.flatnonzero(actions == symmetries.DROP)
+    front = poses[drops, :2] + symmetries.DIRECTION_VECTORS[poses[drops, 2]]
+    front = front.clip(0, needed.shape[1] - 1)  # a user's data may face out of the grid
+    needed[drops, front[:, 0], front[:, 1]] = True
+    return np.logical_or.accumulate(needed[::-1])[::-1][:-1]
