@@ -137,5 +137,5 @@ def test_where_runs_win_nothing_they_are_refused():
         with pytest.raises(UserError, match="runs of 4 windows: only LEAP with architecture paper"):
             method.make_agent(made, None)
     encoders = {"paper": lambda model, context: babyai.StateTokens(7, model.width)}
-    with pytest.raises(UserError, match="--run 4 with --no-repeat-state"):
+    with pytest.raises(UserError, match="runs of 4 windows without repeated states"):
         leap.make_agent(setup(domain=DOMAIN._replace(encoders=encoders), repeat_state=False))
