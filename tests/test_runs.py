@@ -13,6 +13,7 @@ from leapjax.agents import bc, cql, leap
 from leapjax.agents.batches import run_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
+from leapjax.domains.babyai import encoders as babyai
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
@@ -135,3 +136,6 @@ def test_where_runs_win_nothing_they_are_refused():
     ):
         with pytest.raises(UserError, match="runs of 4 windows: only LEAP with architecture paper"):
             method.make_agent(made, None)
+    encoders = {"paper": lambda model, context: babyai.StateTokens(7, model.width)}
+    with pytest.raises(UserError, match="runs of 4 windows without repeated states"):
+        leap.make_agent(setup(domain=DOMAIN._replace(encoders=encoders), repeat_state=False))
