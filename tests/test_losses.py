@@ -46,21 +46,6 @@ def test_bellman_targets(terminated):
     np.testing.assert_array_equal(gradient, [0, 0])
 
 
-def test_bellman_targets_of_several_values():
-    transition = TransitionWindow(context([0, 1, 2], [5.0, 1.0, 2.0]), jnp.array(True))
-    values = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])
-    found = losses.bellman(transition, values, 0.5)
-    np.testing.assert_allclose(found, [[6, 11, 16], [2, 2, 2]])
-
-
-def test_the_values_of_actions():
-    values = np.random.default_rng(0).normal(size=(2, CHOICES, 4))
-    actions = jnp.array([2, 0])
-    np.testing.assert_allclose(losses.of_action(values, actions), [values[0, 2], values[1, 0]])
-    single = losses.of_action(values[..., 3], actions)
-    np.testing.assert_allclose(single, [values[0, 2, 3], values[1, 0, 3]])
-
-
 @pytest.mark.parametrize("kappa", [0.3, 1.0])
 def test_the_quantile_huber_loss_is_what_loops_say(kappa):
     rng = np.random.default_rng(0)
