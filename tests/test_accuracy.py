@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from experiments import accuracy
-from leapjax.data import storage
 from leapjax.data.windows import Window
 from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.observations import Observation
@@ -66,6 +65,13 @@ def collect(count, seed):
     return DOMAIN.collect(count, seed, lambda done: None)
 
 
+def test_the_demonstrations_of_both_kinds_are_different_levels():
+    origin = Origin("leapjax", 999, 4)
+    learned, others = (of(DOMAIN, origin, 9) for of in (accuracy.learned, accuracy.others))
+    assert len(learned) == len(others) == 4  # what there was
+    assert not {d.seed for d in learned} & {d.seed for d in others}
+
+
 def test_counts_are_those_of_every_step():
     """Three demonstrations of 2, 3 and 7 steps that count up from 0, or stand still."""
     whole = max(collect(20, 0).demonstrations, key=lambda d: len(d.actions))
@@ -97,27 +103,6 @@ def test_counts_are_those_of_every_step():
     assert accuracy.accuracy(planner, data, 3)[1][0] == 3
 
 
-def test_the_demonstrations_of_both_kinds_are_different_levels():
-    for seed in (0, 999):
-        origin = Origin("leapjax", seed, 4)
-        learned = accuracy.learned(DOMAIN, origin, 3)
-        others = accuracy.others(DOMAIN, origin, 3)
-        assert (len(learned), len(others)) == (3, 3)
-        assert not {d.seed for d in learned} & {d.seed for d in others}
-        everything = (
-            accuracy.learned(DOMAIN, origin, 9), accuracy.others(DOMAIN, origin, 9)
-        )  # fmt: skip
-        assert [len(each) for each in everything] == [4, 4]  # what there was
-
-
-def test_a_users_data_set_is_what_was_learned_from():
-    collection = collect(3, 5)
-    storage.save("accuracy/mine-v0", collection, DOMAIN, "three demonstrations")
-    origin = Origin("leapjax", 0, 2, "accuracy/mine-v0")
-    learned = accuracy.learned(DOMAIN, origin, 9)
-    assert [d.seed for d in learned] == [d.seed for d in collection.demonstrations[:2]]
-
-
 @only_long
 def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch, capsys):
     run = untrained_run(tmp_path / "run")
@@ -142,8 +127,3 @@ def test_what_nobody_demonstrates_has_nothing_to_compare_with(tmp_path, capsys):
     seal(run)
     assert accuracy.main([str(run)]) == 2
     assert "CartPole-v1, which nobody here demonstrates" in capsys.readouterr().err
-
-
-def test_no_run_is_an_error(capsys):
-    assert accuracy.main([]) == 2
-    assert "at least one folder" in capsys.readouterr().err

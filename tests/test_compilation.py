@@ -58,15 +58,11 @@ def test_what_the_user_has_set_stays(setting, value, no_cache, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_it_can_be_turned_off(no_cache, monkeypatch):
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
-    compilation.use_disk_cache()
-    assert getattr(jax.config, FOLDER) is None
-
-
-def test_programs_whose_compile_times_are_measured_have_none(no_cache, tmp_path, monkeypatch):
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
-    jax_setup.start(cache=False)
+@pytest.mark.parametrize("where", ["the environment", "the program"])
+def test_it_can_be_turned_off(where, no_cache, tmp_path, monkeypatch):
+    folder = "off" if where == "the environment" else str(tmp_path)
+    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", folder)
+    jax_setup.start(cache=where == "the environment")
     compilation.use_disk_cache()  # as `compile_planner` does
     assert getattr(jax.config, FOLDER) is None
 

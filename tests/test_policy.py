@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from leapjax.models.encoder import Encoder
-from leapjax.models.policy import PolicyModel, past_and_present
+from leapjax.models.policy import PolicyModel
 from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Context, pad_token
 from tests.parameters import random_like
@@ -54,10 +54,13 @@ def model(architecture, past=PAST):
     return quick_jit(module.apply), random_like(shapes, scale=1.0)
 
 
-@pytest.mark.parametrize(("architecture", "states"), [("paper", PAST + 1), ("leapjax", 1)])
-def test_each_head_speaks_of_each_state(architecture, states):
-    apply, params = model(architecture)
-    said = apply(params, context(3))
+@pytest.mark.parametrize(
+    ("architecture", "past", "states"),
+    [("paper", PAST, PAST + 1), ("paper", 0, 1), ("leapjax", PAST, 1)],
+)
+def test_each_head_speaks_of_each_state(architecture, past, states):
+    apply, params = model(architecture, past)
+    said = apply(params, context(3, past))
     shapes = {name: values.shape for name, values in said.items()}
     assert shapes == {"logits": (states, ACTIONS - 1), "value": (states, 1)}
     assert all(np.isfinite(values).all() for values in said.values())
@@ -82,23 +85,8 @@ def test_what_is_said_of_a_state_depends_on_what_came_before_it_alone():
         assert differs.tolist() == [s >= first for s in range(PAST + 1)], place
 
 
-@pytest.mark.parametrize("architecture", ["paper", "leapjax"])
-def test_without_a_past_only_the_present_counts(architecture):
-    apply, params = model(architecture, past=0)
-    said = apply(params, context(3, past=0))
-    assert said["logits"].shape == (1, ACTIONS - 1)
-
-
 def test_padded_actions_are_tokens_of_their_own():
     apply, params = model("paper")
     given = context(3)
     padded = given._replace(actions=changed(given.actions, 0, pad_token(ACTIONS)))
     assert not np.allclose(apply(params, padded)["logits"][-1], apply(params, given)["logits"][-1])
-
-
-def test_what_belongs_to_the_last_states():
-    past, present = jnp.array([1, 2, 3]), jnp.array(4)
-    for count in (1, 2, 4):
-        expected = [1, 2, 3, 4][-count:]
-        assert past_and_present(past, present, count).tolist() == expected
-    assert past_and_present(jnp.zeros(0, int), present, 1).tolist() == [4]

@@ -1,6 +1,5 @@
 """Episodes inside `jit` are the episodes of the lockstep rollout."""
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -72,7 +71,9 @@ ENERGY = leap.from_total(lambda params, context: context, total, END + 1)
 CONFIG = leap.GibbsConfig(horizon=4, iterations=6, temperature=0.7)
 
 
-@pytest.mark.parametrize(("context", "executed", "most"), [(0, None, 50), (3, 2, 50), (1, 3, 5)])
+@pytest.mark.parametrize(
+    ("context", "executed", "most"), [(3, 2, 50), pytest.param(0, None, 5, marks=only_long)]
+)
 def test_the_episodes_are_those_of_the_lockstep_rollout(context, executed, most):
     seeds = range(100, 140)
     rollout = compile_rollout(
@@ -117,36 +118,28 @@ def test_a_plan_that_ends_at_once_gives_up():
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="the energy has 4 actions and the environment 3"):
         compile_rollout(WALK._replace(num_actions=3), ENERGY, CONFIG, context=0, max_steps=9)
-    for name in ("executed", "max_steps"):
-        options = {"max_steps": 9, name: 0}
-        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
-            compile_rollout(WALK, ENERGY, CONFIG, context=0, **options)
+    for name, wrong in {"executed": 0, "max_steps": 2**31, "context": 1.5}.items():
+        options = {"context": 0, "max_steps": 9, name: wrong}
+        with pytest.raises(UserError, match=f"{name} must be"):
+            compile_rollout(WALK, ENERGY, CONFIG, **options)
     rollout = compile_rollout(WALK, ENERGY, CONFIG, context=0, max_steps=9)
     with pytest.raises(ValueError, match="NaN or -inf in 3 of 3 episodes"):
         rollout(jnp.nan, range(3))
-    for wrong in (-1, 1.5, math.nan, True):
-        with pytest.raises(UserError, match="context must be"):
-            compile_rollout(WALK, ENERGY, CONFIG, context=wrong, max_steps=9)
-    for wrong in (None, math.nan, 2**31):
-        with pytest.raises(UserError, match="max_steps must be"):
-            compile_rollout(WALK, ENERGY, CONFIG, context=0, max_steps=wrong)
-    for wrong in (2**32 + 5, 5.9, -1, True):
-        with pytest.raises(UserError, match="level seed must be"):
-            rollout(1.0, [0, wrong])
-        with pytest.raises(UserError, match="^seed must be"):
-            rollout(1.0, [0], wrong)
+    with pytest.raises(UserError, match="level seed must be"):
+        rollout(1.0, [0, 2**32 + 5])
+    with pytest.raises(UserError, match="^seed must be"):
+        rollout(1.0, [0], -1)
     with pytest.raises(UserError, match="params holds 1e[+]300"):
         rollout(np.float64(1e300), [0])
 
 
-def led(**changes):
+def led(state=lambda state: state, **changes):
     """The step of the world, but for what it returns."""
 
-    def changed(state, action):
-        state, found = step(state, action)
+    def changed(before, action):
+        after, found = step(before, action)
         parts = {name: change(getattr(found, name)) for name, change in changes.items()}
-        state = parts.pop("state", state)
-        return state, found._replace(**parts)
+        return state(after), found._replace(**parts)
 
     return WALK._replace(step=changed)
 
@@ -159,32 +152,15 @@ def tripled(tree):
     ("world", "says"),
     [
         (led(observation=tripled), r"observation\['at'\] as int32\[3\], but reset as int32\[\]"),
-        (WALK._replace(reset=lambda key: (reset(key)[0], tripled(reset(key)[1]))), "observation"),
-        (led(observation=lambda x: {**x, "at": x["at"] + 0.5}), "as float32.* reset as int32"),
         (led(observation=lambda x: {**x, "more": 0}), "observation of another structure"),
-        (led(observation=lambda x: jax.random.key(0)), "observation of another structure"),
-        (
-            WALK._replace(step=lambda s, a: (s._replace(at=tripled(s.at)), step(s, a)[1])),
-            "state.at",
-        ),
-        (WALK._replace(step=lambda s, a: (tuple(s), step(s, a)[1])), "state of another structure"),
-        (
-            WALK._replace(step=lambda s, a: (s._replace(at=jax.random.key(0)), step(s, a)[1])),
-            "key<",
-        ),
+        (led(state=lambda s: s._replace(at=tripled(s.at))), "state.at"),
         (WALK._replace(step=lambda s, a: step(s, a)[1]), r"must return \(state, Transition\)"),
-        (WALK._replace(step=lambda s, a: (s, tuple(step(s, a)[1]))), r"\(state, Transition\)"),
         (
             WALK._replace(reset=lambda key: reset(key)[1]["at"]),
             r"must return \(state, observation\)",
         ),
         (led(reward=lambda x: x[None]), r"a real number of shape \(\) as reward, got float32\[1\]"),
-        (led(reward=lambda x: x + 1j), "a real number .* as reward, got complex64"),
-        (led(reward=lambda x: None), "a real number .* as reward, got None"),
         (led(terminated=lambda x: x.astype(int)), "a boolean .* as terminated, got int32"),
-        (led(truncated=tripled), "a boolean .* as truncated"),
-        (led(success=lambda x: 0.0), "a boolean .* as success, got float32"),
-        (led(score=lambda x: jnp.zeros(2)), "a real number .* as score"),
         (led(taken=lambda x: 1.0), "an integer .* as taken"),
     ],
 )
@@ -193,54 +169,15 @@ def test_a_step_hands_on_what_the_reset_began(world, says):
         compile_rollout(world, ENERGY, CONFIG, context=1, max_steps=9)
 
 
-def loose_reset(key):
-    state, observation = reset(key)
-    return {"place": state, "count": 0, "key": key, "sum": 0.0}, observation
-
-
-def loose_step(state, action):
-    place, found = step(state["place"], action)
-    state = {
-        **state,
-        "place": place,
-        "count": state["count"] + 1,
-        "sum": state["sum"] + found.reward,
-    }
-    return state, found._replace(
-        reward=found.reward.astype(jnp.bfloat16), truncated=False, taken=jnp.uint8(1), score=1,
-        observation={"at": found.observation["at"].astype(jnp.int8), "to": found.observation["to"]},
-    )  # fmt: skip
-
-
-def test_numbers_of_python_and_types_that_jax_promotes_are_taken():
-    world = PureEnvironment(loose_reset, loose_step, END + 1)
-    rollout = compile_rollout(world, ENERGY, CONFIG, context=1, max_steps=5)
-    found = rollout(1.0, range(4))
-    np.testing.assert_array_equal(found.returns, found.lengths)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["reward", *(pytest.param(name, marks=only_long) for name in ("score", "observation"))],
-)
-def test_numbers_that_are_not_finite_are_refused(name):
+def test_numbers_that_are_not_finite_are_refused():
     def late(state, action):
         state, found = step(state, action)
-        bad = jnp.where(state.steps == 3, jnp.nan, 0.0)
-        seen = {"at": found.observation["at"] + bad, "to": found.observation["to"]}
-        given = {"observation": seen, "reward": bad, "score": 1 / (1 - (state.steps == 3))}
-        if name == "observation":
-            return state, found._replace(observation=seen)
-        return state, found._replace(**{name: given[name]})
-
-    def first(key):
-        state, seen = reset(key)
-        return state, {**seen, "at": seen["at"] * 1.0} if name == "observation" else seen
+        return state, found._replace(reward=jnp.where(state.steps == 3, jnp.nan, 0.0))
 
     still = leap.from_total(
         lambda params, context: (), lambda p, m, actions: (actions != STAY).sum() * 1.0, END + 1
     )
-    world = PureEnvironment(first, late, END + 1)
+    world = WALK._replace(step=late)
     rollout = compile_rollout(world, still, leap.GibbsConfig(2, 2), context=1, max_steps=5)
     assert rollout((), [8, 13]).lengths.tolist() == [2, 2]  # over before
     with pytest.raises(UserError, match="not finite in 2 of 4 .* at step 3 of level seed 11"):

@@ -48,6 +48,47 @@ def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_aga
     assert found[5] == "-"
 
 
+def test_settings_are_kept_apart():
+    others = [
+        row(name="paper", rate=0.8), row(name="paper", rate=0, masking="one"),
+        row(method="random", rate=0.1), row(method="classifier", rate=0),
+        row(played=True, executed=3, rate=1.0, mean_length=4.0),
+        row(played=True, executed=1, rate=0), row(played=True, iterations=1, rate=0),
+    ]  # fmt: skip
+    found = cells(babyai.success([*ROWS, *others]), "S8N7")
+    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
+    found = cells(babyai.steps([*ROWS, others[4]]), "S8N7")
+    assert found[1:] == ["-", "-", "6.0", "4.0"]
+
+
+def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself():
+    rows = [
+        row(played=True, iterations=1, rate=0.02), row(rate=0.9),  # N = T = 5
+        row(played=True, iterations=2, rate=0, seed=1),
+        row("PickUpLoc"),  # of one N alone there is nothing to see
+    ]  # fmt: skip
+    (by_preset,) = babyai.success_by_iterations(rows).values()
+    assert {title: list(by_count) for title, by_count in by_preset.items()} == {
+        "preset `leapjax`": [1, 5]
+    }
+    assert {"2.0%", "90.0%"} < set(cells(babyai.iterations(rows), "S8N7"))
+
+
+def test_what_acting_costs():
+    # 500 episodes of 6 steps: a plan for each step, or for three.
+    rows = [row(method="bc", rate=1.0) | {"plans": 3000}, row() | {"plans": 1000}]
+    assert babyai.acting(rows).splitlines()[2:] == [
+        "| GoToLocalS8N7 | 6.0 | - | - | - | - | - | 6.0 (2.0) |"
+    ]
+    timed = [
+        {"level": "GoToLocalS8N7", "method": method, "plans_per_second": 100.0}
+        for method in ("bc", "leap")
+    ]
+    assert babyai.price(rows, timed).splitlines()[2:] == [
+        "| GoToLocalS8N7 | 10.000 | - | - | - | - | - | 3.333 |"
+    ]
+
+
 def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     rows = [
         row(rate=0.9), row(method="bc", rate=1.0), row(method="bc", seed=1, rate=0.9),
@@ -85,62 +126,6 @@ def test_what_has_rows_on_every_level_is_aggregated(tmp_path):
     assert "| 63.6% | - | - | 90.0% [" in line
     figures.intervals(found, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
-
-
-def test_what_acting_costs():
-    # 500 episodes of 6 steps: a plan for each step, or for three.
-    rows = [row(method="bc", rate=1.0) | {"plans": 3000}, row() | {"plans": 1000}]
-    assert babyai.acting(rows).splitlines()[2:] == [
-        "| GoToLocalS8N7 | 6.0 | - | - | - | - | - | 6.0 (2.0) |"
-    ]
-    timed = [
-        {"level": "GoToLocalS8N7", "method": method, "plans_per_second": 100.0}
-        for method in ("bc", "mopo", "leap")
-    ]
-    assert babyai.price(rows, timed).splitlines()[2:] == [
-        "| GoToLocalS8N7 | 10.000 | - | - | - | - | - | 3.333 |"
-    ]
-    rows = [row("PickUpLoc", method="bc") | {"plans": 3000}]
-    assert babyai.acting(rows).endswith("\n| PickUpLoc | 6.0 | - | - | - | - | - | - |")
-    assert babyai.price(rows, timed).splitlines()[2:] == []  # not measured
-
-
-def test_settings_are_kept_apart():
-    others = [
-        row(name="paper", rate=0.8),
-        row(name="paper", rate=0, masking="one"),
-        row(method="random", rate=0.1),
-        row(method="classifier", rate=0),
-        row(played=True, executed=3, rate=1.0, mean_length=4.0),
-        row(played=True, executed=1, rate=0),
-        row(fields=0, rate=0),
-        row(played=True, iterations=1, rate=0),
-    ]
-    found = cells(babyai.success([*ROWS, *others]), "S8N7")
-    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
-    found = cells(babyai.steps([*ROWS, others[4]]), "S8N7")
-    assert found[1:] == ["-", "-", "6.0", "4.0"]
-
-
-def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself(tmp_path):
-    rows = [
-        *(row(played=True, iterations=n, rate=n / 50) for n in (1, 10)),
-        row(rate=0.9),  # N = T = 5
-        row(played=True, iterations=2, rate=0, seed=1),
-        *(row(name="paper", played=True, iterations=n, rate=n / 10) for n in (1, 2, 5)),
-        row(name="paper", rate=1.0),  # N = 10
-        row("PickUpLoc"),  # of one N alone there is nothing to see
-    ]
-    found = babyai.success_by_iterations(rows)
-    assert list(found) == ["GoToLocalS8N7"]
-    counts = {title: list(by_count) for title, by_count in found["GoToLocalS8N7"].items()}
-    assert counts == {"preset `paper`": [1, 2, 5, 10], "preset `leapjax`": [1, 5, 10]}
-    lines = [line.strip("| ").split("|") for line in babyai.iterations(rows).splitlines()[2:]]
-    rates = [[cell.strip() for cell in line] for line in lines]
-    assert rates[0][2:6] == ["10.0%", "20.0%", "50.0%", "100.0%"]
-    assert rates[1][2:6] == ["2.0%", "", "90.0%", "20.0%"]
-    figures.iterations_by_level(found, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
