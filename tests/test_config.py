@@ -5,13 +5,13 @@ import itertools
 import math
 import typing
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 import experiments.__main__ as programs
+from experiments.common.searches import searches
 from leapjax import domains, files, pretrained, serialization
 from leapjax.agents.learning import TrainingConfig
 from leapjax.configuration import configuration_hash, make_domain, resolved, specify
@@ -26,6 +26,7 @@ from leapjax.presets import babyai, find_preset
 from leapjax.running import command_line, limits, memory, shell
 from leapjax.running.command_line import GROUPS
 from leapjax.types import TrainState
+from tests.programs import only_long
 
 LEVEL = "GoToLocalS7N5"
 
@@ -42,6 +43,17 @@ def parse(*arguments):
     return found
 
 
+@only_long
+def test_options_of_training_are_not_for_methods_that_learn_nothing():
+    found = command_line.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
+    steps = {each.method: each.training.steps for each in found}
+    assert steps.pop("random") == 0 and set(steps.values()) == {5}
+    with pytest.raises(UserError, match="got 0: --steps 5 needs demonstrations"):
+        parse("--method", "random", "--steps", "5")
+    with pytest.raises(UserError, match="got -1: --steps 5 needs demonstrations"):
+        parse("--demos", "-1", "--steps", "5")
+
+
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {
@@ -52,18 +64,21 @@ def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
 
 
 @pytest.mark.parametrize(
-    ("options", "changes"),
-    [
-        (["--demos 499", "--context 1", "--heads 2", "--steps 7", "--iterations 9",
-          "--masking one", "--radius 2", "--test-seed 1", "--executed 3"], True),
-        (["--seeds 1 2", "--record", "--runs elsewhere", "--no-pictures",
-          "--checkpoint-seconds 1", "--fsdp 2", "--microbatch 8"], False),
-    ],
+    "option",
+    ["--demos 499", "--context 1", "--heads 2", "--steps 7", "--iterations 9", "--masking one",
+     "--radius 2", "--test-seed 1", "--validation", "--executed 3"],
 )  # fmt: skip
-def test_what_a_result_depends_on_is_in_its_hash_and_nothing_else(options, changes):
-    for option in options:
-        different = configuration_hash(parse(*option.split()), 0) != configuration_hash(parse(), 0)
-        assert different == changes, option
+def test_what_a_result_depends_on_is_in_its_hash(option):
+    assert configuration_hash(parse(*option.split()), 0) != configuration_hash(parse(), 0)
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--seeds 1 2", "--record", "--runs elsewhere", "--no-pictures", "--checkpoint-seconds 1",
+     "--fsdp 2", "--microbatch 8", "--demos 500"],
+)  # fmt: skip
+def test_what_it_does_not_depend_on_is_not(option):
+    assert configuration_hash(parse(*option.split()), 0) == configuration_hash(parse(), 0)
 
 
 def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
@@ -96,6 +111,42 @@ def test_the_settings_of_a_row_can_be_read_back():
             serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
+def test_options_have_the_names_and_defaults_of_their_group():
+    chosen = parse("--preset", "paper", "--method", "classifier", "--level", "GoToSeqS5R2")
+    assert (chosen.context, chosen.planner.horizon, chosen.planner.iterations) == (20, 5, 10)
+    assert (chosen.model.architecture, chosen.training.windows) == ("paper", "episode")
+    assert chosen.domain_settings == Settings()
+    assert not hasattr(chosen.method_settings, "masking")
+
+
+def test_a_level_may_change_the_preset_of_a_method():
+    temperatures = {level: find_preset("babyai", level, "leap", "leapjax").planner.temperature
+                    for level in (LEVEL, "GoToSeqS5R2")}  # fmt: skip
+    assert temperatures == {LEVEL: 0.5, "GoToSeqS5R2": 1.0}
+    assert find_preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
+
+
+def test_preset_paper_masks_and_ends_as_the_authors_code_does():
+    learned = {level: find_preset("babyai", level, "leap", "paper").method_settings
+               for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
+    assert [each.masking for each in learned.values()] == ["each", "each", "all"]
+    assert not any(each.end or each.repeat_state for each in learned.values())
+    for level in ("GoToObjMazeS7", "GoToObjMazeS7Slip", "GoToObjMazeS7Mistakes"):
+        search = find_preset("babyai", level, "leap", "paper").planner
+        assert (search.horizon, search.iterations) == (10, 30)
+    assert find_preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
+    # In star graphs there is no pose to leave out, and a plan may end.
+    stars = find_preset("stars", "Star3x5", "leap", "paper").method_settings
+    assert stars.repeat_state and stars.end
+
+
+def test_all_levels_are_those_of_the_paper():
+    found = command_line.parse("babyai", ["--level", "all", "--demos", "9"])
+    assert [each.level for each in found] == list(BABYAI.levels)
+    assert {each.demos for each in found} == {9}
+    assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
+
+
 @pytest.mark.parametrize(
     ("method", "option", "value", "why"),
     [
@@ -107,6 +158,18 @@ def test_a_method_is_not_asked_to_plan_in_a_way_that_it_cannot(method, option, v
     with pytest.raises(UserError, match=f"{value}.*{why}") as raised:
         command_line.parse("babyai", ["--method", method, option, value])
     assert option in shell.describe(raised.value)
+
+
+def test_every_method_can_search_stars_and_boards():
+    """Whose presets fill plans one action at a time, which the classifier cannot judge."""
+    for domain in ("stars", "sudoku"):
+        (found,) = command_line.parse(domain, ["--method", "classifier"])
+        ways = searches(found)
+        assert found.planner.fill == "together" and len(ways) > 5
+        assert {way.planner.fill for way in ways} == {"together"}
+        (found,) = command_line.parse(domain, ["--method", "leap"])
+        assert found.planner.fill == "confident"
+        assert len(searches(found)) > len(ways)
 
 
 def test_every_program_is_known_by_name(capsys):
@@ -125,6 +188,12 @@ KINDS = [
     *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
+FIELDS = [
+    pytest.param(kind, field.name, kind_of, id=f"{kind.__module__}.{kind.__name__}.{field.name}")
+    for kind in KINDS
+    for field in dataclasses.fields(kind)
+    for kind_of in [typing.get_type_hints(kind)[field.name]]
+]
 NEVER = {
     int: [1.0, True, "1", math.nan, -1, 2**31, 2**63],
     float: [True, "1", math.nan, -math.inf, 10**400],
@@ -134,67 +203,84 @@ NEVER = {
 UNLIMITED = {"clip"}  # infinite: the gradient is never clipped
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
-def test_every_field_of_every_configuration_is_checked(kind):
-    hints = typing.get_type_hints(kind)
-    for field in dataclasses.fields(kind):
-        kinds = typing.get_args(hints[field.name]) or (hints[field.name],)
-        maybe = type(None) in kinds
-        never = [v for v in NEVER[kinds[0]] if not (maybe and v is None)]
-        if kinds[0] is float and field.name not in UNLIMITED:
-            never.append(math.inf)
-        pair = typing.get_origin(hints[field.name]) is tuple
-        for value in never:
-            with pytest.raises(UserError, match=field.name):
-                kind(**{field.name: (value,) * len(kinds) if pair else value})
-        assert getattr(kind(), field.name) == field.default
+@pytest.mark.parametrize(("kind", "name", "type_of"), FIELDS)
+def test_every_field_of_every_configuration_is_checked(kind, name, type_of):
+    kinds = typing.get_args(type_of) or (type_of,)
+    maybe = type(None) in kinds
+    never = [v for v in NEVER[kinds[0]] if not (maybe and v is None)]
+    if kinds[0] is float and name not in UNLIMITED:
+        never.append(math.inf)
+    pair = typing.get_origin(type_of) is tuple
+    for value in never:
+        with pytest.raises(UserError, match=name):
+            kind(**{name: (value,) * len(kinds) if pair else value})
+    assert getattr(kind(), name) == next(
+        field.default for field in dataclasses.fields(kind) if field.name == name
+    )
 
 
 @pytest.mark.parametrize(
     "option",
-    ["--context 2147483648", "--word-heads 100000", "--restarts 100000", "--seeds 2147483648",
-     "--episodes 90000000", "--width 100000", "--batch 2147483647", "--horizon 100000",
-     "--demos 9999999", "--checkpoint-seconds nan", "--fsdp 9223372036854775808", "--clip nan"],
+    ["--context 100000", "--context 2147483648", "--word-heads 100000", "--radius 100000",
+     "--microbatch 9223372036854775808", "--restarts 100000", "--seeds 2147483648",
+     "--episodes 9223372036854775808", "--episodes 90000000", "--layers 100000", "--width 100000",
+     "--batch 2147483647", "--horizon 100000", "--iterations 2147483647", "--demos 9999999",
+     "--test-seed 9223372036854775808", "--checkpoint-seconds nan", "--rules inf",
+     "--fsdp 9223372036854775808", "--temperature nan", "--clip nan"],
 )  # fmt: skip
 def test_a_number_that_no_machine_can_serve_is_refused(option, monkeypatch):
-    monkeypatch.setattr(files.os, "sysconf", pages(16))
+    pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 16 << 18}
+    monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
     name, value = option.split()
     with pytest.raises(UserError, match=name.strip("-s").replace("-", "[ _-]")):
         parse("--level", LEVEL, name, value)
 
 
-def pages(gibibytes):
-    """What a machine of so much memory says of it."""
-    return {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": gibibytes << 18}.__getitem__
+def test_infinite_means_never_where_something_is_limited():
+    chosen = parse("--checkpoint-seconds", "inf", "--clip", "inf")
+    assert (chosen.checkpoint_seconds, chosen.training.clip) == (math.inf, math.inf)
 
 
-def test_what_a_network_needs_is_compared_with_the_machine(monkeypatch, tmp_path):
-    monkeypatch.setattr(files.os, "sysconf", pages(10))
+def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path):
+    """It was refused later on only."""
+    chosen = dataclasses.replace(parse("--level", LEVEL), context=1000)
+    with pytest.raises(UserError, match="--context 1000 is longer than any episode"):
+        limits.check(chosen)
+    limits.check(dataclasses.replace(chosen, checkpoint=tmp_path))
+
+
+def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch, tmp_path):
+    pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
+    monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
 
     def state(count):
         params = {"w": jax.ShapeDtypeStruct((count, 1024, 1024), jnp.float32)}
         return TrainState(params, (params, params), jax.ShapeDtypeStruct((), jnp.int32))
 
     memory.check_state(state(600))  # parameters, two moments and gradients: 4 * 4 bytes each
-    with pytest.raises(UserError, match="at least 10 GiB of memory would be needed.*--width"):
+    with pytest.raises(UserError, match="at least 10 GiB of memory would be needed"):
         memory.check_state(state(700))
+    with pytest.raises(UserError, match="--width"):
+        memory.check_state(state(2**62))  # of any size
+
+    class Compiled:
+        temp_size_in_bytes, argument_size_in_bytes = 1 << 30, 1 << 20
+
+        def memory_analysis(self):
+            return self
+
+    memory.check_program(Compiled())  # on each of 8 devices
+    Compiled.temp_size_in_bytes = 2 << 30
+    with pytest.raises(UserError, match="--batch.* at least 16 GiB"):
+        memory.check_program(Compiled())
+    Compiled.memory_analysis = lambda self: None  # a backend that does not say
+    memory.check_program(Compiled())
     (tmp_path / "memory.max").write_text("2147483648\n")  # a container of 2 GiB
     monkeypatch.setattr(files, "CONTAINER_MEMORY", tmp_path / "memory.max")
     with pytest.raises(UserError, match="this machine has 2"):
         memory.check_state(state(200))
     monkeypatch.delattr(files.os, "sysconf")  # Windows does not say
     memory.check_state(state(2**40))
-
-
-def test_what_a_program_needs_is_compared_with_the_machine(monkeypatch):
-    monkeypatch.setattr(files.os, "sysconf", pages(10))
-    sizes = SimpleNamespace(temp_size_in_bytes=1 << 30, argument_size_in_bytes=1 << 20)
-    program = SimpleNamespace(memory_analysis=lambda: sizes)
-    memory.check_program(program)  # on each of 8 devices
-    sizes.temp_size_in_bytes = 2 << 30
-    with pytest.raises(UserError, match="--batch.* at least 16 GiB"):
-        memory.check_program(program)
-    memory.check_program(SimpleNamespace(memory_analysis=lambda: None))  # it does not say
 
 
 @pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])

@@ -11,10 +11,10 @@ import pytest
 
 import leapjax as leap
 from leapjax import rollouts
-from leapjax.environments import GymnasiumAdapter, Transition, closing
+from leapjax.environments import GymnasiumAdapter, Transition, closing, environments_of
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
-from leapjax.rollouts import History, join
+from leapjax.rollouts import History, join, stack_contexts
 from leapjax.types import Context
 from tests.recorder import Recorder
 
@@ -108,7 +108,7 @@ def start(seed: int) -> int:
     return max(seed % 7 - 1, 0)
 
 
-@pytest.mark.parametrize("length", [0, 3])
+@pytest.mark.parametrize("length", [0, 1, 3])
 def test_history_against_everything_that_happened(length):
     rng = np.random.default_rng(0)
     states = [
@@ -144,7 +144,27 @@ def test_history_against_everything_that_happened(length):
                 assert context.past["x"][slot] == states[step]["x"]
 
 
-@pytest.mark.parametrize("steps", [1, 4])
+@pytest.mark.parametrize("length", [0, 2])
+def test_stacked_contexts_are_the_contexts_one_after_the_other(length):
+    histories = []
+    for episode in range(4):
+        history = History({"x": np.array([10 * episode])}, length, NUM_ACTIONS)
+        for step in range(episode):
+            history.advance(step, {"x": np.array([10 * episode + step + 1])}, float(step - 5))
+        histories.append(history)
+    stacked = stack_contexts(histories)
+    assert stacked.actions.shape == stacked.rewards.shape == (4, length)
+    np.testing.assert_array_equal(stacked.return_so_far, [0, -5, -9, -12])
+    np.testing.assert_array_equal(stacked.step, [0, 1, 2, 3])
+    for row, history in enumerate(histories):
+        jax.tree.map(
+            lambda whole, one, r=row: np.testing.assert_array_equal(whole[r], one),
+            stacked,
+            history.context(),
+        )
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
 def test_the_end_action_stops_a_plan_and_makes_the_next(steps):
     seeds = [0, 3, 6, 4]
     episodes = leap.evaluate(Corridor, seeds, walker(), jnp.int32(steps), context=0)
@@ -158,7 +178,7 @@ def test_the_end_action_stops_a_plan_and_makes_the_next(steps):
     assert 0 < episodes.planning_seconds <= episodes.seconds
 
 
-@pytest.mark.parametrize("executed", [1, 3, None])
+@pytest.mark.parametrize("executed", [1, 2, 3, 4, None])
 def test_only_so_many_actions_are_executed(executed):
     seeds = [0, 5]
     episodes = leap.evaluate(
@@ -169,7 +189,7 @@ def test_only_so_many_actions_are_executed(executed):
     np.testing.assert_array_equal(episodes.lengths, distances)
 
 
-@pytest.mark.parametrize("iteration", [2, None])
+@pytest.mark.parametrize("iteration", [1, 2, ITERATIONS, None])
 def test_the_plan_is_executed_as_it_stood_after_an_iteration(iteration):
     differ = 0
     for seed in (1, 2, 8):
@@ -193,7 +213,7 @@ def test_the_plan_is_executed_as_it_stood_after_an_iteration(iteration):
         taken = Corridor.made[-1].taken
         assert taken == planned[: len(taken)]
         assert len(planned) - len(taken) < 3  # the episode may be over before its last plan is
-    assert (differ > 0) == (iteration == 2)
+    assert (differ > 0) == (iteration in (1, 2))
 
 
 def test_a_plan_that_is_begun_is_executed_as_far_as_it_goes():
@@ -341,12 +361,17 @@ def play(seeds, **options):
 def test_an_episode_plays_the_same_way_alone_or_in_any_batch():
     seeds = list(range(20, 29))
     together = play(seeds)
-    assert play(seeds, seed=1) != together
     assert len({str(result) for result in together.values()}) > 4
     for subset in ([20], seeds[::-1], seeds[3:6]):
         assert play(subset) == {seed: together[seed] for seed in subset}
     for result, length, taken in together.values():
         assert length == len(taken) and (not result or length >= 1)
+
+
+def test_the_seed_of_the_planner_matters_and_suffices():
+    seeds = list(range(20, 29))
+    assert play(seeds, seed=1) == play(seeds, seed=1)
+    assert play(seeds, seed=1) != play(seeds, seed=2)
 
 
 def ends_at_once(params, context):
@@ -384,7 +409,7 @@ def test_plans_that_end_at_once_do_not_go_on_for_ever():
     leap.evaluate(Corridor, [0], plan, None, context=0, progress=give_up_after(50))
 
 
-@pytest.mark.parametrize("max_steps", [1, 3, 9])
+@pytest.mark.parametrize("max_steps", [1, 3, 6, 9])
 def test_an_episode_may_be_cut_off(max_steps):
     seeds = [0, 3, 6]
     episodes = leap.evaluate(
@@ -394,6 +419,51 @@ def test_an_episode_may_be_cut_off(max_steps):
     np.testing.assert_array_equal(episodes.lengths, np.minimum(distances, max_steps))
     np.testing.assert_array_equal(episodes.successes, distances <= max_steps)
     assert episodes.plans == np.ceil(episodes.lengths / 2).sum()
+
+
+@pytest.mark.parametrize("option", ["executed", "max_steps"])
+def test_to_execute_nothing_is_refused(option):
+    with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), context=0, **{option: 0})
+
+
+class WiderCorridor(Corridor):
+    num_actions = NUM_ACTIONS + 1
+
+
+class GrowingCorridor(Corridor):
+    def observe(self):
+        return {"position": np.zeros(self.steps, np.int32), "goal": np.array([GOAL], np.int32)}
+
+
+@pytest.mark.parametrize(
+    ("make", "seeds", "says"),
+    [
+        (Corridor, [], "no seeds"),
+        (functools.cache(Corridor), [0, 1], "same environment twice"),
+        (WiderCorridor, [0], "planner has 3 actions and the environment 4"),
+        (GrowingCorridor, [0], "observation of other shapes"),
+    ],
+)
+def test_environments_that_would_give_wrong_episodes_are_refused(make, seeds, says):
+    with pytest.raises(ValueError, match=says):
+        leap.evaluate(make, seeds, walker(), jnp.int32(1), context=0)
+
+
+@pytest.mark.parametrize("iteration", [0, ITERATIONS + 1])
+def test_an_iteration_that_there_is_not_is_refused(iteration):
+    with pytest.raises(ValueError, match="iteration"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), context=0, iteration=iteration)
+
+
+def test_an_environment_may_reuse_its_buffers():
+    buffer = {"x": np.zeros(2)}
+    history = History(buffer, 2, NUM_ACTIONS)
+    for step in (1.0, 2.0):
+        buffer["x"][:] = step
+        history.advance(0, buffer, 0.0)
+    np.testing.assert_array_equal(history.context().past["x"], [[0, 0], [1, 1]])
+    np.testing.assert_array_equal(history.context().observation["x"], [2, 2])
 
 
 class Line(gym.Env):
@@ -440,96 +510,149 @@ def test_any_gymnasium_environment_with_discrete_actions():
     assert late.truncated and not late.terminated and not late.success
 
 
-def test_what_is_no_environment_of_gymnasium_is_refused():
-    with pytest.raises(ValueError, match="Discrete action space"):
-        GymnasiumAdapter(Line(gym.spaces.Box(-1, 1, (2,))))
-    with pytest.raises(UserError, match="expected a Gymnasium environment"):
-        GymnasiumAdapter("CartPole-v1")
-    adapter = GymnasiumAdapter(Line())
-    adapter.env = types.SimpleNamespace(reset=lambda seed: np.zeros(1), step=lambda action: (0, 1))
-    with pytest.raises(TypeError, match=r"not \(observation, info\): .*old interface"):
+def test_success_is_a_return_where_one_is_asked_for():
+    """In CartPole every step is rewarded, the one with which the pole falls too."""
+    for asked, succeeds in ((None, False), (8.0, True), (100.0, False)):
+        adapter = GymnasiumAdapter(gym.make("CartPole-v1"), asked)
         adapter.reset(0)
-    with pytest.raises(UserError, match="2 values"):
-        adapter.step(0)
+        steps = [adapter.step(0)]
+        while not steps[-1].terminated:
+            steps.append(adapter.step(0))
+        assert 8 <= len(steps) < 100 and steps[-1].reward > 0
+        assert steps[-1].success == succeeds
+        so_far = [asked is not None and count >= asked for count in range(1, len(steps) + 1)]
+        assert [step.success for step in steps] == so_far
+
+
+def test_evaluation_in_a_gymnasium_environment():
+    made = []
+
+    def make() -> GymnasiumAdapter:
+        made.append(GymnasiumAdapter(Line()))
+        return made[-1]
+
+    def on_or_up(params, context):
+        return jnp.where(context.observation[0] < params, 1, 2) * jnp.ones(HORIZON, jnp.int32)
+
+    def total(params, wanted, actions):
+        return jnp.sum(actions != wanted).astype(jnp.float32)
+
+    plan = compiled(leap.from_total(on_or_up, total, 4))
+    seeds = [0, 1, 2, 3, 4]
+    starts = np.array([int(GymnasiumAdapter(Line()).reset(seed)[0]) for seed in seeds])
+    assert len(set(starts.tolist())) > 1
+    episodes = leap.evaluate(make, seeds, plan, jnp.float32(1.5), context=0)
+    np.testing.assert_array_equal(episodes.successes, starts < 1.5)
+    np.testing.assert_array_equal(episodes.lengths, np.where(starts < 1.5, 4 - starts, 1))
+    # All steps cost one but the last, which gives two where it arrives.
+    np.testing.assert_array_equal(episodes.returns, np.where(starts < 1.5, starts - 1, -1))
+    assert len(made) == len(seeds)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary(2)],
+)
+def test_other_action_spaces_are_refused(space):
+    with pytest.raises(ValueError, match="Discrete action space"):
+        GymnasiumAdapter(Line(space))
+
+
+class OldLine(Line):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed, options=options)[0]
+
+
+def test_an_environment_of_the_old_interface_is_refused():
+    with pytest.raises(TypeError, match=r"not \(observation, info\): .*old interface"):
+        GymnasiumAdapter(OldLine()).reset(0)
+
+
+def test_actions_that_do_not_start_at_zero():
+    adapter = GymnasiumAdapter(Line(gym.spaces.Discrete(2, start=1)))
+    adapter.reset(0)
+    for action in range(adapter.num_actions - 1):
+        adapter.step(action)
+    assert adapter.env.taken == [1, 2]
 
 
 # What enters.
 
 
-@pytest.mark.parametrize(
-    ("option", "wrong", "says"),
-    [
-        ("seeds", [], "no seeds"),
-        ("seeds", [1, 2**32], "level seed must be"),
-        ("seed", 2**32, "^seed must be"),
-        ("max_steps", 1.5, "max_steps must be"),
-        ("executed", 0, "executed must be at least 1, got 0"),
-        ("context", -1, "context must be"),
-        ("iteration", 0, "iteration must be"),
-        ("iteration", ITERATIONS + 1, "iteration"),
-    ],
-)
-def test_options_out_of_range_are_refused(option, wrong, says):
-    options = {"seeds": [0], "context": 0, option: wrong}
-    with pytest.raises(UserError, match=says):
-        leap.evaluate(Corridor, plan=walker(), params=jnp.int32(1), **options)
+@pytest.mark.parametrize("wrong", [2**32, -1, 5.9, True, "5", math.nan])
+@pytest.mark.parametrize("edge", ["level seed", "seed"])
+def test_seeds_that_jax_does_not_tell_apart_are_refused(edge, wrong):
+    seeds, seed = ([1, wrong], 0) if edge == "level seed" else ([1], wrong)
+    with pytest.raises(UserError, match=f"{edge} must be"):
+        leap.evaluate(Corridor, seeds, walker(), jnp.int32(1), context=0, seed=seed)
     assert not Corridor.made  # it is said before anything is made
 
 
-def test_a_history_holds_finite_numbers():
-    with pytest.raises(UserError, match="not finite at step 0 of level seed 3"):
-        History((np.zeros(2), np.array([1, np.nan], np.float16)), 0, NUM_ACTIONS, 3)
-    history = History(np.zeros(1), 0, NUM_ACTIONS)
-    history.advance(0, np.zeros(1), 3e38)
-    with pytest.raises(UserError, match="return of 6e[+]38 at step 2:"):
-        history.advance(0, np.zeros(1), 3e38)
+@pytest.mark.parametrize("wrong", [-1, 1.5, 2.0, True, math.nan, math.inf, "2"])
+@pytest.mark.parametrize("count", ["context", "executed", "iteration", "max_steps"])
+def test_counts_are_integers(count, wrong):
+    with pytest.raises(UserError, match=f"{count} must be"):
+        leap.evaluate(Corridor, [0], walker(), jnp.int32(1), **{"context": 0, count: wrong})
+    assert not Corridor.made
+
+
+def test_integers_of_numpy_are_counts_and_seeds():
+    few = {"context": np.int8(0), "executed": np.int64(1), "max_steps": np.uint8(3)}
+    played = leap.evaluate(Corridor, np.array([0, 3]), walker(), jnp.int32(4), **few)
+    assert played.lengths.tolist() == [3, 3] and played.plans == 6
 
 
 # What an environment gives.
 
 
-class Odd(Corridor):
+class Strange(Corridor):
     """A corridor whose second step gives something else."""
 
-    def __init__(self, **changed) -> None:
-        super().__init__()
-        self.changed = changed
+    given: ClassVar[dict] = {}
 
-    def step(self, action: int):
+    def step(self, action: int) -> Transition:
         found = super().step(action)
-        if self.steps < 2:
-            return found
-        return self.changed["step"] if "step" in self.changed else found._replace(**self.changed)
-
-
-class WiderCorridor(Corridor):
-    num_actions = NUM_ACTIONS + 1
+        return found._replace(**self.given) if self.steps == 2 else found
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("given", "says"),
     [
-        (lambda: gym.make("CartPole-v1"), "returned TimeLimit, expected an Adapter.*Gymnasium"),
-        (lambda: Corridor, "returned the class Corridor"),
-        (Corridor(), "make_adapter is Corridor: expected a function"),
-        (WiderCorridor, "planner has 3 actions and the environment 4"),
-        (lambda: Odd(step=(0, 1.0, True, False, {})), "step of Odd returned tuple"),
-        (lambda: Odd(reward="1"), "reward of 1 at step 2 of level seed 7: expected a number"),
-        (lambda: Odd(reward=1e39), "reward of 1e[+]39"),  # not in the numbers that planners see
-        (lambda: Odd(score=np.zeros(2)), "score of "),
-        (lambda: Odd(score=math.nan), "score of nan at step 2 of level seed 7"),
-        (lambda: Odd(success="no"), "success at step 2 of level seed 7 must be true or false"),
-        (lambda: Odd(taken=NUM_ACTIONS), "action taken"),
-        (lambda: Odd(observation={"position": np.zeros(())}), "other shapes"),
+        ({"reward": math.nan}, "reward of nan"),
+        ({"reward": -math.inf}, "reward of -inf"),
+        ({"reward": 1e39}, "reward of 1e[+]39"),  # not in the numbers that planners see
+        ({"score": math.nan}, "score of nan"),
         (
-            lambda: Odd(observation={"position": np.zeros(()), "goal": np.array([np.inf])}),
-            "observation.*goal.* step 2 of level seed 7",
+            {"observation": {"position": np.float32(np.nan), "goal": np.zeros(1)}},
+            "observation.*pos",
         ),
+        (
+            {"observation": {"position": np.zeros(()), "goal": np.array([np.inf])}},
+            "observation.*go",
+        ),
+        ({"observation": {"position": np.zeros(())}}, "other shapes"),
+        ({"taken": NUM_ACTIONS}, "action taken"),
+        ({"taken": 0.5}, "action taken"),
     ],
 )
-def test_an_environment_of_another_kind_is_named(make, says):
-    with pytest.raises(UserError, match=says):
-        leap.evaluate(make, [7], walker(), jnp.int32(4), context=1)
+def test_values_that_no_data_may_have_are_refused(monkeypatch, given, says):
+    monkeypatch.setattr(Strange, "given", given)
+    with pytest.raises(UserError, match=f"{says}.* step 2 of level seed 7"):
+        leap.evaluate(Strange, [7], walker(), jnp.int32(4), context=1)
+
+
+def test_a_first_observation_that_is_not_finite_is_refused():
+    with pytest.raises(UserError, match="not finite at step 0 of level seed 3"):
+        History((np.zeros(2), np.array([1, np.nan], np.float16)), 0, NUM_ACTIONS, 3)
+    with pytest.raises(UserError, match="length must be at least 0"):
+        History(np.zeros(2), -1, NUM_ACTIONS)
+
+
+def test_rewards_may_not_add_up_to_more_than_a_planner_can_see():
+    history = History(np.zeros(1), 0, NUM_ACTIONS)
+    history.advance(0, np.zeros(1), 3e38)
+    with pytest.raises(UserError, match="return of 6e[+]38 at step 2:"):
+        history.advance(0, np.zeros(1), 3e38)
 
 
 # What is opened.
@@ -582,26 +705,40 @@ def test_few_environments_are_open_at_once_which_changes_nothing(held):
     assert len(set(few.lengths.tolist())) > 2
 
 
-def test_all_is_closed_where_playing_ends_early(held, monkeypatch):
-    with pytest.raises(StuckError):
-        leap.evaluate(held, range(9), walker(), jnp.int32(1), context=0, progress=give_up_after(0))
+@pytest.mark.parametrize("error", [StuckError, KeyboardInterrupt])
+def test_all_is_closed_where_playing_ends_early(held, error):
+    def progress(over, succeeded):
+        raise error
+
+    with pytest.raises(error):
+        leap.evaluate(held, range(9), walker(), jnp.int32(1), context=0, progress=progress)
     assert held.most == 3 and not held.open
+
+
+def test_an_error_of_a_step_or_of_what_is_made_closes_the_rest(held, monkeypatch):
     monkeypatch.setattr(held, "fails_at", 4)
     with pytest.raises(StuckError):
         leap.evaluate(held, range(9), walker(), jnp.int32(1), context=0)
+    assert held.most == 3 and not held.open
+    with pytest.raises(UserError, match="same environment twice"):
+        leap.evaluate(functools.cache(held), [0, 1], walker(), jnp.int32(1), context=0)
     assert not held.open
 
 
-def test_an_error_of_closing_does_not_hide_that_of_playing():
-    def fail():
+class Unclosable(Corridor):
+    def close(self) -> None:
         raise OSError("the port is gone")
 
-    corridor = Corridor()
-    corridor.close = fail
-    with pytest.raises(StuckError), closing(corridor):
+
+def test_what_goes_wrong_first_is_what_is_told():
+    with pytest.raises(StuckError), closing(Unclosable()):
         raise StuckError
-    with pytest.raises(OSError, match="port is gone"), closing(corridor):
+    with pytest.raises(OSError, match="port is gone"), closing(Unclosable()):
         pass
+    with pytest.raises(StuckError):
+        leap.evaluate(Unclosable, [0], walker(), jnp.int32(1), context=0, progress=give_up_after(0))
+    with closing(Corridor()) as corridor:  # has nothing to close
+        corridor.reset(0)
 
 
 @pytest.mark.parametrize("executed", [1, 2])
@@ -647,11 +784,36 @@ class Wrapped:
         self.reset, self.step = inner.reset, inner.step
 
 
+class Common(GymnasiumAdapter):
+    """The environment is the class's."""
+
+    env = ONE
+
+    def __init__(self) -> None:
+        super().__init__(ONE)
+        del self.env
+
+
+class Late(GymnasiumAdapter):
+    """Takes its environment when it is reset."""
+
+    def __init__(self) -> None:
+        super().__init__(Line())
+
+    def reset(self, seed: int):
+        self.env = ONE
+        return super().reset(seed)
+
+
 @pytest.mark.parametrize(
     "make",
     [
+        lambda: GymnasiumAdapter(ONE),
         lambda: GymnasiumAdapter(gym.wrappers.TimeLimit(ONE, 5)),
+        lambda: GymnasiumAdapter(gym.wrappers.OrderEnforcing(gym.wrappers.TimeLimit(ONE, 5))),
         lambda: Wrapped(GymnasiumAdapter(ONE)),
+        Common,
+        Late,
     ],
 )
 def test_one_environment_in_two_adapters_is_found(make):
@@ -667,3 +829,72 @@ def stayer() -> leap.CompiledPlanner:
         lambda params, context: (), lambda p, m, actions: actions.sum().astype(jnp.float32), 4
     )
     return compiled(energy)
+
+
+class Odd(Corridor):
+    """A corridor whose steps return something else."""
+
+    def __init__(self, **changed) -> None:
+        super().__init__()
+        self.changed = changed
+
+    def step(self, action: int):
+        found = super().step(action)
+        return self.changed["step"] if "step" in self.changed else found._replace(**self.changed)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: gym.make("CartPole-v1"), "returned TimeLimit, expected an Adapter.*Gymnasium"),
+        (lambda: None, "returned NoneType, expected an Adapter"),
+        (lambda: Corridor, "returned the class Corridor"),
+        (Corridor(), "make_adapter is Corridor: expected a function"),
+        (lambda: Odd(step=(0, 1.0, True, False, {})), "step of Odd returned tuple"),
+        (lambda: Odd(reward="1"), "reward of 1 at step 1 of level seed 3: expected a number"),
+        (lambda: Odd(reward=None), "reward of None"),
+        (lambda: Odd(reward=np.ones(1)), r"reward of \[1\.\]"),
+        (lambda: Odd(score=np.zeros(2)), "score of "),
+        (lambda: Odd(success="no"), "success at step 1 of level seed 3 must be true or false"),
+        (lambda: Odd(terminated=None), "terminated at step 1"),
+        (lambda: Odd(truncated=math.nan), "truncated at step 1"),
+    ],
+)
+def test_an_environment_of_another_kind_is_named(make, says):
+    with pytest.raises(UserError, match=says):
+        rollouts.evaluate(make, [3], walker(), np.int32(4), context=0)
+
+
+def test_numbers_and_marks_of_any_type_are_taken():
+    plain = rollouts.evaluate(Corridor, [3], walker(), np.int32(4), context=0)
+    for one in (np.float16, np.array, jnp.float32, np.uint8):
+        found = rollouts.evaluate(
+            lambda one=one: Odd(reward=one(1), score=one(1), truncated=one(0)),
+            [3], walker(), np.int32(4), context=0,
+        )  # fmt: skip
+        assert found.successes == plain.successes and found.returns == found.lengths
+
+
+def test_an_environment_in_slots_is_found_and_a_list_of_them_is_not_searched():
+    shared = gym.make("CartPole-v1")
+
+    class Slotted:
+        __slots__ = ("empty", "inner")
+
+    slotted = Slotted()
+    slotted.inner = GymnasiumAdapter(shared)
+    assert environments_of(slotted) == [shared.unwrapped]
+    listed = Corridor()
+    listed.pool = [slotted.inner]
+    assert environments_of(listed) == []
+
+
+def test_gymnasium_adapters_name_what_is_no_environment():
+    with pytest.raises(UserError, match="expected a Gymnasium environment"):
+        GymnasiumAdapter("CartPole-v1")
+    env = gym.make("CartPole-v1")
+    for found, says in [((0, 1.0, True, {}), "4 values"), ((0, None, 1, 0, {}), "of None")]:
+        adapter = GymnasiumAdapter(env)
+        adapter.env = types.SimpleNamespace(step=lambda action, found=found: found)
+        with pytest.raises(UserError, match=says):
+            adapter.step(0)
