@@ -121,6 +121,7 @@ def many(module):
     return lambda params, contexts: call(params, "__call__", contexts)
 
 
+@only_long  # its values are those of value iteration: test_rewards.py
 def test_bcq():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = around(case.batch)
@@ -153,6 +154,7 @@ def iql_loss(value, qs, least, logits, returns, taken):
     )
 
 
+@only_long  # it learns in test_rewards.py
 def test_iql():
     case = make_case(iql, iql.Settings(**IQL))
     steps, params = around(case.batch), case.state.params["params"]
@@ -173,8 +175,9 @@ def test_iql():
 
 
 @only_long
-def test_mopo(share=0.5):
-    """Half of the data, and half of what is imagined, two steps far."""
+@pytest.mark.parametrize("share", [pytest.param(1.0, marks=only_long), 0.5])
+def test_mopo(share):
+    """Of the data alone; and of what is imagined, two steps far, too."""
     settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)
     case = make_case(mopo, settings)
     steps, old, target = around(case.batch), case.state.params, case.state.extra
