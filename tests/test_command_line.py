@@ -1,5 +1,6 @@
 """The command line as someone meets it who has just installed the package."""
 
+import importlib
 import os
 import re
 import subprocess
@@ -19,7 +20,8 @@ from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.running import command_line, results, startup
 from leapjax.running import main as running
-from tests.programs import ROOT
+from leapjax.running.spelling import GymnasiumConfig
+from tests.programs import RANDOM, ROOT, only_long
 
 LEVEL = "GoToLocalS7N5"
 
@@ -30,7 +32,7 @@ def python(*arguments, **options):
                           env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["leapjax", "experiments.babyai"])
+@pytest.mark.parametrize("command", ["leapjax", "experiments babyai", "experiments.babyai"])
 def test_the_version_needs_no_jax(command):
     """-S hides all that is installed, and with it the version."""
     done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
@@ -48,6 +50,8 @@ def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
     ("main", "started", "command"),
     [
         (leapjax.__main__.main, "/env/bin/leapjax", "leapjax babyai"),
+        (leapjax.__main__.main, "/site/leapjax/__main__.py", "python -m leapjax babyai"),
+        (programs.main, "/site/experiments/__main__.py", "python -m experiments babyai"),
         (programs.main, "/site/experiments/babyai.py", "python -m experiments.babyai"),
     ],
 )
@@ -61,10 +65,14 @@ def test_usage_lines_say_how_a_program_was_started(main, started, command, monke
     assert said.out.startswith(f"usage: {command} [-h]") and f"{command} --help" in said.err
 
 
-def test_output_that_nobody_reads_ends_a_program_quietly():
+@pytest.mark.parametrize("buffered", [[], pytest.param(["-u"], marks=only_long)])
+@pytest.mark.parametrize(
+    "name", ["experiments", pytest.param("experiments.stars", marks=only_long)]
+)
+def test_output_that_nobody_reads_ends_a_program_quietly(buffered, name):
     reader, writer = os.pipe()
     os.close(reader)
-    done = python("-m", "experiments", "--help", stdout=writer)
+    done = python(*buffered, "-m", name, "--help", stdout=writer)
     os.close(writer)
     assert (done.returncode, done.stderr) == (startup.UNREAD, "")
 
@@ -80,6 +88,36 @@ def test_the_command_imports_from_the_working_folder(started, safe, finds, monke
     assert interpreter.path == [str(Path.cwd())] * finds
 
 
+def helps(main, arguments, capsys, monkeypatch):
+    """By option, what the help of a program says, the default apart."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit, match="0"):
+        main([*arguments, "--help"])
+    found: dict[str, str] = {}
+    for line in (line.strip(" │") for line in capsys.readouterr().out.splitlines()):
+        if re.match(r"--?\w|\[?RUNS", line):
+            option, _, said = line.partition("  ")
+            found[option] = said.strip()
+        elif found and re.search(r"\w", line):
+            assert not found[option], f"{option} is broken before {line}"
+            found[option] = line
+    del found["-h, --help"]
+    return {
+        option: re.sub(r" ?\((default: .*|required)\)$", "", said) for option, said in found.items()
+    }
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*programs.PROGRAMS, "publish", "atari collect", *(f"babyai --method {m}" for m in METHODS)],
+)
+def test_every_option_is_explained_in_whole_sentences(command, capsys, monkeypatch):
+    name, *arguments = command.split()
+    main = importlib.import_module(f"experiments.{name}").main
+    for option, said in helps(main, arguments, capsys, monkeypatch).items():
+        assert re.fullmatch(r"[A-Z0-9].*[.)\]]", said), f"{option}: {said}"
+
+
 @pytest.mark.parametrize(
     ("main", "own", "not_own"),
     [
@@ -88,13 +126,19 @@ def test_the_command_imports_from_the_working_folder(started, safe, finds, monke
         (babyai.main, {"--level", "--demonstrations"}, {"--env", "--dataset", "--game"}),
     ],
 )
-def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys):
-    with pytest.raises(SystemExit, match="0"):
-        main(["--help"])
-    said = capsys.readouterr().out
-    options = set(re.findall(r"--[a-z-]+", said))
-    assert own <= options and not not_own & options
-    assert set(METHODS) <= set(re.findall(r"\w+", said))
+def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, monkeypatch):
+    found = helps(main, [], capsys, monkeypatch)
+    names = {option.split()[0] for option in found}
+    assert own <= names and not not_own & names
+    assert not [said for said in found.values() if any(name in said for name in not_own)]
+    method = next(said for option, said in found.items() if option.startswith("--method"))
+    assert all(name in method for name in METHODS)
+
+
+def test_messages_have_the_names_of_the_program():
+    options = ["--env", "CartPole-v1", "--method", "bc"]
+    with pytest.raises(UserError, match=r"Minari data set of it to train on \(--dataset\)"):
+        command_line.parse("gymnasium", options, GymnasiumConfig)
 
 
 def methods_of(*names):
@@ -125,6 +169,14 @@ def test_methods_that_cannot_be_run_are_refused(arguments, says):
         command_line.parse("babyai", arguments.split())
 
 
+def test_usage_names_the_method_that_has_no_such_option(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        command_line.parse(
+            "babyai", "--method leap bc --masking each".split(), module="experiments.x"
+        )
+    assert "run python -m experiments.x --method bc --help" in capsys.readouterr().err
+
+
 def row(seed, method="bc", successes=5):
     said = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
     return {**said, "seed": seed, "method": method, "episodes": 10, "successes": successes,
@@ -150,7 +202,12 @@ def test_each_method_and_seed_is_run(tmp_path, monkeypatch, capsys):
     assert len(re.findall(r"mean of 2", capsys.readouterr().out)) == 2
 
 
-def test_rows_have_a_success_rate(tmp_path):
+def test_rows_have_a_success_rate(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert babyai.main([*RANDOM, "--level", LEVEL]) == 0
+    (found,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    written = (tmp_path / "runs" / "babyai.jsonl").read_text()
+    assert found["success"] == found["successes"] / 3 and '"success": ' in written
     results.record(tmp_path / "old.jsonl", row(0))  # as an earlier version wrote it
     assert results.read(tmp_path / "old.jsonl")[0]["success"] == 0.5
     results.record(tmp_path / "wrong.jsonl", {**row(0), "success": 0.6})

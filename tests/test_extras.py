@@ -13,7 +13,6 @@ import pytest
 
 from leapjax import extras
 from leapjax.errors import UserError
-from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -118,10 +117,14 @@ def run(arguments, environment):
     )  # fmt: skip
 
 
-@only_long  # without them it plans in the short form too
 def test_planning_loads_no_optional_module_although_they_are_installed():
-    loading = "leap.load('GoToLocalS7N5'); assert 'orbax' not in sys.modules"
-    ended = run(["-c", PLANNING + loading], {})
+    ended = run(["-c", PLANNING], {})
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_a_published_planner_needs_no_orbax():
+    code = "import sys, leapjax; leapjax.load('GoToLocalS7N5'); assert 'orbax' not in sys.modules"
+    ended = run(["-c", code], {})
     assert ended.returncode == 0, ended.stderr
 
 
@@ -143,7 +146,9 @@ def test_the_core_alone_plans_and_names_the_extra_of_a_published_planner(core_al
 @pytest.mark.parametrize(
     ("arguments", "extra"),
     [
+        ("experiments.babyai --help", "babyai"),
         ("experiments babyai", "babyai"),
+        ("experiments.atari", "atari"),
         ("experiments.stars", "train"),
     ],
 )
@@ -153,6 +158,11 @@ def test_a_program_without_its_extra_is_one_line(core_alone, arguments, extra):
     assert re.fullmatch(
         rf'error: \w+ is not installed: pip install "\.\[{extra}\]".*\n', ended.stderr
     )
+
+
+def test_the_core_alone_lists_the_programs(core_alone):
+    ended = run(["-m", "experiments", "--help"], core_alone)
+    assert ended.returncode == 0 and "babyai" in ended.stdout
 
 
 def test_the_table_of_extras_is_that_of_the_package():
@@ -176,6 +186,8 @@ def test_the_table_of_extras_is_that_of_the_package():
 @pytest.mark.parametrize(
     ("module", "asked", "named"),
     [
+        ("minari", "train", "train"),
+        ("minari", "babyai", "babyai"),
         ("minari", "atari", "atari"),
         ("minigrid.core", "train", "babyai"),
         ("wandb", "babyai", "wandb"),

@@ -15,6 +15,7 @@ from leapjax.errors import UserError
 from leapjax.models.trajectory import (
     ARCHITECTURES,
     ModelConfig,
+    SequenceClassifier,
     Sizes,
     build,
 )
@@ -34,7 +35,7 @@ MASK, PAD = mask_token(ACTIONS), pad_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
 
 
-def make(architecture, past, dtype="float32"):
+def make(kind, architecture, past, dtype="float32"):
     """A tiny model of BabyAI's states; "neighbours" is ours with that option."""
     neighbours = architecture == "neighbours"
     architecture = "leapjax" if neighbours else architecture
@@ -44,7 +45,7 @@ def make(architecture, past, dtype="float32"):
         "paper": encoders.StateTokens(SIDE, config.width, dtype),
         "leapjax": encoders.ContextTokens(settings, config.width, dtype),
     }[architecture]
-    return build(config, Sizes(ACTIONS, past, HORIZON, MAX_STEPS), encoder)
+    return kind(config, Sizes(ACTIONS, past, HORIZON, MAX_STEPS), encoder)
 
 
 def everything(module, context, actions):
@@ -60,7 +61,7 @@ def model(architecture, past):
     the actions as they are, at all positions and at one alone; the energies of the
     conditional at one position and at all positions masked together; and the total energy.
     """
-    module = make(architecture, past)
+    module = make(build, architecture, past)
 
     def encode(params, context):
         return module.apply(params, context, method="encode")
@@ -90,7 +91,7 @@ def model(architecture, past):
     return scaled_like(shapes), evaluate
 
 
-def random_observation(rng):
+def random_observation(rng, goal=True):
     grid = np.stack([rng.integers(0, n, (SIDE, SIDE)) for n in (10, 6, 4)], -1).astype(np.uint8)
     x, y, direction = *rng.integers(0, SIDE, 2), rng.integers(0, 4)
     grid[x, y] = symmetries.AGENT, 0, direction
@@ -98,15 +99,15 @@ def random_observation(rng):
         grid=grid,
         pose=np.array([x, y, direction], np.int32),
         carried=np.array([rng.integers(5, 8), rng.integers(0, 6)], np.int32),
-        goal=rng.integers(0, SIDE, 2).astype(np.int32),
+        goal=(rng.integers(0, SIDE, 2) if goal else np.array([-1, -1])).astype(np.int32),
         instruction=np.append(rng.integers(1, vocabulary.SIZE, WORDS - 1), 0).astype(np.int32),
     )
 
 
-def random_context(seed, past):
+def random_context(seed, past, goal=True):
     rng = np.random.default_rng(seed)
-    observation = random_observation(rng)
-    steps = [random_observation(rng) for _ in range(past)]
+    observation = random_observation(rng, goal)
+    steps = [random_observation(rng, goal) for _ in range(past)]
     empty = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), observation)
     return Context(
         observation=observation,
@@ -163,12 +164,11 @@ def test_end_is_forbidden_at_the_first_position_only(architecture, past):
 
 
 @EACH_MODEL
-def test_plans_that_end_at_once_or_hold_mask_have_infinite_energy(architecture, past):
+def test_only_plans_that_end_at_once_have_infinite_energy(architecture, past):
     context = random_context(1, past)
-    for actions in [*all_plans(HORIZON, ACTIONS)[::20], [MASK, 0, 1], [0, 1, MASK]]:
+    for actions in all_plans(HORIZON, ACTIONS)[:: 20 if past else 9]:
         total = run(architecture, past, context, actions)["total"]
-        infinite = actions[0] == END or MASK in actions
-        assert np.isposinf(total) if infinite else np.isfinite(total)
+        assert np.isposinf(total) if actions[0] == END else np.isfinite(total)
 
 
 @EACH_NETWORK
@@ -183,6 +183,14 @@ def test_total_is_a_loop_over_masked_positions(architecture, past):
             expected -= log_softmax(logits)[actions[t]]
         total = run(architecture, past, context, actions)["total"]
         assert total == pytest.approx(expected, rel=1e-4)
+
+
+@EACH_MODEL
+def test_a_plan_that_holds_mask_has_infinite_energy(architecture, past):
+    for t in range(HORIZON):
+        actions = np.array([1, 2, 3])
+        actions[t] = MASK
+        assert np.isposinf(run(architecture, past, random_context(3, past), actions)["total"])
 
 
 @EACH_NETWORK
@@ -210,7 +218,12 @@ def test_positions_masked_together_see_none_of_each_other(architecture, past):
         together = run(architecture, past, context, actions)["together"]
         np.testing.assert_array_equal(together, blank["together"])
         np.testing.assert_allclose(together, expected, rtol=1e-5, atol=1e-5)
-    for t in range(HORIZON):  # one position alone as all together
+
+
+@EACH_NETWORK
+def test_one_queried_position_has_the_logits_of_all(architecture, past):
+    context = random_context(6, past)
+    for t in range(HORIZON):
         result = run(architecture, past, context, [2, MASK, 0], t)
         np.testing.assert_allclose(result["alone"], result["logits"][t], rtol=1e-5, atol=1e-5)
 
@@ -249,33 +262,73 @@ def moved_past(context):
 
 
 @EACH_ARCHITECTURE
-def test_what_is_read_of_the_past(architecture):
+def test_past_states_are_seen(architecture):
     context = with_kind(random_context(9, 2), BALL)
     before = run(architecture, 2, context, [0, MASK, 1])["logits"]
-    other_actions = context._replace(actions=(context.actions + 1) % (ACTIONS - 1))
+    after = run(architecture, 2, moved_past(context), [0, MASK, 1])["logits"]
+    assert largest_change(after, before) > 1e-4
     swapped = context._replace(past=jax.tree.map(lambda x: x[::-1], context.past))
-    rewarded = context._replace(rewards=context.rewards + 1, return_so_far=np.float32(-5))
-    for changed, seen in (
-        (moved_past(context), True),
-        (swapped, True),
-        (other_actions, architecture == "paper"),
-        (rewarded, False),
-    ):
-        after = run(architecture, 2, changed, [0, MASK, 1])["logits"]
-        assert (largest_change(after, before) > 1e-4) == seen
+    after = run(architecture, 2, swapped, [0, MASK, 1])["logits"]
+    assert largest_change(after, before) > 1e-4
 
 
-# Promises of the leapjax architecture.
+@EACH_ARCHITECTURE
+def test_only_the_papers_model_reads_past_actions(architecture):
+    context = random_context(9, 2)
+    before = run(architecture, 2, context, [0, MASK, 1])["logits"]
+    others = context._replace(actions=(context.actions + 1) % (ACTIONS - 1))
+    after = run(architecture, 2, others, [0, MASK, 1])["logits"]
+    assert (largest_change(after, before) > 1e-4) == (architecture == "paper")
 
 
-def test_ours_remembers_only_what_has_a_name():
-    context = with_kind(random_context(9, 2), WALL)
+@EACH_ARCHITECTURE
+def test_rewards_are_not_read(architecture):
+    context = random_context(9, 2)
+    others = context._replace(rewards=context.rewards + 1, return_so_far=np.float32(-5))
+    before, after = (run(architecture, 2, c, [0, MASK, 1]) for c in (context, others))
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+@pytest.mark.parametrize("kind", [EMPTY, WALL])
+def test_ours_remembers_only_what_has_a_name(kind):
+    context = with_kind(random_context(9, 2), kind)
     before = run("leapjax", 2, context, [0, MASK, 1])["logits"]
     after = run("leapjax", 2, moved_past(context), [0, MASK, 1])["logits"]
     np.testing.assert_array_equal(after, before)
 
 
-def test_steps_before_the_episode_leak_nothing(padded=1):
+@pytest.mark.parametrize("faced_now", [False, True])
+def test_ours_sees_what_the_agent_faces_now_and_forgets_what_was_before_the_start(faced_now):
+    context = with_kind(random_context(9, 2), EMPTY)
+    x, y, direction = context.observation.pose.tolist()
+    assert 0 < x < SIDE - 1 and 0 < y < SIDE - 1
+    behind = (direction + 2) % 4
+    past = np.tile([x, y, behind], (2, 1)).astype(np.int32)
+    context = context._replace(past=context.past._replace(pose=past))
+    dx, dy = symmetries.DIRECTION_VECTORS[direction if faced_now else behind]
+    context.observation.grid[x + dx, y + dy] = BALL, 2, 0
+    begun = context._replace(actions=np.full(2, PAD, np.int32))
+    known = run("leapjax", 2, context, [0, MASK, 1])["logits"]
+    unknown = run("leapjax", 2, begun, [0, MASK, 1])["logits"]
+    if faced_now:  # the past adds nothing to it
+        np.testing.assert_array_equal(known, unknown)
+    else:
+        assert largest_change(known, unknown) > 1e-4
+
+
+def test_episodes_longer_than_expected_stay_finite():
+    context = random_context(10, 2)
+    last = run("paper", 2, context._replace(step=np.int32(MAX_STEPS)), [0, 1, 2])["logits"]
+    later = run("paper", 2, context._replace(step=np.int32(50 * MAX_STEPS)), [0, 1, 2])["logits"]
+    np.testing.assert_array_equal(later, last)
+    assert np.isfinite(last[1:]).all()
+
+
+# Promises of the leapjax architecture.
+
+
+@pytest.mark.parametrize("padded", [1, 2])
+def test_steps_before_the_episode_leak_nothing(padded):
     context = random_context(11, 2)
     actions = context.actions.copy()
     actions[:padded] = PAD
@@ -299,15 +352,32 @@ def test_steps_before_the_episode_leak_nothing(padded=1):
     assert largest_change(after, before) > 1e-3
 
 
+def turn(context, quarters):
+    """Every state of a context, seen after so many quarter turns."""
+    rotate = _rotations(len(context.actions))
+    observation, past = rotate(context.observation, context.past, quarters)
+    return context._replace(observation=observation, past=past)
+
+
+@functools.cache
+def _rotations(past):
+    each = jax.vmap(symmetries.rotate, (0, None))
+
+    @quick_jit
+    def rotate(observation, states, quarters):
+        turned = each(states, quarters) if past else states
+        return symmetries.rotate(observation, quarters), turned
+
+    return rotate
+
+
 @pytest.mark.parametrize("past", [2, pytest.param(0, marks=only_long)])
-def test_turning_the_whole_world_changes_no_logits(past):
-    context = random_context(13, past)
+@pytest.mark.parametrize("goal", [True, False])
+def test_turning_the_whole_world_changes_no_logits(past, goal):
+    context = random_context(13, past, goal)
     before = run("leapjax", past, context, [0, MASK, 1])["logits"]
-    each = jax.vmap(symmetries.rotate, (0, None)) if past else lambda states, quarters: states
-    rotate = quick_jit(lambda seen, states, n: (symmetries.rotate(seen, n), each(states, n)))
     for quarters in (1, 2, 3):
-        observation, states = rotate(context.observation, context.past, quarters)
-        turned = context._replace(observation=observation, past=states)
+        turned = turn(context, quarters)
         assert (np.asarray(turned.observation.pose) != context.observation.pose).any()
         after = run("leapjax", past, turned, [0, MASK, 1])["logits"]
         assert largest_change(after, before) < 1e-5
@@ -322,14 +392,14 @@ def test_turning_the_whole_world_changes_no_logits(past):
 # Lower precision.
 
 
-@pytest.mark.parametrize("architecture", ["leapjax", pytest.param("paper", marks=only_long)])
+@EACH_ARCHITECTURE
 def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
     params, _ = model(architecture, 2)
     context = random_context(0, 2)
     actions = jnp.zeros(HORIZON, jnp.int32)
     programs = {}
     for dtype in ("float32", "bfloat16"):
-        module = make(architecture, 2, dtype)
+        module = make(build, architecture, 2, dtype)
         shapes = jax.eval_shape(
             functools.partial(module.init, method=everything), jax.random.key(0), context, actions
         )
@@ -372,7 +442,7 @@ def test_with_causal_attention_no_action_sees_a_later_one(architecture):
 
 def test_a_token_holds_the_actions_beside_it_and_no_other():
     params, _ = model("neighbours", 0)
-    module = make("neighbours", 0)
+    module = make(build, "neighbours", 0)
     tokens = quick_jit(functools.partial(module.apply, params, method="_tokens"))
     own = params["params"]
     table, before, after = (
@@ -384,7 +454,7 @@ def test_a_token_holds_the_actions_beside_it_and_no_other():
     np.testing.assert_allclose(tokens(np.array([2, MASK, 5])), expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("past", [pytest.param(0, marks=only_long), 2])
+@pytest.mark.parametrize("past", [0, 2])
 def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     """The paper's network, conditioned on returns; with full attention it keeps all tokens."""
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), past)
@@ -451,34 +521,64 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     assert differ(grid=here.observation.grid[::-1].copy()).all()
 
 
+def test_where_embeddings_of_the_paper_start():
+    encoder = encoders.StateTokens(SIDE, 64)
+
+    @quick_jit
+    def tables(key):
+        params = encoder.init(key, random_context(0, 0))["params"]
+        leaves = jax.tree.leaves_with_path(params)
+        return [leaf for path, leaf in leaves if path[-1].key == "embedding"]
+
+    begun = tables(jax.random.key(0))
+    assert len(begun) == 5  # words, coordinates, directions, and the two of what is carried
+    for table in begun:
+        np.testing.assert_allclose(np.std(table), 1, rtol=0.15)
+
+
 def test_only_some_encoders_know_no_pose():
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), 0)
     with pytest.raises(UserError, match="not repeated are for architecture 'paper' on BabyAI"):
         build(ModelConfig("paper"), Sizes(4, 0, HORIZON, 9), encoder, repeat_state=False)
 
 
+def test_unknown_precision_is_refused():
+    with pytest.raises(ValueError, match="unknown dtype 'float16': .* float32, bfloat16"):
+        ModelConfig(dtype="float16")
+
+
 # Mistakes.
 
 
+def test_unknown_architecture_is_refused():
+    with pytest.raises(ValueError, match=r"unknown architecture 'gpt': .* paper, leapjax"):
+        ModelConfig(architecture="gpt")
+
+
+def test_width_that_does_not_split_into_heads_is_refused():
+    with pytest.raises(ValueError, match="width 10 is not a multiple of 4 heads"):
+        ModelConfig(width=10, heads=4)
+
+
 @pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"dtype": "float16"}, "unknown dtype 'float16': .* float32, bfloat16"),
-        ({"architecture": "gpt"}, "unknown architecture 'gpt': .* paper, leapjax"),
-        ({"width": 10, "heads": 4}, "width 10 is not a multiple of 4 heads"),
-        ({"architecture": "paper", "neighbours": True}, "neighbours needs architecture 'leapjax'"),
-        ({"attention": "causal", "neighbours": True}, "neighbours needs .* attention 'full'"),
-    ],
+    "options", [{"architecture": "paper"}, {"architecture": "leapjax", "attention": "causal"}]
 )
-def test_networks_that_cannot_be_are_refused(options, says):
-    with pytest.raises(ValueError, match=says):
-        ModelConfig(**options)
+def test_a_token_that_would_hold_what_it_may_not_see_is_refused(options):
+    with pytest.raises(
+        ValueError, match="neighbours needs architecture 'leapjax', .* and attention 'full'"
+    ):
+        ModelConfig(**options, neighbours=True)
 
 
+def judge(module, context, actions):
+    return module.degree(module.encode(context), actions)
+
+
+@pytest.mark.parametrize(("kind", "method"), [(build, everything), (SequenceClassifier, judge)])
 @EACH_ARCHITECTURE
-def test_plans_of_another_length_are_refused(architecture):
-    module = make(architecture, 0)
-    init = functools.partial(module.init, method=everything)
+def test_plans_of_another_length_are_refused(kind, method, architecture):
+    module = make(kind, architecture, 0)
+    init = functools.partial(module.init, method=method)
 
     def parameters(horizon):
         actions = np.zeros(horizon, np.int32)

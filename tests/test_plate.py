@@ -1,5 +1,6 @@
 """PlaTe predicts states and actions in turn, and finds plans by beam search."""
 
+import dataclasses
 import functools
 
 import jax
@@ -20,7 +21,7 @@ from tests.quick import quick_jit
 
 HORIZON = 4
 EACH_ARCHITECTURE = pytest.mark.parametrize(
-    ("architecture", "past"), [("leapjax", 1), ("paper", 2)]
+    ("architecture", "past"), [("leapjax", 0), ("leapjax", 1), ("paper", 2)]
 )
 
 
@@ -123,6 +124,28 @@ def test_nothing_follows_an_end():
     ended = jnp.array([0, toy.END, toy.END, toy.END])
     first = found[0, 0] + found[1, toy.END]
     assert agent.energy.total(params, memory, ended) == pytest.approx(first, rel=1e-5)
+
+
+def test_it_plans_in_bfloat16():
+    """What is kept of earlier tokens has the precision of the tokens."""
+    _, params, batch = untrained("leapjax", 0)
+    context = windows.context_at(jax.tree.map(lambda x: x[0], batch.context), 0, 0)
+
+    def energies_in(dtype):
+        setup = setup_of("leapjax", 0)
+        setup = setup._replace(model=dataclasses.replace(setup.model, dtype=dtype))
+        energy = plate.make_agent(setup).energy
+
+        def energies(params, context):
+            plan = jnp.array([0, 1, 2, 0])
+            return energy.conditional(
+                params, energy.encode(params, context), plan, jnp.arange(HORIZON)
+            )
+
+        return np.asarray(quick_jit(energies)(params, context))[:, :-1]
+
+    low, high = energies_in("bfloat16"), energies_in("float32")
+    assert 0 < np.abs(low - high).max() < 0.05 * np.abs(high).max()
 
 
 @pytest.fixture(scope="module")

@@ -33,8 +33,9 @@ def test_a_planner_can_be_asked_for_another_return(tmp_path):
         asked = planner.specification.method_settings.target_return
         return asked, np.asarray(judge(planner.params, context))
 
-    (usual, as_trained), (asked, other) = map(energies, (None, -3.0))
+    (usual, as_trained), (_, same), (asked, other) = map(energies, (None, 1.0, -3.0))
     assert (usual, asked) == (1.0, -3.0)
+    np.testing.assert_array_equal(as_trained, same)
     finite = np.isfinite(other)  # the end action is not chosen
     assert np.abs(as_trained[finite] - other[finite]).max() > 1e-3
     with pytest.raises(UserError, match="target_return must be finite"):

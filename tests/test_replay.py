@@ -27,7 +27,8 @@ LEFT, DONE = 0, 6
 NAMES = {"partial": "minigrid/BabyAI-GoToLocal/optimal-v0", "whole": "minigrid/full/optimal-v0"}
 
 
-def test_a_view_may_be_as_large_as_the_level(level="BabyAI-GoToLocalS7N5-v0"):
+@pytest.mark.parametrize("level", ["BabyAI-GoToLocalS7N5-v0"])
+def test_a_view_may_be_as_large_as_the_level(level):
     name = recorded("minigrid/small-v0", episodes=2, level=level)
     collection = storage.load(name, BABYAI.make(level, Settings()))
     assert not collection.dropped and len(collection.demonstrations) == 2
