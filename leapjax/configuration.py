@@ -15,7 +15,7 @@ from leapjax.agents.learning import TrainingConfig
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
-from leapjax.domains import find_domain
+from leapjax.domains import find_domain, make_level
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
@@ -160,7 +160,7 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
 
 def make_domain(config: AnyConfig) -> Domain:
     """The level of a configuration: the one that is played."""
-    return find_domain(config.domain).make(config.play or config.level, config.domain_settings)
+    return make_level(config.domain, config.play or config.level, config.domain_settings)
 
 
 def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:

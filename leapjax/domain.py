@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from leapjax.models.encoder import Encoder
     from leapjax.models.trajectory import ModelConfig
 
+EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # what a network must know of its training data, kept with its checkpoint: by array of an
 # observation, by column of it
@@ -152,8 +153,8 @@ class Domain(NamedTuple):
         encoders: by architecture, (model, K) -> encoder.
         augmentations: each (key, window) -> window; (f, g) makes f(g(window)) of a window.
         measure: (demonstrations) -> what encoders must know of the training data.
-        with_statistics: (what was measured) -> the same level with encoders that know it; None:
-            theirs need to know nothing.
+        encoders_for: (what was measured) -> `encoders` that know it; UserError if it is not of this
+            level's observations. None: `encoders` need to know nothing.
         extras: (demonstration) -> what augmentations must know of each step, `[n, ...]`; no model
             sees it.
         check: (observations `[n + 1, ...]`, where) -> UserError if a value is out of range.
@@ -179,10 +180,10 @@ class Domain(NamedTuple):
     actions: tuple[str, ...]
     max_steps: int
     blank: PyTree
-    encoders: Mapping[str, Callable[["ModelConfig", int], "Encoder"]]
+    encoders: Mapping[str, EncoderMaker]
     augmentations: Sequence[Augmentation] = ()
     measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
-    with_statistics: Callable[[Statistics], "Domain"] | None = None
+    encoders_for: Callable[[Statistics], Mapping[str, EncoderMaker]] | None = None
     extras: Callable[[Demonstration], PyTree] = _no_extras
     check: Callable[[PyTree, str], None] = _nothing_to_check
     replay: Callable[[Recording], Demonstration | str | None] | None = None
@@ -222,7 +223,9 @@ def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
     Raises:
         UserError: the statistics are not of this level's observations.
     """
-    return domain.with_statistics(statistics) if domain.with_statistics and statistics else domain
+    if domain.encoders_for is None or not statistics:
+        return domain
+    return domain._replace(encoders=domain.encoders_for(statistics))
 
 
 def blank_context(domain: Domain, length: int) -> Context:

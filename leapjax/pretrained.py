@@ -168,7 +168,7 @@ class Pretrained:
             UserError: it is there already, or cannot be written; or `leapjax.make_domain` did not
                 make the domain, so that nothing on disk would say how to make its network.
         """
-        if self.domain.made_from is None:
+        if not self.specification.domain:
             raise UserError(
                 f"a planner of {self.domain.level} cannot be saved: its domain is not made by "
                 "leap.make_domain; keep planner.params, and fit with the same domain and steps=0"

@@ -54,6 +54,19 @@ def test_what_is_fitted_is_what_is_saved(star, tmp_path):
         planner.save(tmp_path / "mine")
 
 
+def test_what_is_fitted_on_an_environment_of_ones_own_is_saved_with_its_scales(tmp_path):
+    domain = leap.make_domain("gymnasium", "CartPole-v1")
+    states = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
+    episode = leap.Demonstration(states, np.arange(5) % 2, np.ones(5, np.float32), False, True, 0)
+    planner = leap.fit([episode], domain, "bc", steps=0, model=SMALL)
+    assert planner.specification.statistics  # its network was built around them
+    planner.save(tmp_path / "mine")
+    again = leap.load(tmp_path / "mine")
+    assert again.specification == planner.specification
+    plans = [each.plan_for(each.domain.make_adapter(), seed=0) for each in (planner, again)]
+    np.testing.assert_array_equal(*(plan.trace for plan in plans))
+
+
 @pytest.mark.parametrize("method", ["leap", "dt", "plate"])
 @pytest.mark.parametrize(
     ("domain", "level"), [("babyai", "GoToLocalS7N5"), ("gymnasium", "CartPole-v1")]

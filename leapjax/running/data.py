@@ -38,7 +38,7 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     name = config.demonstrations or source.default
     begun = time.perf_counter()
     if config.demonstrations is None and processes.first_does(lambda: not source.exists(name)):
-        if run.domain.with_statistics is None:  # the network needs to know nothing of the data
+        if run.domain.encoders_for is None:  # the network needs to know nothing of the data
             run.programs.begin(run)
         processes.first_does(lambda: _make(run, source, name))
     # Each process reads for itself: the data need not be on one shared disk.

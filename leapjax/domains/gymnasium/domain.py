@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from leapjax.checks import check_at_least, check_fits, check_types
-from leapjax.domain import Domain, DomainType, Statistics
+from leapjax.domain import Domain, DomainType, EncoderMaker, Statistics
 from leapjax.domains.gymnasium.observations import (
     StateTokens,
     blank_of,
@@ -199,7 +199,7 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
         check_choices(space, observations, where)
         check_precision(space, observations, where)
 
-    def encoders(statistics: Statistics) -> dict[str, Callable[[ModelConfig, int], Encoder]]:
+    def encoders(statistics: Statistics) -> dict[str, EncoderMaker]:
         def tokens(num_actions: int, model: ModelConfig, context: int) -> Encoder:
             del context
             return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
@@ -209,11 +209,11 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
             "leapjax": functools.partial(tokens, int(actions.n) + 1),
         }
 
-    def with_statistics(statistics: Statistics) -> Domain:
+    def encoders_for(statistics: Statistics) -> dict[str, EncoderMaker]:
         check_statistics(statistics, parts, blank)
-        return domain._replace(encoders=encoders(statistics))
+        return encoders(statistics)
 
-    domain = Domain(
+    return Domain(
         level=name,
         make_adapter=lambda: CheckedAdapter(
             make_environment(name, options), name, blank, options.success_return
@@ -228,10 +228,9 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
         criterion=find_criterion(env, options.success_return),
         encoders=encoders(()),
         measure=functools.partial(measure_parts, parts),
-        with_statistics=with_statistics,
+        encoders_for=encoders_for,
         signature={"parts": [list(part) for part in parts]},
     )
-    return domain
 
 
 GYMNASIUM = DomainType(Settings, make, EXAMPLES)
