@@ -3,6 +3,7 @@
 import json
 import math
 import subprocess
+from importlib import metadata
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,6 +55,17 @@ def test_without_a_repository_only_the_version_is_known(tmp_path):
     assert results.code_version(tmp_path) == ""
     (tmp_path / ".git").write_text("damaged")
     assert results.code_version(tmp_path) == ""
+
+
+def test_a_row_can_be_made_without_the_packages_of_other_domains(monkeypatch):
+    def version(name):
+        if name in ("minigrid", "ale-py"):
+            raise metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(results.metadata, "version", version)
+    found = results.versions()
+    assert found["jax"] == "1.0" and not {"minigrid", "ale-py"} & found.keys()
 
 
 def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):

@@ -243,10 +243,10 @@ def find(path: Path, configuration: str) -> Row | None:
 
 def versions() -> dict[str, str]:
     """What a result was made with; starts JAX, if it was not."""
-    names = ("jax", "flax", "optax", "minigrid", "numpy")
-    found = {name: metadata.version(name) for name in names}
-    with contextlib.suppress(metadata.PackageNotFoundError):  # an extra
-        found["ale-py"] = metadata.version("ale-py")
+    found = {}
+    for name in ("jax", "flax", "optax", "minigrid", "numpy", "ale-py"):
+        with contextlib.suppress(metadata.PackageNotFoundError):  # of an extra
+            found[name] = metadata.version(name)
     found["leapjax"] = find_version() + code_version(Path(__file__).parent.parent.parent)
     machine = f"{compilation.name_processor()}, cores: {jax_setup.cores()}"
     devices = jax.local_devices()
