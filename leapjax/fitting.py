@@ -15,7 +15,7 @@ from leapjax.data import storage, windows
 from leapjax.domain import Domain, apply_statistics
 from leapjax.domains import make_level
 from leapjax.errors import UserError
-from leapjax.methods import find_method
+from leapjax.methods import find_method, learns_from_rewards
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.presets import find_preset
@@ -114,9 +114,7 @@ def fit(
     data = _read(demonstrations, domain, seed)
     if not data and training.steps:
         raise UserError("no demonstrations: expected at least one to learn from")
-    if (chosen.rewards or getattr(settings, "returns", False)) and not any(
-        d.rewards.any() for d in data
-    ):
+    if learns_from_rewards(method, settings) and not any(d.rewards.any() for d in data):
         raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
     name_of_data = demonstrations if isinstance(demonstrations, str) else None
     statistics = domain.measure(data) if data else ()

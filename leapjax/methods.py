@@ -1,5 +1,7 @@
 """The table of methods: what `leapjax.load` and the experiments find by name."""
 
+from typing import Any
+
 from leapjax.agents.bc import BC
 from leapjax.agents.bcq import BCQ
 from leapjax.agents.classifier import CLASSIFIER
@@ -31,6 +33,11 @@ METHODS: dict[str, Method] = {
     "rules": RULES,
     "random": RANDOM,
 }
+
+
+def learns_from_rewards(name: str, settings: Any) -> bool:
+    """Whether a method with these settings learns from rewards, so that data must hold some."""
+    return find_method(name).rewards or getattr(settings, "returns", False)
 
 
 def find_method(name: str) -> Method:

@@ -15,7 +15,7 @@ from leapjax.data.storage import reasons
 from leapjax.domain import Domain, Source
 from leapjax.environments import judge_episode
 from leapjax.errors import UserError
-from leapjax.methods import find_method
+from leapjax.methods import learns_from_rewards
 from leapjax.running.progress import Meter
 from leapjax.running.run import Run
 from leapjax.serialization import read_json
@@ -47,7 +47,7 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     run.seconds["demos"] += time.perf_counter() - begun
     if dropped:
         run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)
-    asked = find_method(config.method).rewards or getattr(config.method_settings, "returns", False)
+    asked = learns_from_rewards(config.method, config.method_settings)
     if asked and not any(d.rewards.any() for d in data):
         raise UserError(
             f"{name} holds no rewards, from which --method {config.method} learns: give it data "
