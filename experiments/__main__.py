@@ -1,4 +1,4 @@
-"""All programs by name: `python -m experiments NAME`; once installed, `leapjax NAME`."""
+"""All programs of a checkout by name: `python -m experiments NAME`."""
 
 import ast
 import importlib
@@ -18,7 +18,6 @@ PROGRAMS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the program that comes first with all that follows it; the exit code."""
-    startup.find_modules_here()
     name, *rest = shell.arguments_of(arguments) or ["--help"]
     if name in ("-h", "--help"):
         command = startup.command("experiments.NAME")

@@ -84,7 +84,7 @@ def test_output_that_nobody_reads_ends_a_program_quietly(buffered, name):
 def test_the_command_imports_from_the_working_folder(started, safe, finds, monkeypatch):
     interpreter = SimpleNamespace(argv=[started], path=[], flags=SimpleNamespace(safe_path=safe))
     monkeypatch.setattr(startup, "sys", interpreter)
-    assert programs.main(["--help"]) == 0
+    assert leapjax.__main__.main(["--help"]) == 0
     assert interpreter.path == [str(Path.cwd())] * finds
 
 

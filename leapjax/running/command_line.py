@@ -1,4 +1,4 @@
-"""The configuration of a run: presets, the command line, the hash that names it."""
+"""Makes the configurations that a command line asks for."""
 
 import argparse
 import dataclasses
