@@ -8,15 +8,7 @@ from leapjax.domains.atari.domain import LONGEST, Settings
 from leapjax.domains.atari.encoders import STACK
 from leapjax.domains.atari.games import find_game
 from leapjax.planners import PlannerConfig
-from leapjax.presets.common import (
-    demonstrations,
-    our_model,
-    our_training,
-    paper_model,
-    paper_training,
-    search,
-    settings,
-)
+from leapjax.presets import common
 
 TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
 EPISODES = 20  # games
@@ -39,21 +31,16 @@ def paper(name: str, method: str) -> AnyConfig:
     """
     find_game(name)
     horizon, iterations, batch = PAPER[name]
-    training = paper_training(
+    training = common.paper_training(
         method, steps=EPOCHS * PAPER_TRANSITIONS // batch, batch=batch, windows="step",
         **({"microbatch": 0} if method == "leap" else {}),
     )  # fmt: skip
-    return Config(
-        domain="atari",
-        level=name,
-        method=method,
+    return _configure(
+        name,
+        method,
         preset="paper",
-        demos=demonstrations(method, ALL),
-        episodes=EPISODES,
-        test_seed=TEST_SEED,
-        executed=1,
         context=PAST,
-        model=paper_model(method, layers=6, heads=8, attention="causal"),
+        model=common.paper_model(method, layers=6, heads=8, attention="causal"),
         training=training,
         planner=_search(method, horizon, iterations, 1.0),
         method_settings=_settings(name, method, masking="one"),
@@ -74,18 +61,13 @@ def leapjax(name: str, method: str) -> AnyConfig:
     own = _settings(name, method, masking="stratified")
     if method == "cql":
         own = cql.Settings(alpha=1.0)  # with less it learns nothing in so few steps
-    return Config(
-        domain="atari",
-        level=name,
-        method=method,
+    return _configure(
+        name,
+        method,
         preset="leapjax",
-        demos=demonstrations(method, ALL),
-        episodes=EPISODES,
-        test_seed=TEST_SEED,
-        executed=1,
         context=0 if blind else STACK - 1,
-        model=our_model(method, layers=2, width=64),
-        training=our_training(method, steps=10_000, windows="step", learning_rate=1e-3),
+        model=common.our_model(method, layers=2, width=64),
+        training=common.our_training(method, steps=10_000, windows="step", learning_rate=1e-3),
         planner=_search(method, 5, 5, 0.1),
         method_settings=own,
         domain_settings=Settings(
@@ -99,9 +81,23 @@ def transitions(name: str) -> int:
     return 200_000 if name == "Seaquest" else 50_000
 
 
+def _configure(name: str, method: str, **fields: Any) -> AnyConfig:
+    """Makes a configuration whose data, games and rhythm are those of both presets."""
+    return Config(
+        domain="atari",
+        level=name,
+        method=method,
+        demos=common.demonstrations(method, ALL),
+        episodes=EPISODES,
+        test_seed=TEST_SEED,
+        executed=1,
+        **fields,
+    )
+
+
 def _search(method: str, horizon: int, iterations: int, temperature: float) -> PlannerConfig:
     """Imitators draw their actions at a temperature."""
-    return search(method, horizon, iterations, temperature if method in IMITATORS else 0.0)
+    return common.search(method, horizon, iterations, temperature if method in IMITATORS else 0.0)
 
 
 def _settings(name: str, method: str, masking: str) -> Any:
@@ -109,4 +105,4 @@ def _settings(name: str, method: str, masking: str) -> Any:
     target = find_game(name).target
     if method == "dt":
         return dt.Settings(target)
-    return settings(method, masking=masking, end=False, returns=True, target_return=target)
+    return common.settings(method, masking=masking, end=False, returns=True, target_return=target)

@@ -6,16 +6,7 @@ from leapjax.configuration import AnyConfig, Config
 from leapjax.domains.babyai.levels import Level, find_level
 from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import BeamConfig, PlannerConfig
-from leapjax.presets.common import (
-    SEQUENCE,
-    demonstrations,
-    our_model,
-    our_training,
-    paper_model,
-    paper_training,
-    search,
-    settings,
-)
+from leapjax.presets import common
 
 DEMONSTRATIONS = 500  # of a level: section 5
 _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place
@@ -36,11 +27,11 @@ def paper(name: str, method: str) -> AnyConfig:
         level=name,
         method=method,
         preset="paper",
-        demos=demonstrations(method, DEMONSTRATIONS),
+        demos=common.demonstrations(method, DEMONSTRATIONS),
         context=_paper_context(level, method),
-        model=paper_model(method),
-        training=paper_training(method, **_paper_changes(level, method)),
-        planner=search(method, horizon, iterations),
+        model=common.paper_model(method),
+        training=common.paper_training(method, **_paper_changes(level, method)),
+        planner=common.search(method, horizon, iterations),
         method_settings=_paper_settings(level, method),
         domain_settings=Settings(),
     )
@@ -60,20 +51,20 @@ def leapjax(name: str, method: str) -> AnyConfig:
         level=name,
         method=method,
         preset="leapjax",
-        demos=demonstrations(method, DEMONSTRATIONS),
+        demos=common.demonstrations(method, DEMONSTRATIONS),
         episodes=500,  # a rate near 100% wants more of them than the paper's 200
         context=level.context,
-        model=our_model(method),
-        training=our_training(method, steps=_steps(level), **rate),
+        model=common.our_model(method),
+        training=common.our_training(method, steps=_steps(level), **rate),
         planner=_our_search(level, method),
-        method_settings=settings(method, masking="random"),
+        method_settings=common.settings(method, masking="random"),
         domain_settings=_augmented(level),
     )
 
 
 def _paper_context(level: Level, method: str) -> int:
     """K: methods of single actions see the appendix's past states."""
-    return level.context if method in (*SEQUENCE, "random") else level.states - 1
+    return level.context if method in (*common.SEQUENCE, "random") else level.states - 1
 
 
 def _paper_changes(level: Level, method: str) -> dict[str, Any]:
@@ -91,7 +82,7 @@ def _paper_settings(level: Level, method: str) -> Any:
     PickUpLoc learns from the state alone: all actions are masked, one copy of each window.
     """
     masking = "all" if level.name == "PickUpLoc" else "each"
-    return settings(method, masking=masking, end=False, repeat_state=False)
+    return common.settings(method, masking=masking, end=False, repeat_state=False)
 
 
 def _our_search(level: Level, method: str) -> PlannerConfig:
@@ -104,7 +95,7 @@ def _our_search(level: Level, method: str) -> PlannerConfig:
         noise = {"leap": 1.0, "bc": 1.0, "dt": 1.0, "iql": 1.0, "mopo": 1.0, "bcq": 0.1}
         temperature = {**noise, "plate": 2.0}.get(method, temperature)
     beams = 1 if level.sequence else BeamConfig.beams
-    return search(method, level.horizon, level.horizon, temperature, beams=beams)
+    return common.search(method, level.horizon, level.horizon, temperature, beams=beams)
 
 
 def _augmented(level: Level) -> Settings:

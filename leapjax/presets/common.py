@@ -1,9 +1,12 @@
 """What the presets of all domains share: networks, training and search by method."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from leapjax.agents import leap
 from leapjax.agents.learning import TrainingConfig
+from leapjax.configuration import AnyConfig, Config
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
@@ -81,3 +84,46 @@ def search(
 def settings(method: str, **of_leap: Any) -> Any:
     """Returns the settings of a method: its defaults, and changes of LEAP's."""
     return leap.Settings(**of_leap) if method == "leap" else find_method(method).settings()
+
+
+def configure(
+    domain: str,
+    level: str,
+    method: str,
+    preset: str,
+    *,
+    demos: int,
+    training: Mapping[str, Any],
+    planner: PlannerConfig,
+    domain_settings: Any,
+    model: Mapping[str, Any] = MappingProxyType({}),
+    **others: Any,
+) -> AnyConfig:
+    """Makes the configuration of a preset that stands for a network and how it is trained alone.
+
+    Args:
+        domain: its name.
+        level: its name.
+        method: its name.
+        preset: "leapjax", or "paper".
+        demos: to learn from, where the method learns.
+        training: changes of the preset's training.
+        planner: how plans are found.
+        domain_settings: of the domain.
+        model: changes of the preset's network.
+        others: fields of `Config`.
+    """
+    ours = preset == "leapjax"
+    return Config(
+        domain=domain,
+        level=level,
+        method=method,
+        preset=preset,
+        demos=demonstrations(method, demos),
+        model=(our_model if ours else paper_model)(method, **model),
+        training=(our_training if ours else paper_training)(method, **training),
+        planner=planner,
+        method_settings=settings(method, masking="random" if ours else "each"),
+        domain_settings=domain_settings,
+        **others,
+    )

@@ -1,16 +1,8 @@
 """Presets of any environment, such as Gymnasium's: plan five actions, execute one."""
 
-from leapjax.configuration import AnyConfig, Config
+from leapjax.configuration import AnyConfig
 from leapjax.domains import find_domain
-from leapjax.presets.common import (
-    demonstrations,
-    our_model,
-    our_training,
-    paper_model,
-    paper_training,
-    search,
-    settings,
-)
+from leapjax.presets import common
 
 DEMONSTRATIONS = 500  # as in BabyAI
 EPISODES = 100
@@ -20,36 +12,25 @@ HORIZON = 5  # planned actions, of which one is executed; so many passes fill ea
 
 def paper(domain: str, name: str, method: str) -> AnyConfig:
     """The paper's network."""
-    return Config(
-        domain=domain,
-        level=name,
-        method=method,
-        preset="paper",
-        demos=demonstrations(method, DEMONSTRATIONS),
-        episodes=EPISODES,
-        executed=1,
-        model=paper_model(method),
-        training=paper_training(method, steps=STEPS),
-        planner=search(method, HORIZON, HORIZON),
-        method_settings=settings(method, masking="each"),
-        domain_settings=find_domain(domain).settings(),
-    )
+    return _configure(domain, name, method, "paper", temperature=0.0)
 
 
 def leapjax(domain: str, name: str, method: str) -> AnyConfig:
     """Our network."""
     temperature = 0.5 if method == "leap" else 0.0  # as in BabyAI
-    return Config(
-        domain=domain,
-        level=name,
-        method=method,
-        preset="leapjax",
-        demos=demonstrations(method, DEMONSTRATIONS),
+    return _configure(domain, name, method, "leapjax", temperature)
+
+
+def _configure(domain: str, name: str, method: str, preset: str, temperature: float) -> AnyConfig:
+    return common.configure(
+        domain,
+        name,
+        method,
+        preset,
+        demos=DEMONSTRATIONS,
+        training={"steps": STEPS},
+        planner=common.search(method, HORIZON, HORIZON, temperature),
+        domain_settings=find_domain(domain).settings(),
         episodes=EPISODES,
         executed=1,
-        model=our_model(method),
-        training=our_training(method, steps=STEPS),
-        planner=search(method, HORIZON, HORIZON, temperature),
-        method_settings=settings(method, masking="random"),
-        domain_settings=find_domain(domain).settings(),
     )

@@ -3,16 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from leapjax.configuration import AnyConfig, Config
-from leapjax.presets.common import (
-    demonstrations,
-    our_model,
-    our_training,
-    paper_model,
-    paper_training,
-    search,
-    settings,
-)
+from leapjax.configuration import AnyConfig
+from leapjax.presets import common
 
 EPISODES = 500
 
@@ -27,7 +19,7 @@ class Puzzle(NamedTuple):
         demonstrations: to learn from.
         settings: of the domain.
         training: changes of the training.
-        model: changes of our network.
+        model: changes of the network.
     """
 
     domain: str
@@ -47,17 +39,15 @@ def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
     training = dict(puzzle.training)
     if method == "leap":
         training["windows"] = "start"  # LEAP executes the whole plan, from the start of an episode
-    ours = preset == "leapjax"
-    return Config(
-        domain=puzzle.domain,
-        level=puzzle.level,
-        method=method,
-        preset=preset,
-        demos=demonstrations(method, puzzle.demonstrations),
-        episodes=EPISODES,
-        model=our_model(method, **puzzle.model) if ours else paper_model(method),
-        training=(our_training if ours else paper_training)(method, **training),
-        planner=search(method, puzzle.length, puzzle.length, fill="confident"),
-        method_settings=settings(method, masking="random" if ours else "each"),
+    return common.configure(
+        puzzle.domain,
+        puzzle.level,
+        method,
+        preset,
+        demos=puzzle.demonstrations,
+        training=training,
+        planner=common.search(method, puzzle.length, puzzle.length, fill="confident"),
         domain_settings=puzzle.settings,
+        model=puzzle.model,
+        episodes=EPISODES,
     )
