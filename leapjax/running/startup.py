@@ -17,14 +17,6 @@ from leapjax.version import find_version
 
 COMMAND = "leapjax"  # the installed script
 UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
-# The extra of the package that a program needs, where it is not `babyai`.
-EXTRAS = {
-    "atari": "atari",
-    "atari_energy": "atari",
-    "gymnasium": "train",
-    "stars": "train",
-    "sudoku": "train",
-}
 
 
 def is_program() -> bool:
@@ -168,8 +160,14 @@ def print_uncaught(
 
 
 def extra_of(module: str) -> str:
-    """The extra of the package that a program needs, by its module, such as `experiments.atari`."""
-    return EXTRAS.get(module.rpartition(".")[2], "babyai")
+    """The extra of the package that a program needs, by its module, such as `experiments.atari`.
+
+    A program that is named after a domain needs that of the domain, all others need BabyAI's.
+    """
+    from leapjax.domains import DOMAINS, Place  # noqa: PLC0415  (imports JAX)
+
+    domain = DOMAINS.get(module.rpartition(".")[2].partition("_")[0])
+    return domain.extra if isinstance(domain, Place) else "babyai"
 
 
 def settings_of_jax() -> str:
