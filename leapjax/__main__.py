@@ -13,26 +13,22 @@ USAGE = """usage: leapjax DOMAIN [OPTIONS]
 
 leapjax DOMAIN --help lists the options; --version prints the version.
 
-  babyai       BabyAI and MiniGrid: demonstrations are made
-  gymnasium    any Gymnasium environment with discrete actions, on a Minari data set
-  atari        Breakout, Pong, Qbert, Seaquest
-  stars        star graphs: find the arm that leads to the goal
-  sudoku       boards with one solution
+{domains}
 
-A checkout has more programs, which reproduce the tables of the paper: python -m experiments
-"""
+A checkout has more programs, which reproduce the tables of the paper: python -m experiments"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains on a domain and plays it; the exit code."""
-    from leapjax.domains import DOMAINS  # noqa: PLC0415  (all of these import JAX)
+    from leapjax.domains import DOMAINS, Place  # noqa: PLC0415  (all of these import JAX)
     from leapjax.errors import did_you_mean  # noqa: PLC0415
     from leapjax.running import shell  # noqa: PLC0415
 
     startup.find_modules_here()
     name, *rest = shell.arguments_of(arguments) or ["--help"]
     if name in ("-h", "--help"):
-        print(USAGE, end="")
+        about = {name: d.about for name, d in DOMAINS.items() if isinstance(d, Place)}
+        print(USAGE.format(domains="\n".join(f"  {n:12} {text}" for n, text in about.items())))
         return 0
     if name not in DOMAINS:
         expected = f"expected one of {', '.join(DOMAINS)}{did_you_mean(name, DOMAINS)}"

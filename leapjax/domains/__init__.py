@@ -17,20 +17,35 @@ class Place(NamedTuple):
         module: that defines it.
         name: of the `DomainType` in that module.
         extra: of the package that the domain needs; see `leapjax.extras`.
+        about: what its levels are, in a line of help.
     """
 
     module: str
     name: str
     extra: str
+    about: str
 
 
 DOMAINS: dict[str, DomainType | Place] = {
-    "babyai": Place("leapjax.domains.babyai.domain", "BABYAI", "babyai"),
-    "stars": Place("leapjax.domains.puzzles.stars.domain", "STARS", "train"),
-    "sudoku": Place("leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train"),
-    "gymnasium": Place("leapjax.domains.gymnasium.domain", "GYMNASIUM", "train"),
-    "atari": Place("leapjax.domains.atari.domain", "ATARI", "atari"),
-}
+    "babyai": Place(
+        "leapjax.domains.babyai.domain", "BABYAI", "babyai",
+        "BabyAI and MiniGrid: demonstrations are made",
+    ),
+    "gymnasium": Place(
+        "leapjax.domains.gymnasium.domain", "GYMNASIUM", "train",
+        "any Gymnasium environment with discrete actions, on a Minari data set",
+    ),
+    "atari": Place(
+        "leapjax.domains.atari.domain", "ATARI", "atari", "Breakout, Pong, Qbert, Seaquest"
+    ),
+    "stars": Place(
+        "leapjax.domains.puzzles.stars.domain", "STARS", "train",
+        "star graphs: find the arm that leads to the goal",
+    ),
+    "sudoku": Place(
+        "leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train", "boards with one solution"
+    ),
+}  # fmt: skip
 
 
 def find_domain(name: str) -> DomainType:
