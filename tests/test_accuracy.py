@@ -62,7 +62,7 @@ def test_what_comes_after_the_end_does_not_count(actions):
 
 
 def collect(count, seed):
-    return DOMAIN.collect(count, seed, lambda done: None)
+    return DOMAIN.demonstrations.collect(count, seed, lambda done: None)
 
 
 def test_the_demonstrations_of_both_kinds_are_different_levels():

@@ -16,7 +16,7 @@ from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.domain import blank_context
+from leapjax.domain import Augmentations, blank_context
 from leapjax.domains.babyai import encoders
 from leapjax.domains.babyai.adapter import NUM_ACTIONS
 from leapjax.domains.babyai.domain import BABYAI
@@ -146,7 +146,7 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
         return window._replace(actions=window.actions + 1)
 
     def draw(*augmentations):
-        domain = toy.DOMAIN._replace(augmentations=augmentations)
+        domain = toy.DOMAIN._replace(augmentations=Augmentations(augmentations))
         return jax.jit(window_batches(setup(domain)))(jax.random.key(0), data)
 
     first, second = draw(doubled, shifted), draw(shifted, doubled)
@@ -242,7 +242,9 @@ def entropy_of_positions(data) -> float:
 def test_it_learns_a_few_demonstrations_by_heart(local_demonstrations):
     agent = leap.make_agent(setup(LEVEL, EXACT))
     step = training.make_train_step(agent)
-    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
+    data = jax.tree.map(
+        jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.augmentations.extras)
+    )
     losses, accuracies = [], []
 
     def report(done, state, means):
@@ -552,7 +554,9 @@ def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
 @only_long
 @pytest.mark.parametrize("repeat_state", [True, False])
 def test_a_step_of_the_papers_network_in_parts_is_that_of_all(repeat_state, local_demonstrations):
-    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.extras))
+    data = jax.tree.map(
+        jnp.asarray, windows.concatenate(local_demonstrations, LEVEL.augmentations.extras)
+    )
     settings = leap.Settings(masking="each", repeat_state=repeat_state)
     model, key = dataclasses.replace(MODEL, architecture="paper"), jax.random.key(0)
 
