@@ -10,6 +10,7 @@ import pytest
 from leapjax import batching
 from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, returns
 from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.domain import Scaling
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -153,7 +154,7 @@ def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings, st
 
 def test_the_return_that_is_wanted_is_less_by_what_was_given():
     """In units that do not saturate; where a demonstration tells the rest, that is taken."""
-    domain = mixed.DOMAIN._replace(return_scale=4.0)
+    domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
     settings = dt.Settings(target_return=10.0)
     wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
     context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 2.0]), return_so_far=3.0)
