@@ -95,7 +95,6 @@ def test_a_folder_in_which_checkpoints_would_be_lost(name, workplace):
     for use in (Checkpoints, lambda folder: checkpoints.restore_params(folder, {})):
         with pytest.raises(UserError, match="cannot hold checkpoints"):
             use(workplace / name)
-    assert list(workplace.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a #%41ü\n:.{7}'$HOME", "1.orbax-checkpoint-tmp", "x" * 255])
@@ -395,20 +394,6 @@ def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
             jax_setup.start()
     finally:
         jax.config.update(setting, before)
-
-
-def test_settings_of_jax_that_break_nothing(monkeypatch):
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", "off")
-    with jax.debug_nans(True), jax.numpy_rank_promotion("warn"), jax.log_compiles(True):
-        jax_setup.start()
-
-
-@pytest.mark.parametrize("count", [0, 10**6])
-def test_a_number_of_devices_that_cannot_be_made(count, monkeypatch):
-    config = SimpleNamespace(jax_num_cpu_devices=count)
-    monkeypatch.setattr(jax_setup, "jax", SimpleNamespace(config=config))
-    with pytest.raises(UserError, match=f"JAX_NUM_CPU_DEVICES is {count}: expected a number in 1"):
-        jax_setup.use_every_core()
 
 
 def test_no_device_is_one_line(monkeypatch):
