@@ -57,7 +57,9 @@ def test_what_comes_after_the_end_does_not_count(end):
 
 def test_counts_are_those_of_every_step():
     """Three demonstrations of 2, 3 and 7 steps that count up from 0, or stand still."""
-    whole = max(DOMAIN.collect(20, 0, print).demonstrations, key=lambda d: len(d.actions))
+    whole = max(
+        DOMAIN.demonstrations.collect(20, 0, print).demonstrations, key=lambda d: len(d.actions)
+    )
     assert len(whole.actions) >= 7
 
     def told(actions):

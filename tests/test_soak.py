@@ -49,8 +49,10 @@ def test_train_plan_evaluate_over_and_over(tmp_path):
     begin = training.make_begin(agent, mesh)
     step = training.make_train_step(agent, mesh)
     plan = batching.compile_planner(agent.energy, planners.GibbsConfig(4, 4))
-    demonstrations = DOMAIN.collect(5, 0, lambda done: None).demonstrations
-    data = sharding.replicate(windows.concatenate(demonstrations, DOMAIN.extras), mesh)
+    demonstrations = DOMAIN.demonstrations.collect(5, 0, lambda done: None).demonstrations
+    data = sharding.replicate(
+        windows.concatenate(demonstrations, DOMAIN.augmentations.extras), mesh
+    )
     watch = Watch()
     for cycle in range(CYCLES):
         state, key = begin(cycle)
