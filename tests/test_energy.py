@@ -1,4 +1,5 @@
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,8 @@ MASK = mask_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
 PLANS = all_plans(HORIZON, ACTIONS)
 NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
+ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
+TABLE, OTHER_TABLE = random_table(0, HORIZON, ACTIONS), random_table(1, HORIZON, ACTIONS)
 
 
 @functools.cache
@@ -53,24 +56,19 @@ def evaluator(energy):
     return evaluate
 
 
-def evaluate(energy, params, context, plans):
+class Said(NamedTuple):
+    """What an energy says of many plans."""
+
+    conditional: np.ndarray  # [plans, T, A]: of every action, one position at a time
+    total: np.ndarray
+    violation: np.ndarray
+
+
+def ask(energy, params=TABLE, context=NO_TILT, plans=PLANS):
     # One shape for all, so that an energy is compiled once: the rest repeats the first plan.
     rows = np.resize(plans, (len(PLANS), HORIZON)).astype(np.int32)
     results = evaluator(energy)(params, context, rows)
-    return [np.array(result)[: len(plans)] for result in results]
-
-
-def conditionals(energy, params, context, plans=PLANS):
-    """The energies `[plans, T, A]` of every action, one position at a time."""
-    return evaluate(energy, params, context, plans)[0]
-
-
-def totals(energy, params, context, plans=PLANS):
-    return evaluate(energy, params, context, plans)[1]
-
-
-def violations(energy, params, context, plans=PLANS):
-    return evaluate(energy, params, context, plans)[2]
+    return Said(*(np.array(result)[: len(plans)] for result in results))
 
 
 def probabilities(energies):
@@ -85,10 +83,6 @@ def exact_conditionals(joint, plans=PLANS):
     )
 
 
-ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
-TABLE, OTHER_TABLE = random_table(0, HORIZON, ACTIONS), random_table(1, HORIZON, ACTIONS)
-
-
 # The helper that the other tests take for the truth.
 
 
@@ -96,16 +90,16 @@ def test_enumerable_energy_is_the_joint():
     tilt = np.random.default_rng(5).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
     joint = joint_probabilities(TABLE, tilt)
     np.testing.assert_allclose(
-        totals(ENUMERABLE, TABLE, tilt), -np.log(joint.reshape(-1)), rtol=1e-5, atol=1e-5
+        ask(ENUMERABLE, context=tilt).total, -np.log(joint.reshape(-1)), rtol=1e-5, atol=1e-5
     )
     masked = np.array([[MASK, MASK, MASK], [2, MASK, 0], [MASK, 1, MASK], [0, 2, MASK]], np.int32)
     plans = np.concatenate([PLANS[::5], masked])
     np.testing.assert_allclose(
-        probabilities(conditionals(ENUMERABLE, TABLE, tilt, plans)),
+        probabilities(ask(ENUMERABLE, context=tilt, plans=plans).conditional),
         exact_conditionals(joint, plans),
         atol=1e-5,
     )
-    assert np.isposinf(totals(ENUMERABLE, TABLE, tilt, masked)).all()
+    assert np.isposinf(ask(ENUMERABLE, context=tilt, plans=masked).total).all()
 
 
 # The pseudo-likelihood of a masked language model.
@@ -134,7 +128,7 @@ def test_pseudo_likelihood_total_is_a_loop_over_positions():
     for row, t in np.ndindex(len(PLANS), HORIZON):
         masked = np.where(t == EVERYWHERE, MASK, PLANS[row])
         expected[row] -= pairwise_log_likelihood(masked, t)[PLANS[row, t]]
-    np.testing.assert_allclose(totals(PAIRWISE, VOTES, BIAS), expected, rtol=1e-5)
+    np.testing.assert_allclose(ask(PAIRWISE, VOTES, BIAS).total, expected, rtol=1e-5)
 
 
 def test_an_autoregressive_energy_is_that_of_the_joint():
@@ -149,21 +143,21 @@ def test_an_autoregressive_energy_is_that_of_the_joint():
 
     energy = autoregressive(ENUMERABLE.encode, logits, ACTIONS)
     joint = joint_probabilities(TABLE)
-    found, sums, _ = evaluate(energy, TABLE, NO_TILT, PLANS)
+    found, sums, _ = ask(energy)
     np.testing.assert_allclose(sums, -np.log(joint.reshape(-1)), rtol=1e-4)
     for plan, energies in zip(PLANS, found, strict=True):
         before = [np.where(t > EVERYWHERE, plan, MASK) for t in range(HORIZON)]
         expected = [-np.log(conditional_by_counting(joint, before[t], t)) for t in range(HORIZON)]
         np.testing.assert_allclose(energies, expected, rtol=1e-3, atol=1e-4)
-    assert np.isposinf(totals(energy, TABLE, NO_TILT, np.array([[0, 1, MASK]]))).all()
+    assert np.isposinf(ask(energy, plans=np.array([[0, 1, MASK]])).total).all()
 
 
 @pytest.mark.parametrize("energy", [PAIRWISE, from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)])
 def test_incomplete_plan_has_infinite_total(energy):
     incomplete = [[t if s != t else token for s in range(3)] for t in range(3) for token in (3, 4)]
     incomplete += [[MASK] * 3, [pad_token(ACTIONS)] * 3, [0, -1, 0]]
-    assert np.isposinf(totals(energy, VOTES, BIAS, np.array(incomplete, np.int32))).all()
-    assert np.isfinite(totals(energy, VOTES, BIAS)).all()
+    assert np.isposinf(ask(energy, VOTES, BIAS, plans=np.array(incomplete, np.int32)).total).all()
+    assert np.isfinite(ask(energy, VOTES, BIAS).total).all()
 
 
 def test_forbidden_action_is_infinite_and_not_nan():
@@ -173,10 +167,10 @@ def test_forbidden_action_is_infinite_and_not_nan():
 
     energy = pseudo_likelihood(PAIRWISE.encode, logits, ACTIONS)
     forbidden = PLANS[:, 1] == 2
-    actual = totals(energy, VOTES, BIAS)
+    actual = ask(energy, VOTES, BIAS).total
     assert np.isposinf(actual[forbidden]).all()
     assert np.isfinite(actual[~forbidden]).all()
-    table = conditionals(energy, VOTES, BIAS)
+    table = ask(energy, VOTES, BIAS).conditional
     assert np.isposinf(table[:, 1, 2]).all()
     assert np.isfinite(np.delete(table.reshape(-1, 9), 5, axis=1)).all()
     # What is left is still a distribution.
@@ -206,11 +200,11 @@ def test_composition_is_the_weighted_product_of_the_joints(weights):
     logs = [np.log(joint_probabilities(table)) for table in params]
     summed = first * logs[0] + second * logs[1]
     np.testing.assert_allclose(
-        totals(composed, params, context), -summed.reshape(-1), rtol=1e-5, atol=1e-4
+        ask(composed, params, context).total, -summed.reshape(-1), rtol=1e-5, atol=1e-4
     )
     product = np.exp(summed) / np.exp(summed).sum()
     np.testing.assert_allclose(
-        probabilities(conditionals(composed, params, context)),
+        probabilities(ask(composed, params, context).conditional),
         exact_conditionals(product),
         atol=1e-5,
     )
@@ -239,14 +233,10 @@ INFINITE = Energy(
 def test_composing_with_nothing_changes_nothing(other, weights):
     composed = compose([ENUMERABLE, other], weights)
     params = (TABLE, OTHER_TABLE)
-    np.testing.assert_array_equal(
-        conditionals(composed, params, NO_TILT), conditionals(ENUMERABLE, TABLE, NO_TILT)
-    )
-    np.testing.assert_array_equal(
-        totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
-    )
+    np.testing.assert_array_equal(ask(composed, params).conditional, ask(ENUMERABLE).conditional)
+    np.testing.assert_array_equal(ask(composed, params).total, ask(ENUMERABLE).total)
     # A constraint counts, whatever the weight of the energy that has it.
-    assert (violations(composed, params, NO_TILT) == (other is INFINITE)).all()
+    assert (ask(composed, params).violation == (other is INFINITE)).all()
     assert composed.accepts_mask and composed.num_actions == ACTIONS
     assert not compose([ENUMERABLE, INFINITE]).accepts_mask
 
@@ -305,24 +295,24 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
     assert hopeless.any() == np.isinf(price)
     added = np.where(hopeless, 0, added)
     np.testing.assert_allclose(
-        conditionals(CONSTRAINED, TABLE, context),
-        conditionals(ENUMERABLE, TABLE, NO_TILT) + added,
+        ask(CONSTRAINED, context=context).conditional,
+        ask(ENUMERABLE).conditional + added,
         rtol=1e-5,
         atol=1e-5,
     )
     penalties = np.array([repeats_of(p) * price if repeats_of(p) else 0 for p in PLANS])
     np.testing.assert_allclose(
-        totals(CONSTRAINED, TABLE, context), totals(ENUMERABLE, TABLE, NO_TILT) + penalties,
+        ask(CONSTRAINED, context=context).total, ask(ENUMERABLE).total + penalties,
         rtol=1e-5,
     )  # fmt: skip
-    np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
+    np.testing.assert_array_equal(ask(CONSTRAINED, context=context).violation > 0, penalties > 0)
 
 
 def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
     plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
-    constrained = conditionals(CONSTRAINED, TABLE, context, plans)
-    expected = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
+    constrained = ask(CONSTRAINED, context=context, plans=plans).conditional
+    expected = ask(ENUMERABLE, plans=plans).conditional
     expected[1, 2, 1] = np.inf  # only there is a position that completes a plan
     np.testing.assert_array_equal(constrained, expected)
 
@@ -335,36 +325,34 @@ def test_a_partial_penalty_judges_what_is_certain_already():
         constrain(ENUMERABLE, starts_with_zero, partial=partial) for partial in (False, True)
     )
     blank = np.full((1, HORIZON), MASK, np.int32)
-    free = conditionals(ENUMERABLE, TABLE, NO_TILT, blank)
-    np.testing.assert_array_equal(conditionals(waits, TABLE, NO_TILT, blank), free)
-    found = conditionals(judges, TABLE, NO_TILT, blank)[0, 0]
+    free = ask(ENUMERABLE, plans=blank).conditional
+    np.testing.assert_array_equal(ask(waits, plans=blank).conditional, free)
+    found = ask(judges, plans=blank).conditional[0, 0]
     np.testing.assert_allclose(found - free[0, 0], [50, 0, 0], rtol=1e-4)
-    np.testing.assert_array_equal(
-        conditionals(judges, TABLE, NO_TILT), conditionals(waits, TABLE, NO_TILT)
-    )
+    np.testing.assert_array_equal(ask(judges).conditional, ask(waits).conditional)
 
 
 def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_rest():
     energy = neutral(ENUMERABLE, [2])
     for plan in PLANS:
         seen = np.where(plan == 2, MASK, plan)[None]
-        expected = conditionals(ENUMERABLE, TABLE, NO_TILT, seen.astype(np.int32))[0].copy()
+        expected = ask(ENUMERABLE, plans=seen.astype(np.int32)).conditional[0].copy()
         expected[:, 2] = expected[:, :2].min(axis=1)
-        found = conditionals(energy, TABLE, NO_TILT, plan[None])[0]
+        found = ask(energy, plans=plan[None]).conditional[0]
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
-        total = totals(energy, TABLE, NO_TILT, plan[None])[0]
+        total = ask(energy, plans=plan[None]).total[0]
         np.testing.assert_allclose(total, expected[np.arange(HORIZON), plan].sum(), rtol=1e-5)
 
 
 def test_a_reward_excuses_no_other_violation():
     rewarded = constrain(CONSTRAINED, lambda context, actions: -5.0 * (actions[0] == 2))
     context = {"tilt": NO_TILT, "price": np.float32(1.0)}
-    found = violations(rewarded, TABLE, context)
-    np.testing.assert_allclose(found, violations(CONSTRAINED, TABLE, context))
+    found = ask(rewarded, context=context).violation
+    np.testing.assert_allclose(found, ask(CONSTRAINED, context=context).violation)
     assert (found[PLANS[:, 0] == 2] > 0).any()
     np.testing.assert_allclose(
-        totals(rewarded, TABLE, context),
-        totals(CONSTRAINED, TABLE, context) - 5 * (PLANS[:, 0] == 2),
+        ask(rewarded, context=context).total,
+        ask(CONSTRAINED, context=context).total - 5 * (PLANS[:, 0] == 2),
         rtol=1e-5,
     )
 
@@ -373,7 +361,7 @@ def test_view_hides_the_rest_of_the_context():
     context = {"tilt": random_table(8, 2, ACTIONS), "more": np.float32(1)}
     energy = view(ENUMERABLE, lambda context: context["tilt"])
     np.testing.assert_array_equal(
-        totals(energy, TABLE, context), totals(ENUMERABLE, TABLE, context["tilt"])
+        ask(energy, context=context).total, ask(ENUMERABLE, context=context["tilt"]).total
     )
 
 

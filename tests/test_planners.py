@@ -80,15 +80,18 @@ def _blind_to_other_actions(params, memory, actions, positions):
     return ENUMERABLE.conditional(params, memory, masked, positions)
 
 
+def likelier(pairs, joint=JOINT):
+    """The distribution of the likelier plan of two that are drawn as such a pair `[A^T, A^T]`."""
+    p, rows = joint.reshape(-1), np.arange(len(PLANS))
+    found = np.where(p[:, None] >= p, rows[:, None], rows)
+    return np.bincount(found.reshape(-1), pairs.reshape(-1), len(rows))
+
+
 def best_of(probabilities, count):
     """The distribution of the plan of least energy among independent draws."""
-    probabilities, energies = np.ravel(probabilities), -np.log(JOINT.reshape(-1))
-    order = np.argsort(energies)
-    # At least this energy: all draws at least this, less all draws at least the next.
-    tail = np.append(np.cumsum(probabilities[order][::-1])[::-1], 0.0)
-    result = np.zeros(len(order))
-    result[order] = tail[:-1] ** count - tail[1:] ** count
-    return result
+    if count == 1:
+        return np.ravel(probabilities)
+    return likelier(np.outer(best_of(probabilities, count - 1), probabilities))
 
 
 def best_child(parents, beginnings):
@@ -98,18 +101,12 @@ def best_child(parents, beginnings):
         parents: `[A^T]` probabilities.
         beginnings: how many actions a plan can begin with; with one alone, it is kept.
     """
-    exact = np.zeros(len(PLANS))
-    for plan, probability in zip(PLANS, parents, strict=True):
-        for t in range(HORIZON):
-            possible = range(ACTIONS if t else beginnings)
-            others = [action for action in possible if action != plan[t]] or [plan[t]]
-            for action in others:
-                child = np.where(np.arange(HORIZON) == t, action, plan)
-                row = np.ravel_multi_index(
-                    max(plan, child, key=lambda p: JOINT[tuple(p)]), (3,) * 3
-                )
-                exact[row] += probability / HORIZON / len(others)
-    return exact
+    differ, pairs = PLANS[:, None] != PLANS, 0
+    for t in range(HORIZON):
+        others = differ[..., t] & (differ.sum(-1) == 1) & (PLANS[:, 0] < beginnings)
+        others |= ~others.any(1, keepdims=True) & np.eye(len(PLANS), dtype=bool)
+        pairs += parents[:, None] * others / others.sum(1, keepdims=True) / HORIZON
+    return likelier(pairs)
 
 
 def action_by_action(temperature):
@@ -123,21 +120,11 @@ def action_by_action(temperature):
     return exact
 
 
-def better_of_two(joint, replaced):
-    """The better of two plans: {a, b} has probability p_a p_b / (1 - p_a) and the reverse.
-
-    Args:
-        joint: `[A] * T`.
-        replaced: whether the second may be the first again.
-    """
+def two_beams(joint, replaced):
+    """The better of two plans, of which the second may be the first again if it is replaced."""
     p = joint.reshape(-1)
-    pairs = np.outer(p, p)
-    if not replaced:
-        pairs = pairs / (1 - p)[:, None]
-        np.fill_diagonal(pairs, 0)
-    rank = np.argsort(np.argsort(-p))
-    better = np.where(rank[:, None] < rank, np.arange(len(p))[:, None], np.arange(len(p)))
-    return np.bincount(better.reshape(-1), pairs.reshape(-1), len(p))
+    pairs = np.outer(p, p) if replaced else np.outer(p / (1 - p), p) * (1 - np.eye(len(p)))
+    return likelier(pairs, joint)
 
 
 class Sampler(NamedTuple):
@@ -159,7 +146,7 @@ GUARDED = from_total(ENUMERABLE.encode, _guarded_total, ACTIONS)
 PRODUCT = WEIGHTS[0] * TABLE.astype(np.float64) + WEIGHTS[1] * OTHER_TABLE
 COLD_JOINT = joint_probabilities(2 * TABLE.astype(np.float64))
 COMPOSED = compose([ENUMERABLE, ENUMERABLE], WEIGHTS)
-STEEP_BEAMS = [better_of_two(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
+STEEP_BEAMS = [two_beams(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
 BRED = CrossEntropyConfig(HORIZON, 2, candidates=2, elites=1)
 BEGIN_ALIKE = best_of((PLANS[:, 0] == 0) / 9, 2)
 SAMPLERS = {
