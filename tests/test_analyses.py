@@ -177,10 +177,10 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "hash": cases.row_name(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
-    table = analyses.analysed(of, [row, stale])
-    (line,) = (line for line in table.splitlines() if "Gibbs" in line)
-    assert "62.5%" in line and "50.0%" in line and "**75.0%" in line and "2.00" in line
-    assert line.endswith("| 6.0 |")
+    told = analyses.compared(of, [row, stale], ways=[way.name], cases=["masked"])
+    (line,) = (line for line in told.splitlines() if "Gibbs" in line)
+    assert "| 62.5% | - | 75.0%" in line and "2.0 ms" in line
+    assert "Gibbs" not in analyses.compared(of, [row], cases=["classifier"])
     assert report.is_used(row) and not report.is_used(stale)
 
 

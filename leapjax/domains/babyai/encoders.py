@@ -2,7 +2,7 @@
 
 `StateTokens` is the paper's, a token for each state of the context; `ContextTokens` is ours.
 
-Which convolution is fastest on a CPU depends on the map (docs/tried.md): on whole
+Which convolution is fastest on a CPU depends on the map (docs/lessons.md): on whole
 grids of few channels XLA's own is, on the small and deep maps of the paper's encoder one
 matrix product over shifted copies.
 """
@@ -526,7 +526,7 @@ class ContextTokens(Encoder):
 
         1 where it has, and how recently, in (0, 1]: 1 is now. That is what says which part of
         an instruction is done. The past actions, and where the agent went besides, are left
-        out: by them a network can recognise a demonstration (docs/tried.md).
+        out: by them a network can recognise a demonstration (docs/lessons.md).
 
         Args:
             context: what is known.
