@@ -78,7 +78,7 @@ class ContextTokens(Encoder):
 
         The first feature is 1 where it has; the second is how recently, in (0, 1], 1 for now.
         They show which part of an instruction is done. Past actions and the rest of the agent's
-        way are left out: a network could recognise a demonstration by them (docs/tried.md).
+        way are left out: a network could recognise a demonstration by them (docs/lessons.md).
 
         Args:
             context: with K past steps.

@@ -1,6 +1,6 @@
 """Convolutions, normalisation and pooling of the paper's encoder.
 
-Which convolution is fastest on a CPU depends on the map (docs/tried.md). On these small and deep
+Which convolution is fastest on a CPU depends on the map (docs/lessons.md). On these small and deep
 maps it is one matrix product over shifted copies; on whole grids of few channels it is XLA's own.
 """
 
