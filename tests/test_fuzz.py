@@ -289,7 +289,7 @@ def parsed(domain, arguments):
         try:
             with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
                 return command_line.parse(domain, arguments)
-        except SystemExit as stopped:  # help, or what argparse and tyro have to say
+        except SystemExit as stopped:  # help, or a mistake that tyro reports
             assert stopped.code in (0, 2)
             return None
 
