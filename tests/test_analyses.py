@@ -169,11 +169,13 @@ def test_options_of_a_method_are_for_it_alone_and_for_ours():
     def settings(method, preset="leapjax"):
         options = Options(preset=preset)
         config = cases.training_config(properties.ANALYSIS, model, method, 0, options)
-        return config.domain_settings.detours, config.domain_settings.false_starts
+        found = config.domain_settings
+        folder = cases.run_folder(config, 0).name.partition("-")[0]
+        return folder, *(getattr(found, name, None) for name in ("detours", "false_starts"))
 
-    assert settings("leap") == (0.5, 0.6)
-    assert settings("dt") == (0.5, 0.0)
-    assert settings("iql") == settings("leap", "paper") == (0.0, 0.0)
+    assert settings("leap") == ("augmented_babyai", 0.5, 0.6)
+    assert settings("dt") == ("augmented_babyai", 0.5, 0.0)
+    assert settings("iql") == settings("leap", "paper") == ("babyai", None, None)
 
 
 @pytest.mark.parametrize(
