@@ -1,6 +1,5 @@
 import dataclasses
 import functools
-import json
 import math
 from pathlib import Path
 
@@ -18,16 +17,6 @@ from leapjax.errors import UserError
         (functools.partial(checks.check_integer, "count"), [5, np.int8(5), np.array(5)], 5),
         (checks.check_seed, [2**32 - 1], 2**32 - 1),
         (functools.partial(checks.check_flag, "over"), [True, np.True_, 1, jnp.array(True)], True),
-    ],
-)
-def test_a_value_of_any_type_is_that_of_python(check, values, expected):
-    for value in values:
-        assert check(value) == expected and type(check(value)) is type(expected)
-
-
-@pytest.mark.parametrize(
-    ("check", "values", "expected"),
-    [
         (checks.check_seeds, [range(3), np.arange(3)], np.arange(3, dtype=np.uint32)),
         (
             functools.partial(checks.check_counts, "n"),
@@ -36,11 +25,11 @@ def test_a_value_of_any_type_is_that_of_python(check, values, expected):
         ),
     ],
 )
-def test_a_sequence_of_any_type_is_the_same_array(check, values, expected):
+def test_a_value_of_any_type_is_that_of_python_or_numpy(check, values, expected):
     for value in values:
         found = check(value)
-        assert found.dtype == expected.dtype
-        np.testing.assert_array_equal(found, expected)
+        assert type(found) is type(expected)
+        np.testing.assert_array_equal(found, expected, strict=isinstance(found, np.ndarray))
 
 
 @pytest.mark.parametrize(
@@ -73,9 +62,8 @@ def test_numbers_fit_another_type_or_are_refused():
     assert checks.check_fits("it", np.uint64(2**31 - 1), np.dtype(np.int32)) == 2**31 - 1
     assert checks.check_fits("it", np.array([0, 1]), np.dtype(bool)).tolist() == [False, True]
     for value, kind in [
-        (2**32 + 2, np.int32), (2**31, np.int32), (np.uint64(2**64 - 5), np.int32), (-1, np.uint8),
-        (0.5, np.int32), (math.nan, np.int32), (2, bool), (1e39, np.float32),
-        (-math.inf, np.float32), (math.nan, np.float32),
+        (2**31, np.int32), (np.uint64(2**64 - 5), np.int32), (-1, np.uint8), (0.5, np.int32),
+        (math.nan, np.int32), (2, bool), (1e39, np.float32), (math.nan, np.float32),
     ]:  # fmt: skip
         with pytest.raises(UserError, match="it: numbers that do not fit"):
             checks.check_fits("it", [0, value], np.dtype(kind))
@@ -136,9 +124,6 @@ def test_a_configuration_holds_plain_values():
         jnp.int32(4), math.inf,
     )  # fmt: skip
     assert given == Example(3, 0.5, True, "b", (1, 2.0), (0, 1), 4, math.inf)
-    assert (
-        json.loads(json.dumps(dataclasses.asdict(dataclasses.replace(given, path="")))) is not None
-    )
     assert isinstance(hash(given), int)
     # An integer that stands for a number is written as one: names are made of what is written.
     assert type(Example(share=1).share) is int

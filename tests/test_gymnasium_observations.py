@@ -248,7 +248,7 @@ def test_statistics_are_kept_with_the_specification(tmp_path):
     made = pretrained.make_domain(after).encoders["paper"](chosen.model, 0)
     assert made.statistics == after.statistics
     knots = ((1.0,),) * 3
-    for wrong in ((), (knots,), ((*knots, (2.0, 1.0)),), ((*knots, (np.nan,)),)):
+    for wrong in ((knots,), ((*knots, (2.0, 1.0)),), ((*knots, (np.nan,)),)):
         with pytest.raises(UserError, match="not of this observation space: train it again"):
             apply_statistics(domain, wrong)
 

@@ -107,13 +107,6 @@ def test_a_cached_prefix_equals_running_all_tokens_together():
         assert np.abs(oracle(PARAMS, JOINED, other)[PREFIX:] - expected).max() > 0.05
 
 
-def test_a_prefix_that_is_masked_everywhere_is_no_prefix():
-    nobody = np.zeros((PREFIX, PREFIX), bool)
-    each_other = np.tile(np.arange(PREFIX + TOKENS) >= PREFIX, (TOKENS, 1))
-    actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, nobody, each_other)
-    np.testing.assert_allclose(actual, run(PARAMS, X, EVERYWHERE), **CLOSE)
-
-
 @pytest.mark.parametrize("prefix", [0, PREFIX])
 def test_a_causal_mask_hides_later_tokens(prefix):
     mask = np.asarray(causal_mask(TOKENS, prefix))
@@ -122,9 +115,8 @@ def test_a_causal_mask_hides_later_tokens(prefix):
     np.testing.assert_array_equal(mask, expected)
 
 
-@pytest.mark.parametrize("queried", [[2], [4, 0], [3, 3, 1]])
-def test_last_layer_at_queried_positions_is_the_full_output_there(queried):
-    queried = np.array(queried)
+def test_last_layer_at_queried_positions_is_the_full_output_there():
+    queried = np.array([3, 3, 0])
 
     def outputs(queried):
         return run_with_prefix(PARAMS, FIXED, X, queried, AMONG_PREFIX, OF_TOKENS)
