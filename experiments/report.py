@@ -103,12 +103,14 @@ def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str]
         rows: by source: some tables take a second one.
     """
     return {
-        "results": (babyai.success, "babyai"),
+        "results": (functools.partial(babyai.success, settings=babyai.PRESETS), "babyai"),
+        "settings": (babyai.success, "babyai"),
         "steps": (babyai.steps, "babyai"),
         "iterations": (babyai.iterations, "babyai"),
         "methods": (babyai.methods, "babyai"),
         "acting": (babyai.acting, "babyai"),
         "price": (functools.partial(babyai.price, measured=rows["methods"]), "babyai"),
+        "search-pays": (puzzles.search_pays, "puzzles"),
         "searches": (puzzles.searches, "puzzles"),
         "arms": (puzzles.arms, "puzzles"),
         "atari": (functools.partial(atari.played, data=rows["atari-data"]), "atari"),

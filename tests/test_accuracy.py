@@ -13,7 +13,6 @@ from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
-from leapjax.pretrained import Origin
 from leapjax.types import mask_token
 from tests.programs import only_long, seal, untrained_run
 
@@ -63,13 +62,6 @@ def test_what_comes_after_the_end_does_not_count(actions):
 
 def collect(count, seed):
     return DOMAIN.collect(count, seed, lambda done: None)
-
-
-def test_the_demonstrations_of_both_kinds_are_different_levels():
-    origin = Origin("leapjax", 999, 4)
-    learned, others = (of(DOMAIN, origin, 9) for of in (accuracy.learned, accuracy.others))
-    assert len(learned) == len(others) == 4  # what there was
-    assert not {d.seed for d in learned} & {d.seed for d in others}
 
 
 def test_counts_are_those_of_every_step():

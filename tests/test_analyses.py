@@ -10,12 +10,10 @@ import pytest
 
 from experiments import ablation, landscape, properties, report, stochastic, suboptimal
 from experiments.common import cases
-from experiments.common.cases import Analysis, Options, Way
+from experiments.common.cases import Analysis, Options
 from experiments.tables import analyses
-from leapjax import pretrained
 from leapjax.domains.babyai import constraints
 from leapjax.domains.babyai.levels import find_level
-from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.running.metrics import write_metrics
@@ -96,23 +94,6 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
 
 
 @only_long
-def test_constraints_remember_what_models_do_not_see(place):
-    lengths = []
-
-    def watched(context, actions):
-        lengths.append(context.actions.shape[0])
-        return jnp.zeros(())
-
-    case = case_of("constraints-errand")
-    way = case.ways[-1]._replace(minimise=properties.unseen(watched))
-    of = small(case._replace(ways=[way]), way.name)
-    assert cases.main(of._replace(change=one_action), SHORT) == 0
-    (row,) = rows(place, "properties")
-    assert set(lengths) == {64}  # as many as an episode in that room has steps
-    assert row["violations"] >= 0
-
-
-@only_long
 def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place, capsys):
     """Metrics are written first, and a kill may come before the checkpoint is."""
     of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
@@ -124,20 +105,6 @@ def test_what_a_kill_left_without_its_checkpoint_is_not_taken_for_trained(place,
     assert f"training {folder}" in capsys.readouterr().out.replace("\n", "")
     assert cases.main(of, ["--episodes", "1"]) == 0
     assert "training" not in capsys.readouterr().out
-
-
-@only_long
-def test_a_damaged_end_of_training_is_learned_again(place, capsys):
-    of, options = small(case_of("adaptation-medium"), "whole plan"), Options(episodes=2)
-    assert cases.main(of, SHORT) == 0
-    (config,) = cases.configurations(of, of.cases[0], "leap", 0, options)
-    folder = cases.run_folder(config, 0) / pretrained.CHECKPOINTS
-    for path in (folder / "0").rglob("d/*"):
-        path.write_bytes(b"")
-    capsys.readouterr()
-    assert cases.main(of, ["--episodes", "1"]) == 0
-    assert "training" in capsys.readouterr().out and len(rows(place, "properties")) == 2
-    assert (folder / "0").is_dir() and (folder / "0.damaged").is_dir()
 
 
 def test_every_case_can_be_made():
@@ -194,14 +161,6 @@ def test_rows_are_named_by_all_that_matters():
     assert name(options=Options(force=True, record=True)) == name()
     same = properties.unseen(constraints.lava, weight=properties.WEIGHT)
     assert name(case.ways[1]._replace(minimise=same)) == name()
-
-
-@pytest.mark.parametrize("program", ALL, ids=lambda program: program.ANALYSIS.name)
-def test_what_a_way_minimises_can_be_told_by_its_name(program):
-    for case in program.ANALYSIS.cases:
-        for function in (case.adapter, *(way.minimise for way in case.ways)):
-            said = json.dumps(cases.described(function))
-            assert "<" not in said  # a function without a name, or what it is bound to unseen
 
 
 def test_options_of_a_method_are_for_it_alone_and_for_ours():
@@ -288,19 +247,3 @@ def test_a_share_of_actions_is_replaced_by_any_but_the_end():
         assert counts[6] == 0
         assert counts[[0, 1, 3, 4, 5]] == pytest.approx(share * 7000 / 6, abs=120)  # 4 deviations
     assert (landscape.corrupted(jax.random.key(1), actions, 0.0, end=6) == actions).all()
-
-
-def test_demonstrations_shorter_than_a_plan_have_no_energy(place, monkeypatch, capsys):
-    monkeypatch.setattr(landscape.accuracy, "others", lambda *arguments: [])
-    assert landscape.main(["--presets", "leapjax", "--trajectories", "3"]) == 2
-    error = capsys.readouterr().err
-    assert "--trajectories 3: none of these" in error and len(error.strip().splitlines()) == 1
-
-
-def test_planners_of_the_ablation_have_the_papers_budgets():
-    trained = GibbsConfig(10, 10)
-    assert ablation.shooting(trained).candidates == 30
-    assert ablation.cross_entropy(trained).elites == 3
-    assert ablation.gibbs(trained).iterations == 30
-    assert ablation.confident(trained).fill == "confident"
-    assert Way("any").search(trained) == trained

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import atari, methods, planning, quality, scaling, training
+from benchmarks import atari, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
 from leapjax import pretrained, sharding
 from leapjax.configuration import make_domain, specify
@@ -16,7 +16,7 @@ from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
 from leapjax.presets import find_preset
 from leapjax.running.jax_setup import Cluster
-from tests.programs import only_long, untrained_run, with_options
+from tests.programs import only_long, with_options
 
 HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
@@ -90,22 +90,6 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     assert plot.stat().st_size > 1000
 
 
-def test_methods_take_turns_and_an_action_costs_its_share_of_a_plan(tmp_path, monkeypatch):
-    calls = []
-
-    def make_call(level, method, batch):
-        return lambda: calls.append((level, method, batch))
-
-    monkeypatch.setattr(methods, "make_call", make_call)
-    path = tmp_path / "rows.json"
-    small = ["--batch", "2", "--rounds", "2", "--seconds", "0"]
-    assert methods.main([*small, "--level", "PickUpLoc", "--json", str(path)]) == 0
-    assert calls == [("PickUpLoc", method, 2) for method in methods.METHODS] * 2
-    rows = json.loads(path.read_text())
-    assert [row["method"] for row in rows] == list(methods.METHODS)
-    assert all(row["plans_per_second"] > 0 and row["batch"] == 2 for row in rows)
-
-
 @only_long
 def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, quick_begin):
     monkeypatch.setattr(training, "find_preset", tiny_preset)
@@ -173,16 +157,6 @@ def test_what_cannot_be_written_is_not_measured(
     assert said in capsys.readouterr().err
 
 
-def test_who_judges_whole_plans_is_not_asked_to_fill_them(tmp_path, monkeypatch):
-    run = untrained_run(tmp_path / "run", "--method", "classifier")
-    monkeypatch.setattr(quality, "measure", lambda options, path, name, search: search)
-    monkeypatch.setattr(quality, "table", lambda searches: {search.fill for search in searches})
-    shown = []
-    monkeypatch.setattr(quality, "Console", lambda: SimpleNamespace(print=shown.append))
-    assert quality.main([str(run)]) == 0
-    assert shown == [{"together"}]
-
-
 def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypatch):
     made = []
 
@@ -202,19 +176,6 @@ def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypat
     assert (row["processes"], row["devices"], row["fsdp"]) == (1, 8, 4)
     assert row["examples_per_second"] == pytest.approx(24 / row["seconds_per_step"])
     assert row["exchange_seconds"] > 0 and row["parameters"] == 64 * 64 + 3
-
-
-def test_the_scaling_benchmark_writes_a_row_for_each_setting(tmp_path, monkeypatch, capsys):
-    def launch(arguments, count, devices, fsdp):
-        measured = {"seconds_per_step": 0.1, "examples_per_second": 10.0, "exchange_seconds": 0.01}
-        return {"processes": count, "devices": count * devices, "fsdp": fsdp, **measured}
-
-    monkeypatch.setattr(scaling, "launch", launch)
-    rows = tmp_path / "rows.json"
-    assert scaling.main(["--json", str(rows)]) == 0
-    found = [tuple(row[n] for n in ("processes", "devices", "fsdp")) for row in read(rows)]
-    assert found == [(count, count * each, fsdp) for count, each, fsdp in scaling.SETTINGS]
-    assert "100%" in capsys.readouterr().out
 
 
 def read(path):

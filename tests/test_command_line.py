@@ -5,9 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from importlib import metadata
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -15,12 +12,10 @@ import experiments.__main__ as programs
 import leapjax
 import leapjax.__main__
 from experiments import atari, babyai, gymnasium
-from leapjax import scores, version
+from leapjax import scores
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.running import command_line, results, startup
-from leapjax.running import main as running
-from leapjax.running.spelling import GymnasiumConfig
 from tests.programs import RANDOM, ROOT, only_long
 
 LEVEL = "GoToLocalS7N5"
@@ -38,12 +33,6 @@ def test_the_version_needs_no_jax(command):
     done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
-
-
-def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
-    assert version.find_version() == leapjax.__version__
-    monkeypatch.setattr(metadata, "distribution", lambda name: metadata.Distribution.from_name("-"))
-    assert version.find_version() == "0+unknown"
 
 
 @pytest.mark.parametrize(
@@ -75,17 +64,6 @@ def test_output_that_nobody_reads_ends_a_program_quietly(buffered, name):
     done = python(*buffered, "-m", name, "--help", stdout=writer)
     os.close(writer)
     assert (done.returncode, done.stderr) == (startup.UNREAD, "")
-
-
-@pytest.mark.parametrize(
-    ("started", "safe", "finds"),
-    [("bin/leapjax", False, True), ("bin/leapjax", True, False), ("bin/pytest", False, False)],
-)
-def test_the_command_imports_from_the_working_folder(started, safe, finds, monkeypatch):
-    interpreter = SimpleNamespace(argv=[started], path=[], flags=SimpleNamespace(safe_path=safe))
-    monkeypatch.setattr(startup, "sys", interpreter)
-    assert leapjax.__main__.main(["--help"]) == 0
-    assert interpreter.path == [str(Path.cwd())] * finds
 
 
 def helps(main, arguments, capsys, monkeypatch):
@@ -135,12 +113,6 @@ def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, m
     assert all(name in method for name in METHODS)
 
 
-def test_messages_have_the_names_of_the_program():
-    options = ["--env", "CartPole-v1", "--method", "bc"]
-    with pytest.raises(UserError, match=r"Minari data set of it to train on \(--dataset\)"):
-        command_line.parse("gymnasium", options, GymnasiumConfig)
-
-
 def methods_of(*names):
     found = command_line.parse(
         "babyai", ["--level", LEVEL, "--method", *names, "--seeds", "0", "1"]
@@ -169,14 +141,6 @@ def test_methods_that_cannot_be_run_are_refused(arguments, says):
         command_line.parse("babyai", arguments.split())
 
 
-def test_usage_names_the_method_that_has_no_such_option(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        command_line.parse(
-            "babyai", "--method leap bc --masking each".split(), module="experiments.x"
-        )
-    assert "run python -m experiments.x --method bc --help" in capsys.readouterr().err
-
-
 def row(seed, method="bc", successes=5):
     said = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
     return {**said, "seed": seed, "method": method, "episodes": 10, "successes": successes,
@@ -193,13 +157,6 @@ def test_tables_end_with_the_mean_over_seeds():
     low, high = scores.interval_over_seeds([5, 7], [10, 10])
     assert columns["success [95%]"][-2] == f"60.0% [{low:.1%}, {high:.1%}]"
     assert results.success_table(rows[1:3]).row_count == 2
-
-
-def test_each_method_and_seed_is_run(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(running, "finish", lambda _, chosen, seed, *rest: row(seed, chosen.method))
-    monkeypatch.chdir(tmp_path)
-    assert babyai.main(["--method", "bc", "dt", "--seeds", "0", "1"]) == 0
-    assert len(re.findall(r"mean of 2", capsys.readouterr().out)) == 2
 
 
 def test_rows_have_a_success_rate(tmp_path, monkeypatch):

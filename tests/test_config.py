@@ -23,10 +23,9 @@ from leapjax.methods import METHODS
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 from leapjax.presets import babyai, find_preset
-from leapjax.running import command_line, limits, memory, shell
+from leapjax.running import command_line, memory, shell
 from leapjax.running.command_line import GROUPS
 from leapjax.types import TrainState
-from tests.programs import only_long
 
 LEVEL = "GoToLocalS7N5"
 
@@ -41,17 +40,6 @@ class Later(Settings):
 def parse(*arguments):
     (found,) = command_line.parse("babyai", arguments)
     return found
-
-
-@only_long
-def test_options_of_training_are_not_for_methods_that_learn_nothing():
-    found = command_line.parse("babyai", ["--level", LEVEL, "--method", "all", "--steps", "5"])
-    steps = {each.method: each.training.steps for each in found}
-    assert steps.pop("random") == 0 and set(steps.values()) == {5}
-    with pytest.raises(UserError, match="got 0: --steps 5 needs demonstrations"):
-        parse("--method", "random", "--steps", "5")
-    with pytest.raises(UserError, match="got -1: --steps 5 needs demonstrations"):
-        parse("--demos", "-1", "--steps", "5")
 
 
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
@@ -109,21 +97,6 @@ def test_the_settings_of_a_row_can_be_read_back():
             assert serialization.from_json(type(settings), fewer) == default
         with pytest.raises(UserError, match="missing or unknown mood"):
             serialization.from_json(type(settings), {**row[group], "mood": "calm"})
-
-
-def test_options_have_the_names_and_defaults_of_their_group():
-    chosen = parse("--preset", "paper", "--method", "classifier", "--level", "GoToSeqS5R2")
-    assert (chosen.context, chosen.planner.horizon, chosen.planner.iterations) == (20, 5, 10)
-    assert (chosen.model.architecture, chosen.training.windows) == ("paper", "episode")
-    assert chosen.domain_settings == Settings()
-    assert not hasattr(chosen.method_settings, "masking")
-
-
-def test_a_level_may_change_the_preset_of_a_method():
-    temperatures = {level: find_preset("babyai", level, "leap", "leapjax").planner.temperature
-                    for level in (LEVEL, "GoToSeqS5R2")}  # fmt: skip
-    assert temperatures == {LEVEL: 0.5, "GoToSeqS5R2": 1.0}
-    assert find_preset("babyai", "GoToSeqS5R2", "leap", "paper").planner.temperature == 0.0
 
 
 def test_preset_paper_masks_and_ends_as_the_authors_code_does():
@@ -236,19 +209,6 @@ def test_a_number_that_no_machine_can_serve_is_refused(option, monkeypatch):
         parse("--level", LEVEL, name, value)
 
 
-def test_infinite_means_never_where_something_is_limited():
-    chosen = parse("--checkpoint-seconds", "inf", "--clip", "inf")
-    assert (chosen.checkpoint_seconds, chosen.training.clip) == (math.inf, math.inf)
-
-
-def test_a_trained_planner_may_know_a_longer_context_than_its_level_has(tmp_path):
-    """It was refused later on only."""
-    chosen = dataclasses.replace(parse("--level", LEVEL), context=1000)
-    with pytest.raises(UserError, match="--context 1000 is longer than any episode"):
-        limits.check(chosen)
-    limits.check(dataclasses.replace(chosen, checkpoint=tmp_path))
-
-
 def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch, tmp_path):
     pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
     monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
@@ -281,13 +241,3 @@ def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkey
         memory.check_state(state(200))
     monkeypatch.delattr(files.os, "sysconf")  # Windows does not say
     memory.check_state(state(2**40))
-
-
-@pytest.mark.parametrize("planner", [ShootingConfig, CrossEntropyConfig])
-def test_any_planner_is_checked_for_memory(planner):
-    chosen = dataclasses.replace(parse("--level", LEVEL), planner=planner())
-    domain = make_domain(chosen)
-    limits.check_memory(chosen, domain)
-    huge = dataclasses.replace(chosen, planner=planner(candidates=10**9))
-    with pytest.raises(UserError, match="--candidates"):
-        limits.check_memory(huge, domain)

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.batching import compile_planner
 from leapjax.energy import (
     autoregressive,
     classifier,
@@ -18,7 +17,7 @@ from leapjax.energy import (
     view,
 )
 from leapjax.planners import GibbsConfig, bind
-from leapjax.types import Energy, mask_token, no_violation, pad_token
+from leapjax.types import Energy, mask_token, pad_token
 from tests.enumerable import (
     all_plans,
     conditional_by_counting,
@@ -41,22 +40,16 @@ NO_TILT = no_tilt(HORIZON, ACTIONS)
 def evaluator(energy):
     """Everything that an energy says about many plans, compiled once."""
 
+    def about(params, memory, plan):
+        return (
+            jax.vmap(lambda t: energy.conditional(params, memory, plan, t[None])[0])(EVERYWHERE),
+            energy.total(params, memory, plan),
+            energy.violation(params, memory, plan),
+        )
+
     @quick_jit
     def evaluate(params, context, plans):
-        memory = energy.encode(params, context)
-
-        def at(plan, position):
-            return energy.conditional(params, memory, plan, position[None])[0]
-
-        def about(plan):
-            positions = jnp.arange(plan.shape[0])
-            return (
-                jax.vmap(at, (None, 0))(plan, positions),
-                energy.total(params, memory, plan),
-                energy.violation(params, memory, plan),
-            )
-
-        return jax.vmap(about)(plans)
+        return jax.vmap(about, (None, None, 0))(params, energy.encode(params, context), plans)
 
     return evaluate
 
@@ -65,7 +58,7 @@ def evaluate(energy, params, context, plans):
     # One shape for all, so that an energy is compiled once: the rest repeats the first plan.
     rows = np.resize(plans, (len(PLANS), HORIZON)).astype(np.int32)
     results = evaluator(energy)(params, context, rows)
-    return [np.asarray(result)[: len(plans)] for result in results]
+    return [np.array(result)[: len(plans)] for result in results]
 
 
 def conditionals(energy, params, context, plans=PLANS):
@@ -116,16 +109,6 @@ def test_enumerable_energy_is_the_joint():
     assert np.isposinf(totals(ENUMERABLE, TABLE, tilt, masked)).all()
 
 
-def test_enumerable_energy_masks_all_positions_together():
-    joint = joint_probabilities(TABLE)
-    plan, positions = jnp.array([0, 2, 1]), jnp.array([2, 0])
-    memory = ENUMERABLE.encode(TABLE, NO_TILT)
-    energies = ENUMERABLE.conditional(TABLE, memory, plan, positions)
-    masked = np.array([MASK, 2, MASK])
-    expected = [conditional_by_counting(joint, masked, t) for t in (2, 0)]
-    np.testing.assert_allclose(probabilities(np.asarray(energies)), expected, atol=1e-5)
-
-
 # The pseudo-likelihood of a masked language model.
 
 
@@ -148,40 +131,32 @@ def pairwise_log_likelihood(tokens, position):
 
 
 def test_pseudo_likelihood_total_is_a_loop_over_positions():
-    expected = []
-    for plan in PLANS:
-        energy = 0.0
-        for t in range(HORIZON):
-            masked = plan.copy()
-            masked[t] = MASK
-            energy -= pairwise_log_likelihood(masked, t)[plan[t]]
-        expected.append(energy)
+    expected = np.zeros(len(PLANS))
+    for row, t in np.ndindex(len(PLANS), HORIZON):
+        masked = np.where(t == EVERYWHERE, MASK, PLANS[row])
+        expected[row] -= pairwise_log_likelihood(masked, t)[PLANS[row, t]]
     np.testing.assert_allclose(totals(PAIRWISE, VOTES, BIAS), expected, rtol=1e-5)
 
 
 def test_an_autoregressive_energy_is_that_of_the_joint():
     """Its total is the negative log-likelihood; its conditionals look only at what comes before."""
-    exact = enumerable_energy(HORIZON, ACTIONS)
 
     def logits(params, memory, tokens, positions):
         def at(position):
             before = jnp.where(position > EVERYWHERE, tokens, MASK)
-            return -exact.conditional(params, memory, before, position[None])[0]
+            return -ENUMERABLE.conditional(params, memory, before, position[None])[0]
 
         return jax.vmap(at)(positions) + 5.0  # up to a constant
 
-    energy = autoregressive(exact.encode, logits, ACTIONS)
-    table = random_table(0, HORIZON, ACTIONS)
-    joint = joint_probabilities(table)
-    found, totals, _ = evaluate(energy, table, NO_TILT, PLANS)
-    np.testing.assert_allclose(totals, -np.log(joint.reshape(-1)), rtol=1e-4)
+    energy = autoregressive(ENUMERABLE.encode, logits, ACTIONS)
+    joint = joint_probabilities(TABLE)
+    found, sums, _ = evaluate(energy, TABLE, NO_TILT, PLANS)
+    np.testing.assert_allclose(sums, -np.log(joint.reshape(-1)), rtol=1e-4)
     for plan, energies in zip(PLANS, found, strict=True):
-        for t in range(HORIZON):
-            before = np.where(t > EVERYWHERE, plan, MASK)
-            expected = -np.log(conditional_by_counting(joint, before, t))
-            np.testing.assert_allclose(energies[t], expected, rtol=1e-3, atol=1e-4)
-    incomplete = np.array([[0, 1, MASK]])
-    assert np.isposinf(evaluate(energy, table, NO_TILT, incomplete)[1]).all()
+        before = [np.where(t > EVERYWHERE, plan, MASK) for t in range(HORIZON)]
+        expected = [-np.log(conditional_by_counting(joint, before[t], t)) for t in range(HORIZON)]
+        np.testing.assert_allclose(energies, expected, rtol=1e-3, atol=1e-4)
+    assert np.isposinf(totals(energy, TABLE, NO_TILT, np.array([[0, 1, MASK]]))).all()
 
 
 @pytest.mark.parametrize("energy", [PAIRWISE, from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)])
@@ -212,13 +187,6 @@ def test_forbidden_action_is_infinite_and_not_nan():
 # An energy from its total alone.
 
 
-def test_conditional_from_the_exact_total_is_exact():
-    energy = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
-    expected = exact_conditionals(joint_probabilities(TABLE))
-    actual = probabilities(conditionals(energy, TABLE, NO_TILT))
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
 def test_totals_may_be_counts():
     energy = from_total(lambda p, c: None, lambda p, m, actions: jnp.sum(actions == 1), ACTIONS)
     assert energy.total(None, None, np.array([1, 0, 1])).dtype == jnp.float32
@@ -231,7 +199,7 @@ def test_totals_may_be_counts():
 # Sums of energies.
 
 
-@pytest.mark.parametrize("weights", [None, (0.5, 2.0), (0.0, 3.0)])
+@pytest.mark.parametrize("weights", [None, (0.5, 2.0)])
 def test_composition_is_the_weighted_product_of_the_joints(weights):
     first, second = weights or (1.0, 1.0)
     composed = compose([ENUMERABLE, ENUMERABLE], weights)
@@ -287,13 +255,11 @@ def test_composing_with_nothing_changes_nothing(other, weights):
 FORBIDDING = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
 KEEPING = {
     "weight 0": (compose([ENUMERABLE, FORBIDDING], [1, 0]), (TABLE, TABLE)),
-    "all weights 0": (compose([FORBIDDING, ENUMERABLE], [0, 0]), (TABLE, TABLE)),
     "nested": (
         compose([ENUMERABLE, compose([FORBIDDING, ENUMERABLE], [0, 1])], [1, 0]),
         (TABLE, (TABLE, TABLE)),
     ),
     "seen through a view": (view(FORBIDDING, lambda context: context), TABLE),
-    "constrained again": (constrain(FORBIDDING, lambda context, actions: jnp.float32(0)), TABLE),
     "of a constrained neutral": (
         compose([constrain(neutral(ENUMERABLE, [2]), lambda c, a: 1.0 * (a[0] == 1))], [0]),
         (TABLE,),
@@ -332,13 +298,9 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
     context = {"tilt": NO_TILT, "price": np.float32(price)}
     # The truth: the penalty of each plan with each action at each position, by a loop.
     added = np.zeros((len(PLANS), HORIZON, ACTIONS))
-    for row, plan in enumerate(PLANS):
-        for t in range(HORIZON):
-            for action in range(ACTIONS):
-                changed = plan.copy()
-                changed[t] = action
-                count = repeats_of(changed)
-                added[row, t, action] = count * price if count else 0
+    for row, t, action in np.ndindex(added.shape):
+        count = repeats_of(np.where(t == EVERYWHERE, action, PLANS[row]))
+        added[row, t, action] = count * price if count else 0
     # Where every action is forbidden another position has to change, so none is preferred.
     hopeless = np.isinf(added).all(-1, keepdims=True)
     assert hopeless.any() == np.isinf(price)
@@ -361,31 +323,25 @@ def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
     plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
     constrained = conditionals(CONSTRAINED, TABLE, context, plans)
-    free = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
-    np.testing.assert_array_equal(constrained[0], free[0])
-    np.testing.assert_array_equal(constrained[2], free[2])
-    # In the second plan only the last position completes it.
-    np.testing.assert_array_equal(constrained[1, :2], free[1, :2])
-    assert np.isposinf(constrained[1, 2, 1])
-    np.testing.assert_array_equal(constrained[1, 2, [0, 2]], free[1, 2, [0, 2]])
+    expected = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
+    expected[1, 2, 1] = np.inf  # only there is a position that completes a plan
+    np.testing.assert_array_equal(constrained, expected)
 
 
 def test_a_partial_penalty_judges_what_is_certain_already():
     def starts_with_zero(context, actions):  # known once the first action is
         return jnp.where(actions[0] == 0, 50.0, 0.0)
 
-    tilted = NO_TILT.copy()
-    tilted[0, 0] = 9.0  # it is by far the best first action
-    waits = constrain(ENUMERABLE, starts_with_zero)
-    judges = constrain(ENUMERABLE, starts_with_zero, partial=True)
-    blank = np.full((1, HORIZON), MASK, np.int32)
-    free = conditionals(ENUMERABLE, TABLE, tilted, blank)
-    np.testing.assert_array_equal(conditionals(waits, TABLE, tilted, blank), free)
-    np.testing.assert_allclose(
-        conditionals(judges, TABLE, tilted, blank)[0, 0] - free[0, 0], [50.0, 0.0, 0.0], rtol=1e-4
+    waits, judges = (
+        constrain(ENUMERABLE, starts_with_zero, partial=partial) for partial in (False, True)
     )
+    blank = np.full((1, HORIZON), MASK, np.int32)
+    free = conditionals(ENUMERABLE, TABLE, NO_TILT, blank)
+    np.testing.assert_array_equal(conditionals(waits, TABLE, NO_TILT, blank), free)
+    found = conditionals(judges, TABLE, NO_TILT, blank)[0, 0]
+    np.testing.assert_allclose(found - free[0, 0], [50, 0, 0], rtol=1e-4)
     np.testing.assert_array_equal(
-        conditionals(judges, TABLE, tilted), conditionals(waits, TABLE, tilted)
+        conditionals(judges, TABLE, NO_TILT), conditionals(waits, TABLE, NO_TILT)
     )
 
 
@@ -399,20 +355,6 @@ def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_r
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
         total = totals(energy, TABLE, NO_TILT, plan[None])[0]
         np.testing.assert_allclose(total, expected[np.arange(HORIZON), plan].sum(), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "actions",
-    [[False, False, True], np.array([False, False, True]), jnp.array([False, False, True]), {2},
-     np.array([2], np.uint8), jnp.array([2]), range(2, 3)],
-)  # fmt: skip
-def test_a_mask_and_a_number_mean_the_same_neutral_action(actions):
-    tokens, positions = jnp.array([0, 2, 1]), jnp.arange(HORIZON)
-    memory = ENUMERABLE.encode(TABLE, NO_TILT)
-    np.testing.assert_array_equal(
-        neutral(ENUMERABLE, actions).conditional(TABLE, memory, tokens, positions),
-        neutral(ENUMERABLE, [2]).conditional(TABLE, memory, tokens, positions),
-    )
 
 
 def test_a_reward_excuses_no_other_violation():
@@ -429,24 +371,11 @@ def test_a_reward_excuses_no_other_violation():
 
 
 def test_view_hides_the_rest_of_the_context():
-    seen = np.random.default_rng(8).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
-
-    def first_half(context):
-        return jnp.where(jnp.arange(HORIZON)[:, None] < 2, context, 0.0)
-
-    energy = view(ENUMERABLE, first_half)
-    cut = seen.copy()
-    cut[2] = 0
-    expected = exact_conditionals(joint_probabilities(TABLE, cut))
-    np.testing.assert_allclose(
-        probabilities(conditionals(energy, TABLE, seen)), expected, atol=1e-5
+    context = {"tilt": random_table(8, 2, ACTIONS), "more": np.float32(1)}
+    energy = view(ENUMERABLE, lambda context: context["tilt"])
+    np.testing.assert_array_equal(
+        totals(energy, TABLE, context), totals(ENUMERABLE, TABLE, context["tilt"])
     )
-    hidden, visible = seen.copy(), seen.copy()
-    hidden[2] += 3.0
-    visible[1, 0] += 3.0
-    before = totals(energy, TABLE, seen)
-    np.testing.assert_array_equal(totals(energy, TABLE, hidden), before)
-    assert np.abs(totals(energy, TABLE, visible) - before).max() > 0.1
 
 
 # Methods that choose one action at a time.
@@ -454,55 +383,22 @@ def test_view_hides_the_rest_of_the_context():
 
 CHOICES = 5  # and the end action
 SCORES = np.array([0.3, -1.0, 1.2, -np.inf, 0.9], np.float32)
-OTHER_SCORES = np.array([0.5, 2.0, -1.0, 3.0, 0.4], np.float32)
 SINGLE = single_action(
     lambda params, context: context, lambda params, memory: params + memory, CHOICES + 1
 )
 
 
-@functools.cache
-def chooser(energy, temperature):
-    planner = bind(energy, GibbsConfig(1, 1, temperature=temperature, score=True))
-    return quick_jit(jax.vmap(planner, (None, 0, None)))
-
-
-def choices(energy, params, context, temperature=1.0):
-    """Actions that are chosen for many keys; checks that their energies are their totals."""
-    keys = jax.random.split(jax.random.key(0), 5000)
-    plan = chooser(energy, temperature)(params, keys, context)
-    assert plan.actions.shape == (5000, 1)
-    assert plan.valid.all()
-    return np.asarray(plan.actions)[:, 0], np.asarray(plan.energy)
-
-
-def softmax(scores):
-    weights = np.exp(np.append(scores, -np.inf).astype(np.float64))  # the end action is never
-    return weights / weights.sum()
-
-
-def counts_of(actions):
-    return np.bincount(actions, minlength=CHOICES + 1)
-
-
 def test_one_action_at_temperature_one_is_a_sample_of_the_policy():
     shift = np.linspace(-0.5, 0.5, CHOICES, dtype=np.float32)
-    actions, energies = choices(SINGLE, SCORES, shift)
-    counts = counts_of(actions)
-    assert counts[3] == counts[CHOICES] == 0  # forbidden by its score, and the end action
-    assert fit_p_value(counts, softmax(SCORES + shift)) > 1e-3
-    assert fit_p_value(counts, softmax(SCORES)) < 1e-9
-    np.testing.assert_allclose(energies, -(SCORES + shift)[actions], rtol=1e-6)
-
-
-def test_scores_of_composed_methods_add_up():
-    both = compose([SINGLE, SINGLE], [1.0, 0.5])
-    actions, _ = choices(both, (SCORES, OTHER_SCORES), np.float32(0))
-    expected = softmax(SCORES + 0.5 * OTHER_SCORES)
-    assert fit_p_value(counts_of(actions), expected) > 1e-3
-    for alone in (SCORES, OTHER_SCORES):
-        assert fit_p_value(counts_of(actions), softmax(alone)) < 1e-9
-    actions, _ = choices(SINGLE, SCORES, 0.0, temperature=0.0)
-    assert (actions == SCORES.argmax()).all()
+    planner = bind(SINGLE, GibbsConfig(1, 1, temperature=1.0, score=True))
+    keys = jax.random.split(jax.random.key(0), 5000)
+    plan = quick_jit(jax.vmap(planner, (None, 0, None)))(SCORES, keys, shift)
+    assert plan.actions.shape == (5000, 1) and plan.valid.all()
+    [actions] = np.asarray(plan.actions).T
+    weights = np.exp([*(SCORES + shift), -np.inf])  # the end action is never
+    counts = np.bincount(actions, minlength=CHOICES + 1)
+    assert fit_p_value(counts, weights / weights.sum()) > 1e-3
+    np.testing.assert_allclose(plan.energy, -(SCORES + shift)[actions], rtol=1e-6)
 
 
 def test_the_total_of_one_action_is_its_score():
@@ -540,8 +436,9 @@ FREE = scoring(np.zeros((HORIZON, ACTIONS), np.float32))
 START = jnp.zeros(HORIZON, jnp.int32)
 
 
-def penalised(penalty):
-    return constrain(FREE, lambda context, actions: penalty)
+def violation_of(penalty):
+    energy = constrain(FREE, lambda context, actions: penalty)
+    return energy.violation(None, (None, None), START)
 
 
 def conditional_of(energy, actions=START, positions=(0, 1), params=VOTES, memory=BIAS["bias"]):
@@ -554,24 +451,14 @@ def without_distribution(row):
     return conditional_of(scoring(scores), positions=(2, 1))
 
 
-def with_logits(logits):
-    return pseudo_likelihood(lambda p, c: None, lambda *_: logits, ACTIONS)
-
-
 def total_of(total):
     return from_total(lambda p, c: None, lambda p, m, a: total, ACTIONS).total(None, None, START)
 
 
-NO_PLAN = "must be a sequence of integers"
-NOT_ONE = r"must be one number, got shape \(3,\)"
-OUT_OF_RANGE = r"positions .* are not all in 0 \.\. 2, the horizon is 3"
-NO_ACTION = r"actions .* are not all in 0 \.\. 2, or 3 for MASK"
-PENALTY = "a penalty must be"
-NAN = "energy of the plan is NaN"
 WRONG = [
     *(
         (lambda w=weight: compose([ENUMERABLE, ENUMERABLE], [1.0, w]), "weights must be")
-        for weight in (-1.0, float("inf"), float("nan"), 1e39, True, "1", None, 1j)
+        for weight in (-1.0, float("nan"), 1e39, "1")
     ),
     (lambda: compose([ENUMERABLE, ENUMERABLE], [1.0]), "2 energies need as many weights"),
     (lambda: compose([], []), "at least one energy"),
@@ -579,54 +466,41 @@ WRONG = [
     (lambda: compose(FREE), "a sequence of energies, got one energy"),
     (lambda: compose([FREE, None]), "expected Energy, got"),
     (lambda: constrain(FREE.total, lambda c, a: 0), "expected Energy, got"),
-    (lambda: view(3, lambda context: context), "expected Energy, got"),
-    (lambda: neutral(None, [0]), "expected Energy, got"),
-    (lambda: compile_planner(None, GibbsConfig()), "expected Energy, got"),
-    *(
-        (lambda p=params: compose([FREE, FREE]).encode(p, None), "params of 2 composed energies")
-        for params in ((None,), {"a": 1, "b": 2}, None, "ab c")
-    ),
+    (lambda: compose([FREE, FREE]).encode((None,), None), "params of 2 composed energies"),
+    (lambda: compose([FREE, FREE]).encode({"a": 1, "b": 2}, None), "params of 2 composed energies"),
     (lambda: neutral(TABLED, [0]), "accepts MASK"),
     (lambda: neutral(ENUMERABLE, []), "expected some of 3 actions"),
     (lambda: neutral(ENUMERABLE, [0, 1, 2]), "expected some of 3 actions"),
     (lambda: neutral(ENUMERABLE, [3]), "neutral actions must be at most 2"),
+    (lambda: total_of(jnp.zeros(3)), r"must be one number, got shape \(3,\)"),
+    (lambda: total_of(jnp.float32(jnp.nan)), "energy of the plan is NaN"),
+    (lambda: without_distribution([np.nan, 0, 0]), r"energies at positions \[1\] are NaN"),
+    (lambda: without_distribution([-np.inf] * 3), r"energies at positions \[1\] are NaN"),
+    (lambda: conditional_of(scoring(np.zeros((3, 2)))), r"logits must be of shape \(2, 3\)"),
+    (lambda: violation_of(np.ones(HORIZON)), "a penalty must be"),
+    (lambda: violation_of(None), "a penalty must be"),
+    (lambda: conditional_of(FREE, positions=[-1]), r"positions .* are not all in 0 \.\. 2"),
+    (lambda: conditional_of(TABLED, positions=[0, 3]), r"positions .* are not all in 0 \.\. 2"),
     *(
-        (lambda a=actions: neutral(ENUMERABLE, a), "neutral actions")
-        for actions in ([1.5], [-1], [1, 1], [0, True], ["0"], 1, "1", jnp.array([[0]]))
+        (
+            lambda e=e, a=a: conditional_of(e, START.at[1].set(a)),
+            r"not all in 0 \.\. 2, or 3 for MASK",
+        )
+        for e in (FREE, TABLED)
+        for a in (-1, ACTIONS + 1)
     ),
-    (lambda: neutral(compose([CONSTRAINED, CONSTRAINED]), [2]), "neutral comes before constrain"),
-    (lambda: total_of(jnp.zeros(3)), NOT_ONE),
-    (lambda: total_of(jnp.float32(jnp.nan)), NAN),
-    (lambda: penalised(jnp.float32(jnp.nan)).total(None, (None, None), START), NAN),
-    (lambda: conditional_of(penalised(jnp.float32(jnp.nan)), memory=(None, None)), "are NaN"),
-    *((lambda r=row: without_distribution(r), r"energies at positions \[1\] are NaN")
-      for row in ([np.nan, 0, 0], [np.inf, 0, 0], [-np.inf] * 3)),
-    (lambda: conditional_of(with_logits(jnp.zeros((1, 2)))), r"logits must be of shape \(2, 3\)"),
-    *(
-        (lambda p=penalty: penalised(p).violation(None, (None, None), START), PENALTY)
-        for penalty in (np.ones(HORIZON), np.ones(1), None, 1j)
-    ),
-    (lambda: penalised(None).total(None, (None, None), START), PENALTY),
-    (lambda: conditional_of(penalised(None), memory=(None, None)), PENALTY),
-    *((lambda e=energy: conditional_of(e, positions=[-1]), OUT_OF_RANGE)
-      for energy in (FREE, TABLED)),
-    *((lambda e=energy: conditional_of(e, positions=[0, HORIZON]), OUT_OF_RANGE)
-      for energy in (FREE, TABLED)),
-    *((lambda e=energy, a=action: conditional_of(e, START.at[1].set(a)), NO_ACTION)
-      for energy in (FREE, TABLED) for action in (-1, ACTIONS + 1)),
-    *((lambda a=actions: FREE.total(None, None, a), NO_PLAN)
-      for actions in ([[0]], 0, "abc", None)),
-    (lambda: bind(SINGLE, GibbsConfig(2, 1))(SCORES, jax.random.key(0), np.float32(0)),
-     "its horizon is 1"),
+    (lambda: FREE.total(None, None, [[0]]), "must be a sequence of integers"),
     (lambda: SINGLE.total(SCORES, np.float32(0), START), "its horizon is 1"),
-    (lambda: single_action(lambda p, c: (), lambda p, m: jnp.zeros(3), 3).total(None, (), [0]),
-     r"scores must be of shape \(2,\), got shape \(3,\)"),
-    *((lambda m=make, n=count: m(*[None] * 2, n), "num_actions must be")
-      for make in (pseudo_likelihood, autoregressive, from_total, single_action, classifier)
-      for count in (0, 3.0, True)),
-    *((lambda t=token, n=count: t(n), "num_actions must be")
-      for token in (mask_token, pad_token) for count in (-1, "3", None, 2**31 - 1, [3])),
-]  # fmt: skip
+    (
+        lambda: single_action(lambda *_: (), lambda p, m: jnp.zeros(3), 3).total(None, (), [0]),
+        r"scores must be of shape \(2,\), got shape \(3,\)",
+    ),
+    *(
+        (lambda m=make: m(None, None, 0), "num_actions must be")
+        for make in (pseudo_likelihood, autoregressive, from_total, single_action, classifier)
+    ),
+    (lambda: mask_token(2**31 - 1), "num_actions must be"),
+]
 
 
 @pytest.mark.parametrize(("call", "message"), WRONG)
@@ -635,57 +509,33 @@ def test_mistakes_are_refused(call, message):
         call()
 
 
-def energies_of_everyone():
-    """By name: an energy, its parameters and memory."""
-    free = scoring(np.zeros((HORIZON, ACTIONS)))
-    forbidding = constrain(free, lambda context, actions: jnp.float32(0))
-
-    def scores(params, memory, tokens, positions):
-        return jnp.zeros((len(positions), ACTIONS))
-
-    return {
-        "pseudo_likelihood": (free, (), ()),
-        "autoregressive": (autoregressive(lambda p, c: (), scores, ACTIONS), (), ()),
-        "from_total": (from_total(lambda p, c: (), lambda p, m, a: 0.0, ACTIONS), (), ()),
-        "compose": (compose([free, free], [0, 0]), ((), ()), ((), ())),
-        "constrain": (forbidding, (), ((), ())),
-        "neutral": (neutral(free, [2]), (), ()),
-        "view": (view(free, lambda context: context), (), ()),
-    }
+TAKING = {  # by name: an energy and its memory
+    "pseudo_likelihood": (FREE, ()),
+    "autoregressive": (autoregressive(lambda p, c: (), FREE.conditional, ACTIONS), ()),
+    "from_total": (from_total(lambda p, c: (), lambda p, m, a: 0.0, ACTIONS), ()),
+    "compose": (compose([FREE, FREE], [0, 0]), ((), ())),
+    "constrain": (constrain(FREE, lambda context, actions: jnp.float32(0)), ((), ())),
+    "neutral": (neutral(FREE, [2]), ()),
+}
 
 
-NO_TOKENS = {
-    "floats": np.zeros(HORIZON), "booleans": np.zeros(HORIZON, bool), "texts": ["0", "1", "2"],
-    "wide": np.array([0, 2**32, 1]), "JAX": jnp.zeros(3),
-}  # fmt: skip
+@pytest.mark.parametrize("name", TAKING)
+def test_actions_and_positions_are_integers_while_traced_too(name):
+    energy, memory = TAKING[name]
 
+    def ask(actions=START, positions=EVERYWHERE):
+        energy.total(memory, memory, actions)
+        return energy.conditional(memory, memory, actions, positions)
 
-@pytest.mark.parametrize("name", energies_of_everyone())
-@pytest.mark.parametrize("wrong", NO_TOKENS)
-def test_actions_and_positions_are_integers(name, wrong):
-    energy, params, memory = energies_of_everyone()[name]
-    given, fine = NO_TOKENS[wrong], np.arange(HORIZON)
-    with pytest.raises(ValueError, match="actions"):
-        energy.conditional(params, memory, given, fine)
-    with pytest.raises(ValueError, match="positions"):
-        energy.conditional(params, memory, fine, given)
-    with pytest.raises(ValueError, match="actions"):
-        energy.total(params, memory, given)
-    if energy.violation is not no_violation:
-        with pytest.raises(ValueError, match="actions"):
-            energy.violation(params, memory, given)
-
-
-@pytest.mark.parametrize("name", energies_of_everyone())
-@pytest.mark.parametrize("kind", [jnp.float32, bool])
-def test_a_program_refuses_other_types_while_it_is_traced(name, kind):
-    energy, params, memory = energies_of_everyone()[name]
-    given, fine = jax.ShapeDtypeStruct((3,), kind), jax.ShapeDtypeStruct((3,), jnp.int32)
-    for arguments in ((given, fine), (fine, given)):
-        with pytest.raises(ValueError, match="must be integers"):
-            jax.eval_shape(lambda *each: energy.conditional(params, memory, *each), *arguments)
-    with pytest.raises(ValueError, match="must be integers"):
-        jax.eval_shape(lambda plan: energy.total(params, memory, plan), given)
+    assert ask().shape == (HORIZON, ACTIONS)
+    for wrong in (np.zeros(HORIZON), np.zeros(HORIZON, bool), ["0", "1"], np.array([2**32] * 3)):
+        for part in ("actions", "positions"):
+            with pytest.raises(ValueError, match=part):
+                ask(**{part: wrong})
+    for kind in (jnp.float32, bool):
+        for part in ("actions", "positions"):
+            with pytest.raises(ValueError, match="must be integers"):
+                jax.eval_shape(ask, **{part: jax.ShapeDtypeStruct((3,), kind)})
 
 
 def test_small_integers_hold_every_token():
@@ -701,12 +551,9 @@ def test_small_integers_hold_every_token():
     assert seen[0].tolist() == [256, 0]
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint32, np.int32, bool, jnp.bfloat16])
+@pytest.mark.parametrize("kind", [np.uint32, bool, jnp.bfloat16])
 def test_scores_of_any_real_type_are_the_numbers_that_they_say(kind):
     scores = jnp.array([1, 0], kind)  # an unsigned -1 would be 2^32 - 1
     energy = single_action(lambda params, context: (), lambda p, m: scores, 3)
     energies = energy.conditional(None, (), jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32))
     np.testing.assert_array_equal(energies, [[-1, 0, np.inf]])
-    logits = jnp.array([0, 1, 0], kind)
-    model = pseudo_likelihood(lambda *_: None, lambda p, m, t, q: logits[None], 3)
-    assert jnp.argmin(model.conditional(None, None, jnp.zeros(1, int), jnp.zeros(1, int))) == 1

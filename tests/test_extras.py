@@ -160,11 +160,6 @@ def test_a_program_without_its_extra_is_one_line(core_alone, arguments, extra):
     )
 
 
-def test_the_core_alone_lists_the_programs(core_alone):
-    ended = run(["-m", "experiments", "--help"], core_alone)
-    assert ended.returncode == 0 and "babyai" in ended.stdout
-
-
 def test_the_table_of_extras_is_that_of_the_package():
     listed = PROJECT["optional-dependencies"]
     names = importlib.metadata.packages_distributions()
@@ -200,8 +195,3 @@ def test_one_extra_is_named_that_brings_all(monkeypatch, module, asked, named):
         extras.missing_explained(asked),
     ):
         importlib.import_module(module)
-
-
-def test_other_modules_that_are_missing_stay_what_they_are():
-    with pytest.raises(ModuleNotFoundError, match="nowhere"), extras.missing_explained():
-        importlib.import_module("nowhere")

@@ -1,18 +1,17 @@
 """Damaged and adversarial input: a correct load or one line that says what is wrong.
 
-Never a traceback, a hang, much memory, or code that the data chose. `make test-long` tries
-thousands of cases; the suite tries some.
+Never a traceback, a hang, much memory, or code that the data chose.
 """
 
 import contextlib
 import copy
-import functools
 import io
 import json
 import resource
 import shutil
 import signal
 import tempfile
+import typing
 import warnings
 from pathlib import Path
 
@@ -23,23 +22,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experiments import report
-from experiments.common import cases as analyses
-from experiments.tables import measured
 from leapjax import checkpoints, pretrained, weights
 from leapjax.checkpoints import Checkpoints
-from leapjax.configuration import configuration_hash, make_domain, resolved, specify
+from leapjax.configuration import blank, configuration_hash, make_domain, resolved, specify
 from leapjax.data import storage
 from leapjax.domain import Collection
-from leapjax.domains.atari.demonstrators import collect
-from leapjax.domains.babyai import levels
 from leapjax.errors import UserError
+from leapjax.methods import METHODS
 from leapjax.presets import find_preset
-from leapjax.running import command_line, jax_setup, results
+from leapjax.running import command_line, results
 from leapjax.running.metrics import read_metrics
 from leapjax.types import TrainState
-from tests import extreme_options
-from tests.programs import LONG, ROOT, only_long
+from tests.programs import LONG, only_long
 from tests.test_storage import LEVEL, NAME, SIDE
 
 SECONDS = 20  # nothing that is read here takes a tenth of a second
@@ -251,81 +245,6 @@ def test_arrays_that_are_not_there(data_set, replace, says):
         read_data_set(data_set, change)
 
 
-# Rows, the training curve, what a checkpoint says of itself.
-
-SOURCES = [*report.EXPERIMENTS, *report.MEASURED]
-VALUES_OF_FIELDS = [
-    None, True, "", "x", "paper", -1, 0, 2, 1.5, -0.5, 1e300, 10**40, float("nan"), float("inf"),
-    [], {}, [1], {"x": 1},
-]  # fmt: skip
-GONE = object()  # instead of a value: the field is removed
-
-
-@pytest.fixture(scope="module")
-def few_results(tmp_path_factory):
-    """A folder with some of the committed rows of each experiment, and all measurements."""
-    root = tmp_path_factory.mktemp("results")
-    (root / "results").mkdir()
-    for name in report.EXPERIMENTS:
-        lines = (ROOT / "results" / f"{name}.jsonl").read_text().splitlines()
-        kept = [line for line in lines[:: len(lines) // 8] if report.is_used(json.loads(line))]
-        assert len(kept) > 2
-        (root / "results" / f"{name}.jsonl").write_text("\n".join(kept[:3]))
-    for name in report.MEASURED:
-        shutil.copy(ROOT / "results" / f"{name}.json", root / "results")
-    return root
-
-
-def tables_of(root, name, rows):
-    """Every table that is made from one of the sources, for documents and for a terminal."""
-    if name in report.MEASURED:
-        rows = {**rows, name: measured.read(root / "results" / f"{name}.json")}
-    else:
-        rows = {**rows, name: report.rows_of(root, name)}
-        shown = analyses.table if name in report.ANALYSES else results.success_table
-        assert shown(rows[name]).row_count == results.time_table(rows[name]).row_count
-        assert all(isinstance(report.is_used(row), bool) for row in rows[name])
-    rows["puzzles"] = [row for puzzle in report.PUZZLES for row in rows[puzzle]]
-    sections = report.sections_of(rows)
-    return {section: make(rows[source]) for section, (make, source) in sections.items()
-            if source == name or (source == "puzzles" and name in report.PUZZLES)
-            or (section, name) in (("price", "methods"), ("atari", "atari-data"))}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", SOURCES)
-def test_tables_of_damaged_rows(few_results, tmp_path, name):
-    """Each field of a real row becomes each of many values: there is a table, or one line."""
-    whole = report.rows_by_source(few_results)
-    assert tables_of(few_results, name, whole)
-    suffix = "json" if name in report.MEASURED else "jsonl"
-    text = (few_results / "results" / f"{name}.{suffix}").read_text()
-    original = json.loads(text) if suffix == "json" else json.loads(text.splitlines()[0])
-    rest = [] if suffix == "json" else text.splitlines()[1:]
-    changes = [(path, value) for path in places(original) if path
-               for value in (*VALUES_OF_FIELDS, GONE)]  # fmt: skip
-    rng = np.random.default_rng(SOURCES.index(name))
-    fields = [change for change in changes if len(change[0]) < 3]  # of rows; most are deep in one
-    chosen = [fields[i] for i in rng.choice(len(fields), CASES // 2)]
-    chosen += [changes[i] for i in rng.choice(len(changes), CASES // 2)]
-    root = tmp_path / "damaged"
-    (root / "results").mkdir(parents=True)
-    refused = 0
-    for path, value in chosen:
-        changed = copy.deepcopy(original)
-        parent = functools.reduce(lambda part, key: part[key], path[:-1], changed)
-        if value is GONE:
-            del parent[path[-1]]
-        else:
-            parent[path[-1]] = value
-        line = json.dumps(changed)
-        (root / "results" / f"{name}.{suffix}").write_text("\n".join([line, *rest]))
-        try:
-            refused += outcome(functools.partial(tables_of, root, name, whole)) is None
-        except Exception as error:
-            raise AssertionError(f"{name}: {path} = {value!r}") from error
-    assert refused  # they do reach what tables read
-
-
 ROW = {
     **{name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()},
     "paper_success": 95.0,
@@ -399,79 +318,66 @@ OPTIONS = st.lists(st.tuples(st.sampled_from(WORDS), VALUES).map(list), max_size
 )
 
 
-@cases
-@given(arguments=OPTIONS | st.lists(ARGUMENT, max_size=6))
-def test_any_command_line(arguments):
+def parsed(domain, arguments):
+    """The configurations of a command line; none if it is refused, or help is shown."""
+
     def parse():
+        quiet = io.StringIO()
         try:
-            with (
-                contextlib.redirect_stdout(io.StringIO()),
-                contextlib.redirect_stderr(io.StringIO()),
-            ):
-                return command_line.parse("babyai", arguments)
+            with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
+                return command_line.parse(domain, arguments)
         except SystemExit as stopped:  # help, or what argparse and tyro have to say
             assert stopped.code in (0, 2)
             return None
 
-    for parsed in outcome(parse) or []:
-        # What is accepted has a name, a level and episodes.
-        assert len(configuration_hash(parsed, parsed.seeds[0])) == 12
-        assert levels.find_level(parsed.level) and parsed.episodes > 0
-        assert parsed.demos > 0 or parsed.training.steps == 0
+    found = outcome(parse) or []
+    for each in found:
+        assert len(configuration_hash(each, each.seeds[0])) == 12
+        assert "NaN" not in json.dumps(resolved(each, each.seeds[0]))
+        assert each.context <= make_domain(each).max_steps and each.episodes > 0
+        assert each.demos > 0 or each.training.steps == 0
+    return found
+
+
+@cases
+@given(arguments=OPTIONS | st.lists(ARGUMENT, max_size=6))
+def test_any_command_line(arguments):
+    parsed("babyai", arguments)
+
+
+COUNTS = ("-1", "0", "2", "100000", "2147483647", "2147483648", "9223372036854775808", "9" * 5000)
+NUMBERS = ("-1", "0", "0.5", "nan", "inf", "-inf", "1e39", "1e308", "9" * 5000)
+NUMERIC = {
+    "babyai": ["--level", "GoToLocalS7N5"],
+    "stars": ["--level", "Star3x5"],
+    "sudoku": ["--level", "Sudoku4x6"],
+    "gymnasium": ["--level", "FrozenLake-v1", "--demos", "0", "--steps", "0"],
+    "atari": ["--level", "Breakout"],
+}
+
+
+def numeric(settings):
+    """Each option that takes a number, with every number."""
+    for name, kind in typing.get_type_hints(type(settings)).items():
+        parts = typing.get_args(kind) or (kind,)
+        pair = typing.get_origin(kind) is tuple and ... not in parts
+        for value in COUNTS if int in parts else NUMBERS if float in parts else ():
+            yield [f"--{name.replace('_', '-')}", *[value] * (len(parts) if pair else 1)]
 
 
 @only_long
-@pytest.mark.parametrize("domain", extreme_options.LEVELS)
+@pytest.mark.parametrize("domain", NUMERIC)
 def test_any_number_that_an_option_takes(domain):
-    """An accepted one has passed every check before work, the arithmetic of memory included."""
+    """In BabyAI of every method; options that all methods have, of LEAP alone."""
     accepted = 0
-    for arguments in extreme_options.command_lines(domain):
-        try:
-            with (
-                contextlib.redirect_stdout(io.StringIO()),
-                contextlib.redirect_stderr(io.StringIO()),
-            ):
-                parsed = outcome(lambda given=arguments: command_line.parse(domain, given)) or []
-        except SystemExit as stopped:  # what tyro has to say
-            assert stopped.code == 2
-            parsed = []
-        for each in parsed:
-            accepted += 1
-            assert len(configuration_hash(each, each.seeds[0])) == 12
-            assert each.context <= make_domain(each).max_steps
-            numbers_in = json.dumps(resolved(each, each.seeds[0]))
-            assert "NaN" not in numbers_in
+    for method in METHODS if domain == "babyai" else ("leap", "iql"):
+        chosen = blank(domain, NUMERIC[domain][1], method)
+        parts = [chosen.method_settings, chosen.planner]
+        if method == "leap":
+            parts += [chosen, chosen.model, chosen.training, chosen.cluster, chosen.domain_settings]
+        for option in (option for part in parts for option in numeric(part)):
+            accepted += len(parsed(domain, [*NUMERIC[domain], "--method", method, *option]))
     assert accepted > 50
-
-
-class Begun(Exception):
-    """A program has made all checks, and would begin to work."""
-
-
-@only_long
-@pytest.mark.parametrize("name", extreme_options.PROGRAMS)
-def test_any_number_that_a_program_takes(toy_run, tmp_path, monkeypatch, capsys, name):
-    monkeypatch.chdir(tmp_path)
-
-    def begin(*given):
-        raise Begun
-
-    for module, name_of in ((jax_setup, "start"), (collect, "collect")):
-        monkeypatch.setattr(module, name_of, begin)
-    main, kind, before = extreme_options.PROGRAMS[name]
-    given = [str(toy_run) if each == "RUN" else each for each in before]
-    for field, option in extreme_options.numeric(kind):
-        with bounded():
-            try:
-                assert main([*given, *option]) == 2, (field, option)
-            except Begun:
-                assert float(option[-1]) >= 0, (field, option)
-            except SystemExit as stopped:
-                assert stopped.code == 2
-                capsys.readouterr()
-                continue
-        error = capsys.readouterr().err
-        assert not error or (error.startswith("error: ") and error.count("\n") == 1)
 
 
 # Checkpoints.

@@ -72,23 +72,6 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
 
 
 @only_long
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_process_that_is_asked_to_stop_goes_on_as_if_it_had_not_been(place, number, code):
-    runs = f"stopped{number}"
-    run = place.start(runs)
-    place.wait_for_checkpoint(run, runs)
-    run.send_signal(number)
-    assert run.wait(60) == code
-    error = run.stderr.read()
-    assert f"stopped by {signal.Signals(number).name}; continue with: python -m" in error
-    assert f"--runs {runs}" in error and "Traceback" not in error
-    assert 0 < max(place.steps_saved(runs)) < STEPS
-    assert not place.rows(runs)
-    place.finish(place.start(runs))
-    place.check_same_end(runs)
-
-
-@only_long
 @pytest.mark.parametrize("trial", range(100))
 def test_a_signal_at_any_moment(tmp_path, trial):
     """Nothing is compiled yet, so that most of the time a compiler runs."""
@@ -255,48 +238,3 @@ def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
         pass
     with only_process_in(tmp_path / "run"):
         pass
-
-
-def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
-    program = f"""
-import resource, sys
-from pathlib import Path
-import jax
-import jax.numpy as jnp
-from leapjax import files
-from leapjax.checkpoints import Checkpoints
-from leapjax.errors import UserError
-from leapjax.types import TrainState
-def state(step, size):
-    noise = jax.random.normal(jax.random.key(0), (size, size))  # does not compress
-    return TrainState({{"w": noise}}, (), jnp.int32(step))
-folder = Path({str(tmp_path)!r})
-files.write_text(folder / "row.json", "old")
-saved = Checkpoints(folder / "checkpoints")
-saved.save(state(1, 50))
-saved._manager.wait_until_finished()
-# No file may grow beyond this: what a full disk does, to this process alone.
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-try:
-    files.write_text(folder / "row.json", "new" * 100_000)
-except UserError as error:
-    print("row:", error)
-try:
-    saved.save(state(2, 1000))
-    saved.close()
-except UserError as error:
-    print("state:", error)
-resource.setrlimit(resource.RLIMIT_FSIZE, (0, 100_000))
-with files.only_process_in(folder / "run"):  # which takes no room
-    print("inside")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False
-    )
-    lines = done.stdout.splitlines()
-    assert lines[0].startswith(f"row: cannot write {tmp_path}/row.json"), done.stderr[-2000:]
-    assert lines[1].startswith(f"state: cannot write a checkpoint to {tmp_path}/checkpoints")
-    assert lines[2] == "inside"
-    assert (tmp_path / "row.json").read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
-    assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1

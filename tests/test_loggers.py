@@ -128,8 +128,3 @@ def test_a_log_says_how_long_it_will_take_once_that_is_known(monkeypatch):
     first, last = out.getvalue().splitlines()
     assert first.split() == ["games", "0/10", "0.0/s", "ETA", "unknown"]
     assert last.startswith("games 10/10 ") and last.endswith("ETA 0s  score 3")
-
-
-def test_what_is_slow_says_how_long_each_takes():
-    said = [progress.speed(rate) for rate in (0.0, 1234.56, 1.0, 0.4, 0.02)]
-    assert said == ["0.0/s", "1234.6/s", "1.0/s", "2.5s each", "50.0s each"]

@@ -78,11 +78,3 @@ def test_both_figures_are_drawn(tmp_path, monkeypatch):
     frames = np.asarray(asked).reshape(-1, 3)
     for colour in qualitative.HALVES:  # who sees what
         assert (frames == colour).all(axis=1).any()
-
-
-@pytest.mark.parametrize(
-    "option", [["--test-seed", "-5"], ["--test-seed", "100000000"], ["--seed", "-1"]]
-)
-def test_seeds_that_cannot_be_are_refused(option, capsys):
-    assert qualitative.main(option) == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from experiments import report
 from experiments.common import figures
-from experiments.tables import analyses, babyai, puzzles
+from experiments.tables import babyai, puzzles
 from leapjax.configuration import configuration_hash
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
@@ -59,34 +59,6 @@ def test_settings_are_kept_apart():
     assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
     found = cells(babyai.steps([*ROWS, others[4]]), "S8N7")
     assert found[1:] == ["-", "-", "6.0", "4.0"]
-
-
-def test_success_by_iterations_is_of_seed_0_and_includes_the_run_itself():
-    rows = [
-        row(played=True, iterations=1, rate=0.02), row(rate=0.9),  # N = T = 5
-        row(played=True, iterations=2, rate=0, seed=1),
-        row("PickUpLoc"),  # of one N alone there is nothing to see
-    ]  # fmt: skip
-    (by_preset,) = babyai.success_by_iterations(rows).values()
-    assert {title: list(by_count) for title, by_count in by_preset.items()} == {
-        "preset `leapjax`": [1, 5]
-    }
-    assert {"2.0%", "90.0%"} < set(cells(babyai.iterations(rows), "S8N7"))
-
-
-def test_what_acting_costs():
-    # 500 episodes of 6 steps: a plan for each step, or for three.
-    rows = [row(method="bc", rate=1.0) | {"plans": 3000}, row() | {"plans": 1000}]
-    assert babyai.acting(rows).splitlines()[2:] == [
-        "| GoToLocalS8N7 | 6.0 | - | - | - | - | - | 6.0 (2.0) |"
-    ]
-    timed = [
-        {"level": "GoToLocalS8N7", "method": method, "plans_per_second": 100.0}
-        for method in ("bc", "leap")
-    ]
-    assert babyai.price(rows, timed).splitlines()[2:] == [
-        "| GoToLocalS8N7 | 10.000 | - | - | - | - | - | 3.333 |"
-    ]
 
 
 def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
@@ -174,13 +146,3 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     }
     figures.iterations_by_level(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0
-
-
-def test_each_way_of_the_properties_is_in_one_of_their_tables():
-    of, rows = analyses.ANALYSES["properties"], report.rows_of(Path(), "properties")
-    parts = [analyses.analysed(of, rows, kind).splitlines() for kind in report.PROPERTIES]
-    kept = [line.split(" | ")[:3] for part in parts for line in part[2:]]
-    whole = analyses.analysed(of, rows).splitlines()[2:]
-    assert kept == [line.split(" | ")[:3] for line in whole]
-    watched = [" | violations" in part[0] for part in parts]
-    assert watched == [True, False, False, True]  # where there is a constraint

@@ -3,8 +3,6 @@
 import json
 import math
 import subprocess
-from importlib import metadata
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -49,31 +47,6 @@ def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
     assert results.code_version(checkout) == f"{version}.dirty"
     latest = commit(checkout)
     assert results.code_version(checkout) == f"+g{latest}" != version
-
-
-def test_without_a_repository_only_the_version_is_known(tmp_path):
-    assert results.code_version(tmp_path) == ""
-    (tmp_path / ".git").write_text("damaged")
-    assert results.code_version(tmp_path) == ""
-
-
-def test_a_row_can_be_made_without_the_packages_of_other_domains(monkeypatch):
-    def version(name):
-        if name in ("minigrid", "ale-py"):
-            raise metadata.PackageNotFoundError(name)
-        return "1.0"
-
-    monkeypatch.setattr(results.metadata, "version", version)
-    found = results.versions()
-    assert found["jax"] == "1.0" and not {"minigrid", "ale-py"} & found.keys()
-
-
-def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):
-    alone = results.versions()["machine"]
-    assert "H100" not in alone  # the devices of these tests are cores
-    gpus = [SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")] * 2
-    monkeypatch.setattr(results.jax, "local_devices", lambda: gpus)
-    assert results.versions()["machine"] == f"{alone}, 2 NVIDIA H100"
 
 
 ROW = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}

@@ -53,14 +53,6 @@ def test_bounds_are_the_rates_that_the_score_test_just_accepts(case, z):
 NO_COUNTS = [2.0, 2.5, True, "2", None, math.nan, [2]]
 
 
-def test_one_seed_has_the_interval_of_its_episodes():
-    for successes in (0, 3, 100, 190, 200):
-        expected = wilson_interval(successes, 200)
-        assert interval_over_seeds([successes], [200]) == pytest.approx(expected, abs=0.01)
-    low, high = interval_over_seeds([200, 200, 200], [200, 200, 200])
-    assert 0.98 < low < high == 1.0
-
-
 def test_seeds_that_differ_widen_the_interval():
     def width(*successes, **correlation):
         low, high = interval_over_seeds(successes, [500] * len(successes), **correlation)

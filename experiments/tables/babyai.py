@@ -12,10 +12,10 @@ from leapjax.domains.babyai.levels import LEVELS
 from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
+PRESETS = {"preset `paper`": PAPER, "preset `leapjax`": OURS}
 SETTINGS = {
     "random": Setting("leapjax", "random"),
-    "preset `paper`": PAPER,
-    "preset `leapjax`": OURS,
+    **PRESETS,
     # Chosen on validation levels: docs/tried.md.
     "`leapjax`, `--executed 3`": Setting("leapjax", changes={"executed": 3}),
 }
@@ -58,24 +58,28 @@ def uses(row: Row) -> bool:
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
-def success(rows: Sequence[Row]) -> str:
-    """Success rates per level: the paper's, and those of every setting; their middle.
+def success(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> str:
+    """Success of the paper's LEAP and of some settings, by level, and the interquartile mean.
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
+
+    Args:
+        rows: of BabyAI.
+        settings: a column for each, by title.
     """
-    found = select(rows, LEVELS, SETTINGS)
+    found = select(rows, LEVELS, settings)
     lines = [
         [
             level,
             f"{paper_success(level)['leap']:.1f}%",
-            *(rate(found[level, title]) for title in SETTINGS),
+            *(rate(found[level, title]) for title in settings),
         ]
         for level in LEVELS
     ]
-    middles = [middle(rows, setting) for setting in SETTINGS.values()]
+    middles = [middle(rows, setting) for setting in settings.values()]
     cells = ["-" if each is None else with_interval(*each) for each in middles]
     lines.append(["interquartile mean", f"{middle_of_paper():.1f}%", *cells])
-    return table(" | ".join(["level", "paper", *SETTINGS]), lines)
+    return table(" | ".join(["level", "paper", *settings]), lines)
 
 
 def steps(rows: Sequence[Row]) -> str:
