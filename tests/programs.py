@@ -54,6 +54,12 @@ def main():
     return running.main(LAKE)
 
 
+def toy_row(**values):
+    """A row of results with every field."""
+    row = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
+    return {**row, "success": 1.0, **values}
+
+
 def with_options(config, options):
     """A configuration with options of the command line, whichever part of it they are of."""
     parts = {name: dataclasses.asdict(getattr(config, name)) for name in pretrained.GROUPS}

@@ -16,7 +16,7 @@ from leapjax import scores
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.running import command_line, results, startup
-from tests.programs import RANDOM, ROOT, only_long
+from tests.programs import RANDOM, ROOT, only_long, toy_row
 
 LEVEL = "GoToLocalS7N5"
 
@@ -142,9 +142,10 @@ def test_methods_that_cannot_be_run_are_refused(arguments, says):
 
 
 def row(seed, method="bc", successes=5):
-    said = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
-    return {**said, "seed": seed, "method": method, "episodes": 10, "successes": successes,
-            "mean_return": 0.5, "hash": f"{seed}{method}"}  # fmt: skip
+    return toy_row(
+        seed=seed, method=method, episodes=10, successes=successes, success=successes / 10,
+        hash=f"{seed}{method}",
+    )  # fmt: skip
 
 
 def test_tables_end_with_the_mean_over_seeds():

@@ -27,7 +27,7 @@ from experiments import gymnasium as program
 from leapjax import domains
 from leapjax.data import storage, windows
 from leapjax.data.storage.spaces import SPACES
-from leapjax.domain import Collection, blank_context
+from leapjax.domain import Collection, Demonstrations, blank_context
 from leapjax.domains.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.domains.gymnasium.observations import (
     StateTokens,
@@ -203,11 +203,18 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
         found = judge_data(data, domain)
         assert found == {"success": np.mean(played), "return": pytest.approx(2 / 3)}
         assert found["success"] == (1.0 if least == 0 else pytest.approx(2 / 3))
-    assert judge_data(data, domain._replace(criterion=None)) is judge_data([], domain) is None
+    assert (
+        judge_data(data, domain._replace(demonstrations=Demonstrations()))
+        is judge_data([], domain)
+        is None
+    )
 
 
 def test_a_criterion_says_where_it_comes_from():
-    found, given = (make("CartPole-v1", Settings(success_return=x)).criterion for x in (None, 3.0))
+    found, given = (
+        make("CartPole-v1", Settings(success_return=x)).demonstrations.criterion
+        for x in (None, 3.0)
+    )
     assert "475 (reward_threshold of the environment, meant" in str(found)
     assert str(given) == "a return of at least 3 (given)"
     with pytest.raises(UserError, match="success_return must be finite"):

@@ -28,11 +28,11 @@ from leapjax.configuration import make_domain, specify
 from leapjax.data import storage
 from leapjax.domains.babyai import demonstrations, levels
 from leapjax.errors import UserError
-from leapjax.running import jax_setup, results, shell, startup
+from leapjax.running import jax_setup, shell, startup
 from leapjax.running import main as running
 from leapjax.running.command_line import parse
 from leapjax.types import TrainState
-from tests.programs import ROOT, TOY_RUN, only_long, seal, untrained_run
+from tests.programs import ROOT, TOY_RUN, only_long, seal, toy_row, untrained_run
 
 OTHER, TOO_SMALL = "another configuration", "must be at least"
 
@@ -349,8 +349,7 @@ def test_a_level_that_fails_does_not_end_the_others(capsys, monkeypatch):
         played.append((config.level, seed))
         if config.level == "GoToLocalS8N7":
             raise UserError("something is wrong with it")
-        row = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
-        return row | {"level": config.level}
+        return toy_row(level=config.level)
 
     monkeypatch.setattr(running, "finish", run_one)
     assert babyai.main(["--level", "all", "--seeds", "0", "1", "--no-pictures"]) == 2

@@ -11,7 +11,7 @@ from experiments.tables import measured
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes
 from leapjax.running import results
-from tests.programs import ROOT
+from tests.programs import ROOT, toy_row
 
 
 @pytest.fixture
@@ -49,8 +49,7 @@ def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
     assert results.code_version(checkout) == f"+g{latest}" != version
 
 
-ROW = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
-ROW["success"] = 1.0
+ROW = toy_row()
 
 
 def write_rows(path, *rows):

@@ -10,6 +10,7 @@ import pytest
 from leapjax import batching
 from leapjax.agents import bc, bcq, dt, iql, leap, mopo, returns
 from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.domain import Scaling
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -201,7 +202,7 @@ def test_the_return_that_is_wanted_is_less_by_what_was_given():
     """In units that do not saturate; where a demonstration tells the rest, that is taken."""
     given = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
     np.testing.assert_array_equal(returns.returns_to_go(given, jnp.float32(10)), [17, 16, 14, 10])
-    domain = mixed.DOMAIN._replace(return_scale=4.0)
+    domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
     settings = dt.Settings(target_return=10.0)
     wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
     context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 1.0]), return_so_far=2.0)

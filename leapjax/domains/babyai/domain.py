@@ -5,7 +5,7 @@ import functools
 
 import numpy as np
 
-from leapjax.domain import Domain, DomainType
+from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.babyai import (
     augmentation,
     demonstrations,
@@ -33,7 +33,7 @@ def make(name: str, options: Settings) -> Domain:
     level = levels.find_level(name)
     with contextlib.closing(levels.make_environment(level)) as env:
         side = max(env.width, env.height)
-        longest, shortest = levels.longest_episode(level, env), levels.shortest_limit(env)
+        longest = levels.longest_episode(level, env)
 
     def state_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
@@ -51,21 +51,23 @@ def make(name: str, options: Settings) -> Domain:
     return Domain(
         level=level.name,
         make_adapter=lambda: BabyAIAdapter(level),
-        collect=functools.partial(demonstrations.collect, level),
         actions=ACTIONS,
         max_steps=longest,
         blank=observations.blank(side, level.words),
         encoders={"paper": state_tokens, "leapjax": context_tokens},
-        augmentations=augmentation.choose_augmentations(options),
-        extras=augmentation.mark_needed_cells,
-        check=functools.partial(check, level=level),
-        replay=functools.partial(replay.replay, level=level),
-        shortest_limit=shortest,
+        demonstrations=Demonstrations(
+            functools.partial(demonstrations.collect, level),
+            check=functools.partial(check_states, level=level),
+            replay=functools.partial(replay.replay, level=level),
+        ),
+        augmentations=Augmentations(
+            augmentation.choose_augmentations(options), augmentation.mark_needed_cells
+        ),
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
     )
 
 
-def check(states: Observation, where: str, level: Level) -> None:
+def check_states(states: Observation, where: str, level: Level) -> None:
     """Refuses observations whose numbers mean nothing in this world.
 
     Args:
