@@ -28,9 +28,6 @@ def test_parameters_come_back_in_half_precision(tmp_path):
     found = weights.read(path, PARAMS, "mine")
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), found, PARAMS)
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
-    again = tmp_path / "again.npz"
-    weights.write(again, found, "mine")  # what is rounded once is not rounded again
-    jax.tree.map(np.testing.assert_array_equal, weights.read(again, PARAMS, "mine"), found)
     with pytest.raises(ValueError, match="b does not fit half precision"):
         weights.write(path, {"b": jnp.full(2, 1e6)}, "mine")
 

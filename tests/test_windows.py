@@ -91,11 +91,6 @@ def slow_way(demonstration: Demonstration, start: int) -> np.ndarray:
     return way
 
 
-@functools.cache
-def window_at(context: int, horizon: int):
-    return jax.jit(lambda steps, i: windows.window(steps, i, context, horizon, END))
-
-
 def assert_same(actual, expected) -> None:
     """The same arrays, of the same types."""
     jax.tree.map(np.testing.assert_array_equal, actual, expected)
@@ -103,75 +98,57 @@ def assert_same(actual, expected) -> None:
     assert types == jax.tree.map(lambda x: x.dtype, expected)
 
 
+def each_step():
+    """The row of each step of the toy demonstrations, its demonstration, and its number."""
+    steps = [(d, step) for d in toy_demonstrations() for step in range(len(d.actions))]
+    return [(row, *step) for row, step in enumerate(steps)]
+
+
 def test_steps_are_all_that_happened_in_order():
-    demonstrations = toy_demonstrations()
-    steps = laid_out(demonstrations)
-    row = 0
-    for episode, demonstration in enumerate(demonstrations):
+    steps = laid_out(toy_demonstrations())
+    for row, demonstration, step in each_step():
         n = len(demonstration.actions)
-        assert (steps.starts[episode], steps.lengths[episode]) == (row, n)
-        for step in range(n):
-            # The state before the action, and the one after it: the last one too.
-            for later in (0, 1):
-                assert_same(
-                    jax.tree.map(lambda x, i=steps.state[row] + later: x[i], steps.observations),
-                    jax.tree.map(lambda x, i=step + later: x[i], demonstration.observations),
-                )
-            assert steps.actions[row] == demonstration.actions[step]
-            assert steps.rewards[row] == demonstration.rewards[step]
-            assert steps.return_so_far[row] == sum(demonstration.rewards[:step].tolist())
-            assert steps.terminated[row] == (step == n - 1 and episode in (0, 2))
-            assert (steps.step[row], steps.remaining[row]) == (step, n - step)
-            np.testing.assert_array_equal(steps.extras[row], slow_way(demonstration, step))
-            row += 1
-    assert row == len(steps.actions) == sum(LENGTHS)
+        episode = demonstration.seed
+        assert (steps.starts[episode], steps.lengths[episode]) == (row - step, n)
+        for later in (0, 1):  # the state before the action, and the one after it: the last one too
+            assert_same(
+                jax.tree.map(lambda x, i=steps.state[row] + later: x[i], steps.observations),
+                jax.tree.map(lambda x, i=step + later: x[i], demonstration.observations),
+            )
+        assert steps.actions[row] == demonstration.actions[step]
+        assert steps.rewards[row] == demonstration.rewards[step]
+        assert steps.return_so_far[row] == sum(demonstration.rewards[:step].tolist())
+        assert steps.terminated[row] == (step == n - 1 and episode in (0, 2))
+        assert (steps.step[row], steps.remaining[row]) == (step, n - step)
+        np.testing.assert_array_equal(steps.extras[row], slow_way(demonstration, step))
+    assert len(steps.actions) == sum(LENGTHS)
     assert len(steps.observations.grid) == sum(LENGTHS) + len(LENGTHS)
 
 
 @pytest.mark.parametrize(("context", "horizon"), [(0, 1), (2, 3), (5, 5)])
 def test_every_window_against_the_slow_one(context, horizon):
-    demonstrations = toy_demonstrations()
-    steps = on_device(laid_out(demonstrations))
-    index = 0
-    for demonstration in demonstrations:
-        for start in range(len(demonstration.actions)):
-            expected = slow_window(demonstration, start, context, horizon)
-            assert_same(window_at(context, horizon)(steps, index), expected)
-            index += 1
-    assert index == steps.actions.shape[0] == sum(LENGTHS)
+    steps = on_device(laid_out(toy_demonstrations()))
+    find = jax.jit(lambda steps, i: windows.window(steps, i, context, horizon, END))
+    for row, demonstration, start in each_step():
+        assert_same(find(steps, row), slow_window(demonstration, start, context, horizon))
 
 
 @pytest.mark.parametrize("context", [0, 2])
 def test_transitions_are_what_was_before_and_after_every_step(context):
-    demonstrations = toy_demonstrations()
-    steps = on_device(laid_out(demonstrations))
+    steps = on_device(laid_out(toy_demonstrations()))
     find = jax.jit(lambda steps, i: windows.transition_window(steps, i, context, END))
-    index = 0
-    for demonstration in demonstrations:
+    for row, demonstration, step in each_step():
         # One step longer, so that the state after the last step is one that windows start at.
-        longer = demonstration._replace(
-            observations=jax.tree.map(
-                lambda x: np.concatenate([x, x[-1:]]), demonstration.observations
-            ),
-            actions=np.append(demonstration.actions, 0),
-            rewards=np.append(demonstration.rewards, 0),
-        )
-        for step, action in enumerate(demonstration.actions):
-            found = find(steps, index)
-            assert found.actions.shape == (0,)
-            assert found.context.actions[-1] == action
-            assert found.context.rewards[-1] == demonstration.rewards[step]
-            np.testing.assert_array_equal(found.extras, slow_way(demonstration, step))
-            for part, start in ((windows.before, step), (windows.after, step + 1)):
-                expected = slow_window(longer, start, context, 0)
-                assert_same(
-                    found._replace(
-                        context=part(found.context),
-                        return_to_go=expected.return_to_go, extras=expected.extras,
-                    ),
-                    expected,
-                )  # fmt: skip
-            index += 1
+        states = jax.tree.map(lambda x: np.concatenate([x, x[-1:]]), demonstration.observations)
+        actions, rewards = (np.append(x, 0) for x in (demonstration.actions, demonstration.rewards))
+        longer = demonstration._replace(observations=states, actions=actions, rewards=rewards)
+        found = find(steps, row)
+        assert found.actions.shape == (0,)
+        assert found.context.actions[-1] == actions[step]
+        assert found.context.rewards[-1] == rewards[step]
+        np.testing.assert_array_equal(found.extras, slow_way(demonstration, step))
+        assert_same(windows.before(found.context), slow_window(longer, step, context, 0).context)
+        assert_same(windows.after(found.context), slow_window(longer, step + 1, context, 0).context)
 
 
 def test_states_keep_their_type():
@@ -194,29 +171,25 @@ def test_states_keep_their_type():
 
 @pytest.mark.parametrize(("context", "horizon"), [(0, 4), (2, 3)])
 def test_unrolled_windows_hold_every_context_of_their_plan(context, horizon):
-    demonstrations = toy_demonstrations()
-    steps = on_device(laid_out(demonstrations))
+    steps = on_device(laid_out(toy_demonstrations()))
     find = jax.jit(lambda s, i: windows.unrolled_window(s, i, context, horizon, END))
-    index = 0
-    for demonstration in demonstrations:
+    for row, demonstration, start in each_step():
         n = len(demonstration.actions)
-        for start in range(n):
-            found = find(steps, index)
-            expected = slow_window(demonstration, start, context, horizon)
-            np.testing.assert_array_equal(found.actions, expected.actions)
-            np.testing.assert_array_equal(found.extras, expected.extras)
-            for place in range(horizon):
-                at = windows.context_at(found.context, place, context)
-                now = min(start + place, n)
-                state = jax.tree.map(lambda x, i=now: x[i], demonstration.observations)
-                assert_same(at.observation, state)
-                assert at.step == start + place
-                assert at.actions.shape == (context,)
-                if start + place < n:
-                    same = slow_window(demonstration, now, context, 0).context
-                    assert_same(at.past, same.past)
-                    np.testing.assert_array_equal(at.actions, same.actions)
-            index += 1
+        found = find(steps, row)
+        expected = slow_window(demonstration, start, context, horizon)
+        np.testing.assert_array_equal(found.actions, expected.actions)
+        np.testing.assert_array_equal(found.extras, expected.extras)
+        for place in range(horizon):
+            at = windows.context_at(found.context, place, context)
+            now = min(start + place, n)
+            assert_same(
+                at.observation, jax.tree.map(lambda x, i=now: x[i], demonstration.observations)
+            )
+            assert at.step == start + place
+            assert at.actions.shape == (context,)
+            if start + place < n:
+                same = slow_window(demonstration, now, context, 0).context
+                assert_same((at.past, at.actions), (same.past, same.actions))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4, 5))
