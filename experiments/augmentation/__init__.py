@@ -47,7 +47,9 @@ def make(level: str, options: Settings) -> Domain:
     Raises:
         UserError: an unknown level.
     """
-    return domain.make(level, options)._replace(augmentations=choose(options))
+    made = domain.make(level, options)
+    augmentations = made.augmentations._replace(functions=choose(options))
+    return made._replace(augmentations=augmentations)
 
 
 def choose(options: Settings) -> list[Augmentation]:
