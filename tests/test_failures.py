@@ -71,10 +71,6 @@ def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
     assert failures.main([str(run), "--episodes", "2", "--executed", "9"]) == 2
     error = capsys.readouterr().err
     assert "not in 1 .. 1" in error and str(run) in error
-    assert failures.main([str(run), "--gallery", str(tmp_path / "x.foo")]) == 2
-    assert "a picture can be" in capsys.readouterr().err
-    assert failures.main([str(tmp_path)]) == 2
-    assert "not a checkpoint" in capsys.readouterr().err
 
 
 def test_tasks_that_are_done_are_counted_through_nested_instructions():
@@ -91,8 +87,3 @@ def test_tasks_that_are_done_are_counted_through_nested_instructions():
     assert failures.tasks_done(after) == [False, False, True]
     both.a_done, after.b_done, after.a_done = "continue", "success", "continue"
     assert failures.tasks_done(after) == [False, True, True]
-
-
-def next_sequence() -> int:
-    """The first level seed whose instruction has several tasks."""
-    return next(s for s in range(50) if len(recorder("GoToSeqS5R2", s).tasks) > 1)

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from leapjax.batching import NotANumber, check_fit, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
@@ -27,16 +25,14 @@ from tests.enumerable import (
     enumerable_energy,
     fit_p_value,
     joint_probabilities,
-    no_tilt,
     plan_counts,
     random_table,
-    total_variation,
 )
 from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
 PLANS = all_plans(HORIZON, ACTIONS)
-NO_TILT = no_tilt(HORIZON, ACTIONS)
+NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
 ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
 FROM_TOTAL = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
 TABLE = random_table(0, HORIZON, ACTIONS)
@@ -84,15 +80,18 @@ def _blind_to_other_actions(params, memory, actions, positions):
     return ENUMERABLE.conditional(params, memory, masked, positions)
 
 
+def likelier(pairs, joint=JOINT):
+    """The distribution of the likelier plan of two that are drawn as such a pair `[A^T, A^T]`."""
+    p, rows = joint.reshape(-1), np.arange(len(PLANS))
+    found = np.where(p[:, None] >= p, rows[:, None], rows)
+    return np.bincount(found.reshape(-1), pairs.reshape(-1), len(rows))
+
+
 def best_of(probabilities, count):
     """The distribution of the plan of least energy among independent draws."""
-    probabilities, energies = np.ravel(probabilities), -np.log(JOINT.reshape(-1))
-    order = np.argsort(energies)
-    # At least this energy: all draws at least this, less all draws at least the next.
-    tail = np.append(np.cumsum(probabilities[order][::-1])[::-1], 0.0)
-    result = np.zeros(len(order))
-    result[order] = tail[:-1] ** count - tail[1:] ** count
-    return result
+    if count == 1:
+        return np.ravel(probabilities)
+    return likelier(np.outer(best_of(probabilities, count - 1), probabilities))
 
 
 def best_child(parents, beginnings):
@@ -102,18 +101,12 @@ def best_child(parents, beginnings):
         parents: `[A^T]` probabilities.
         beginnings: how many actions a plan can begin with; with one alone, it is kept.
     """
-    exact = np.zeros(len(PLANS))
-    for plan, probability in zip(PLANS, parents, strict=True):
-        for t in range(HORIZON):
-            possible = range(ACTIONS if t else beginnings)
-            others = [action for action in possible if action != plan[t]] or [plan[t]]
-            for action in others:
-                child = np.where(np.arange(HORIZON) == t, action, plan)
-                row = np.ravel_multi_index(
-                    max(plan, child, key=lambda p: JOINT[tuple(p)]), (3,) * 3
-                )
-                exact[row] += probability / HORIZON / len(others)
-    return exact
+    differ, pairs = PLANS[:, None] != PLANS, 0
+    for t in range(HORIZON):
+        others = differ[..., t] & (differ.sum(-1) == 1) & (PLANS[:, 0] < beginnings)
+        others |= ~others.any(1, keepdims=True) & np.eye(len(PLANS), dtype=bool)
+        pairs += parents[:, None] * others / others.sum(1, keepdims=True) / HORIZON
+    return likelier(pairs)
 
 
 def action_by_action(temperature):
@@ -127,21 +120,11 @@ def action_by_action(temperature):
     return exact
 
 
-def better_of_two(joint, replaced):
-    """The better of two plans: {a, b} has probability p_a p_b / (1 - p_a) and the reverse.
-
-    Args:
-        joint: `[A] * T`.
-        replaced: whether the second may be the first again.
-    """
+def two_beams(joint, replaced):
+    """The better of two plans, of which the second may be the first again if it is replaced."""
     p = joint.reshape(-1)
-    pairs = np.outer(p, p)
-    if not replaced:
-        pairs = pairs / (1 - p)[:, None]
-        np.fill_diagonal(pairs, 0)
-    rank = np.argsort(np.argsort(-p))
-    better = np.where(rank[:, None] < rank, np.arange(len(p))[:, None], np.arange(len(p)))
-    return np.bincount(better.reshape(-1), pairs.reshape(-1), len(p))
+    pairs = np.outer(p, p) if replaced else np.outer(p / (1 - p), p) * (1 - np.eye(len(p)))
+    return likelier(pairs, joint)
 
 
 class Sampler(NamedTuple):
@@ -163,7 +146,7 @@ GUARDED = from_total(ENUMERABLE.encode, _guarded_total, ACTIONS)
 PRODUCT = WEIGHTS[0] * TABLE.astype(np.float64) + WEIGHTS[1] * OTHER_TABLE
 COLD_JOINT = joint_probabilities(2 * TABLE.astype(np.float64))
 COMPOSED = compose([ENUMERABLE, ENUMERABLE], WEIGHTS)
-STEEP_BEAMS = [better_of_two(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
+STEEP_BEAMS = [two_beams(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
 BRED = CrossEntropyConfig(HORIZON, 2, candidates=2, elites=1)
 BEGIN_ALIKE = best_of((PLANS[:, 0] == 0) / 9, 2)
 SAMPLERS = {
@@ -206,7 +189,6 @@ def test_plans_are_drawn_from_the_exact_distribution(name):
     config, exact, wrong, energy, params, context = SAMPLERS[name]
     counts = plan_counts(plans_of(energy, config, params, context).actions, ACTIONS)
     assert fit_p_value(counts, exact) > ACCEPTED
-    assert total_variation(counts, exact) < 0.04
     assert fit_p_value(counts, wrong) < REJECTED
 
 
@@ -222,7 +204,6 @@ def test_plans_are_drawn_from_the_exact_distribution(name):
 def test_a_broken_sampler_does_not_pass_for_the_joint(energy, config):
     counts = plan_counts(plans_of(energy, config).actions, ACTIONS)
     assert fit_p_value(counts, JOINT) < REJECTED
-    assert total_variation(counts, JOINT) > 0.06
 
 
 def greedy_traces(config):
@@ -449,8 +430,7 @@ CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), price
 
 def prices(*forbidden, price=np.inf):
     result = np.zeros((HORIZON, ACTIONS), np.float32)
-    for position, action in forbidden:
-        result[position, action] = price
+    result[tuple(np.transpose(forbidden))] = price
     return result
 
 
@@ -458,15 +438,15 @@ def price_of(plans, price):
     return price[np.arange(HORIZON), plans].sum(-1)
 
 
-CONSTRAINED_CONFIGS = {
-    "gibbs": GibbsConfig(HORIZON, iterations=3, temperature=1.0, score=True, score_trace=True),
-    "restarts": GibbsConfig(HORIZON, iterations=3, restarts=2, temperature=0.3, score=True),
-    "shooting": ShootingConfig(HORIZON, candidates=2, score=True),
-    "cross entropy": CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
-}
-
-
-@pytest.mark.parametrize("config", CONSTRAINED_CONFIGS.values(), ids=CONSTRAINED_CONFIGS)
+@pytest.mark.parametrize(
+    "config",
+    [
+        GibbsConfig(HORIZON, iterations=3, temperature=1.0, score=True, score_trace=True),
+        GibbsConfig(HORIZON, iterations=3, restarts=2, temperature=0.3, score=True),
+        ShootingConfig(HORIZON, candidates=2, score=True),
+        CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
+    ],
+)
 def test_a_plan_that_breaks_a_constraint_is_never_called_satisfied(config):
     some = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 0), (2, 2)]
     for price in (prices(*some, price=0.5), prices(*some), np.full_like(NO_TILT, np.inf)):
@@ -547,23 +527,21 @@ def test_a_batch_is_a_loop_over_its_contexts_on_any_number_of_devices(config):
         np.testing.assert_allclose(plan.energy, one_by_one(config).energy[:batch], rtol=1e-5)
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 500), st.sets(st.integers(1, 70), min_size=1, max_size=4))
-def test_chunks_cover_every_row_exactly_once(batch, sizes):
-    chunks = split_batch(batch, sorted(sizes))
-    covered = [row for start, _, used in chunks for row in range(start, start + used)]
-    assert covered == list(range(batch))
-    assert all(size in sizes for _, size, _ in chunks)
-
-
-def test_a_chunk_is_not_padded_to_several_times_what_is_left():
-    for batch, sizes, chunks in [
-        (40, (16, 128), [16, 16, 16]),
-        (4, (1, 16), [1, 1, 1, 1]),
-        (5, (1, 16), [16]),
-        (110, (32, 128), [128]),
-    ]:
-        assert [size for _, size, _ in split_batch(batch, sizes)] == chunks
+@pytest.mark.parametrize(
+    ("batch", "sizes", "chunks"),
+    [
+        (40, [16, 128], [16, 16, 16]), (4, [1, 16], [1, 1, 1, 1]), (5, [1, 16], [16]),
+        (110, [32, 128], [128]), (300, [32, 128], [128, 128, 32, 32]), (1, [7], [7]),
+    ],
+)  # fmt: skip
+def test_chunks_cover_a_batch_and_are_not_padded_to_several_times_what_is_left(
+    batch, sizes, chunks
+):
+    found = split_batch(batch, sizes)
+    assert [size for _, size, _ in found] == chunks
+    assert [row for start, _, used in found for row in range(start, start + used)] == [
+        *range(batch)
+    ]
 
 
 def test_after_compiling_ahead_nothing_is_traced():
@@ -623,33 +601,34 @@ def test_parameters_are_placed_again_where_they_or_their_place_in_the_tree_chang
 
 # Energies that are no numbers. Parameters: a table, and what stands where an energy should be.
 
-UNDEFINED_TOTAL = ENUMERABLE._replace(
-    encode=lambda params, context: ENUMERABLE.encode(params[0], context),
-    total=lambda params, memory, actions: params[1],
+UNDEFINED = ENUMERABLE._replace(
+    encode=lambda params, context: (ENUMERABLE.encode(params[0], context), params[1]),
+    conditional=lambda params, memory, *plan: ENUMERABLE.conditional(params, memory[0], *plan),
+    total=lambda params, memory, actions: memory[1],
 )
 
 
 def _undefined_at_first(params, memory, actions, positions):
-    energies = ENUMERABLE.conditional(params[0], memory, actions, positions)
-    return jnp.where(jnp.all(actions == ACTIONS), energies.at[0, 1].set(params[1]), energies)
-
-
-UNDEFINED_STEP = UNDEFINED_TOTAL._replace(conditional=_undefined_at_first)
+    energies = UNDEFINED.conditional(params, memory, actions, positions)
+    return jnp.where(jnp.all(actions == ACTIONS), energies.at[0, 1].set(memory[1]), energies)
 
 
 @pytest.mark.parametrize(
-    ("energy", "config"),
+    "config",
     [
-        (UNDEFINED_STEP, GibbsConfig(HORIZON, 3)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, score=True)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, score_trace=True)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, restarts=2)),
-        (UNDEFINED_TOTAL, ShootingConfig(HORIZON)),
-        (UNDEFINED_TOTAL, CrossEntropyConfig(HORIZON)),
-        (UNDEFINED_TOTAL, BeamConfig(HORIZON, score=True)),
+        GibbsConfig(HORIZON, 3),
+        GibbsConfig(HORIZON, 3, score=True),
+        GibbsConfig(HORIZON, 3, score_trace=True),
+        GibbsConfig(HORIZON, 3, restarts=2),
+        ShootingConfig(HORIZON),
+        CrossEntropyConfig(HORIZON),
+        BeamConfig(HORIZON, score=True),
     ],
 )
-def test_a_plan_whose_energy_is_no_number_is_not_valid(energy, config):
+def test_a_plan_whose_energy_is_no_number_is_not_valid(config):
+    energy = UNDEFINED
+    if config == GibbsConfig(HORIZON, 3):  # which asks for no total
+        energy = UNDEFINED._replace(conditional=_undefined_at_first)
     for value, valid in ((np.nan, False), (-np.inf, False), (1.0, True)):
         plan = plans_of(energy, config, (TABLE, np.float32(value)), chains=2)
         assert (plan.valid == valid).all()
@@ -697,12 +676,10 @@ def _of_another_shape(name, config):
 WIDE = (np.array([0, 2**31]), np.array([0, 2**32], np.uint64), np.array([np.inf, -1e39]))
 WRONG = [
     (lambda: _plan(KEYS[0]), "expected one for each context"),
-    (lambda: _plan(jax.random.key(0)), "expected one for each context"),
     (lambda: _plan(KEYS.astype(np.int64)), r"raw keys must be \[B, 2\] uint32"),
     (lambda: _plan("keys"), "keys must be an array"),
     (lambda: _plan(KEYS[:0], tilt=np.zeros((0, HORIZON, ACTIONS))), "no contexts"),
     (lambda: _plan(tilt=np.zeros((3, HORIZON, ACTIONS))), r"'tilt'\] has .* number of keys, 2"),
-    (lambda: _plan(tilt=np.float32(0)), r"context\['tilt'\] has shape .* number of keys, 2"),
     (lambda: _plan(mission=np.array(["go", "stay"])), r"'mission'\] holds <U\d+, not numbers"),
     *(
         (lambda w=wide: _plan(more=[w]), r"context\['more'\]\[0\] holds .*does not fit")
@@ -719,7 +696,6 @@ WRONG = [
     (lambda: plan_keys(0, np.array([5.9]), np.array([0])), "episode must be"),
     (lambda: plan_keys(0, np.array([0]), np.array([2**32])), "replan must be"),
     (lambda: plan_keys(0, np.arange(2), np.arange(1)), "2 episodes, but 1 replans"),
-    (lambda: compile_planner(TILTED, GIBBS, ()), "chunk sizes"),
     (lambda: compile_planner(TILTED, GIBBS, (8, -1)), "chunk sizes"),
     (lambda: compile_planner(TILTED, GIBBS, (1,), ["cpu"]), "devices must be a sequence"),
     (lambda: batched(GIBBS).compile(TABLE, CONTEXTS, 0), "batch must be at least 1"),
@@ -730,9 +706,7 @@ WRONG = [
     (lambda: GibbsConfig(3, resampled=4), "resampled is 4, .* the horizon 3"),
     (lambda: GibbsConfig(3, order="backwards"), "unknown order 'backwards': .*sequential"),
     (lambda: GibbsConfig(5, 2, 2, fill="margin"), "needs 3"),
-    (lambda: ShootingConfig(candidates=0), "candidates must be at least 1, got 0"),
     (lambda: CrossEntropyConfig(candidates=2, elites=3), "3 elites out of 2 candidates"),
-    (lambda: BeamConfig(beams=0), "beams must be at least 1"),
     (lambda: BeamConfig(temperature=-1.0), "a temperature must be in"),
     (lambda: GibbsConfig(temperature=1e31), "a temperature must be in"),
 ]

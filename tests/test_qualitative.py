@@ -1,6 +1,5 @@
 """Drawings of plans: episodes that are watched, and the program at toy size."""
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -40,9 +39,6 @@ def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
         assert len(steps) == played.lengths[row]
         succeeded = bool(steps) and steps[-1][1].success
         assert succeeded == played.successes[row]
-        several = list(watched(adapter, planner, 0, level_seed, 3, executed, most=1))
-        assert jax.tree.all(jax.tree.map(np.array_equal, several[0], events[0]))
-        assert sum(isinstance(event, Plan) for event in several) == 1
     assert plans == played.plans
 
 

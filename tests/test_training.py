@@ -15,7 +15,7 @@ from leapjax.agents.batches import window_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.domain import blank_context
+from leapjax.domain import Augmentations, blank_context
 from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
@@ -111,7 +111,7 @@ def test_the_last_augmentation_comes_first_and_each_has_its_own_keys(data):
         return window._replace(extras=extras, actions=window.actions + 1)
 
     def draw(*augmentations):
-        domain = toy.DOMAIN._replace(augmentations=augmentations)
+        domain = toy.DOMAIN._replace(augmentations=Augmentations(augmentations))
         return jax.jit(window_batches(setup(domain)))(jax.random.key(0), data)
 
     first, second = draw(doubled, shifted), draw(shifted, doubled)

@@ -46,7 +46,7 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
         return windows.window(steps, index, setup.context, setup.horizon, domain.num_actions - 1)
 
     def batch(key: jax.Array, steps: Steps) -> Window:
-        step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+        step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
         count = training.batch // training.run
         starts = windows.sample_steps(step_key, steps, count, training.windows)
         ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
@@ -88,7 +88,7 @@ def _draw(
 ) -> tuple[Window, jax.Array]:
     """Windows `[B, ...]`, augmented, and the indices `[B]` of their steps."""
     domain, training = setup.domain, setup.training
-    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
     indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
     drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
     return _augmented(domain, keys, drawn), indices
@@ -105,6 +105,6 @@ def _augmented(
     `of_example` makes an augmentation of an example from one of a window.
     """
     count = drawn.actions.shape[0]
-    for augment, key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+    for augment, key in reversed(list(zip(domain.augmentations.functions, keys, strict=True))):
         drawn = jax.vmap(of_example(augment))(jax.random.split(key, count), drawn)
     return drawn

@@ -410,7 +410,7 @@ def blank_steps(domain: Domain) -> Steps:
     states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
     actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
     blank = Demonstration(states, actions, rewards, True, False, 0)
-    return windows.concatenate([blank], domain.extras)
+    return windows.concatenate([blank], domain.augmentations.extras)
 
 
 def context_encoder(
