@@ -47,9 +47,8 @@ def make(level: str, options: Settings) -> Domain:
     Raises:
         UserError: an unknown level.
     """
-    made = domain.make(level, options)
-    augmentations = made.augmentations._replace(functions=choose(options))
-    return made._replace(augmentations=augmentations)
+    plain = domain.make(level, options)
+    return plain._replace(augmentations=plain.augmentations._replace(functions=choose(options)))
 
 
 def choose(options: Settings) -> list[Augmentation]:
