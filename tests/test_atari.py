@@ -300,7 +300,7 @@ def test_presets_are_the_papers_and_ours():
 @pytest.mark.parametrize(
     "changes",
     [{"transitions": 0}, {"sticky": 1.5}, {"sticky": float("nan")}, {"shift": -1}, {"shift": 84},
-     {"max_steps": 0}, {"max_steps": 2**29}, {"replay_run": 0}],
+     {"max_steps": 0}, {"max_steps": 2**29}, {"dqn_seed": 0}],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
@@ -493,17 +493,17 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
     assert collect.find_shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
 
 
-@pytest.mark.parametrize(("game", "run"), [("Pong", 1)])
-def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
+@pytest.mark.parametrize(("game", "number"), [("Pong", 1)])
+def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, number):
     folder, arguments = collected
-    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
-    where = ["--folder", str(tmp_path), "--game", game, "--replay-run", str(run)]
+    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(number))
+    where = ["--folder", str(tmp_path), "--game", game, "--dqn-seed", str(number)]
     assert atari.main([*arguments, *where]) == 2
     error = capsys.readouterr().err
-    assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
+    assert f"holds games of Breakout, seed 1, not of {game}, seed {number}" in error
     assert error.count("\n") == 1
-    settings = domain.Settings(transitions=100, replay_run=run)
-    with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
+    settings = domain.Settings(transitions=100, dqn_seed=number)
+    with pytest.raises(UserError, match=f"of Breakout, seed 1, not of {game}, seed {number}"):
         domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
 
 
@@ -574,7 +574,7 @@ def test_every_way_to_learn_trains_and_plays(
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "did you mean Pong"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
-        (["collect", "--game", "Pong", "--replay-run", "0"], "--replay-run must be at least 1"),
+        (["collect", "--game", "Pong", "--dqn-seed", "0"], "--dqn-seed must be at least 1"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -621,7 +621,7 @@ def test_data_of_another_size_are_recorded_beside_the_usual(tmp_path, monkeypatc
     for size in ("500000", "50000"):
         assert atari.main([*record, "--transitions", size]) == 0
     assert atari.main(["collect", "--game", "Pong", "--record"]) == 0
-    for other in ("--replay-run", "--longest"):
+    for other in ("--dqn-seed", "--longest"):
         assert atari.main([*record, other, "2"]) == 2
     assert "--record is for data that are learned from" in capsys.readouterr().err
     recorded = json.loads((tmp_path / "data.json").read_text())
