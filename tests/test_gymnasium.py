@@ -275,7 +275,7 @@ def test_tables_show_the_return_first_where_nobody_has_said_what_success_is():
     judged = {"criterion": "a return of at least 8 (x)", "data_success": 0.56, "data_return": 8.0}
     found, asked = (row_of(**judged, criterion_given=given) for given in (False, True))
     for rows, first in (([found], "return"), ([asked], "success [95%]"), ([row_of()], "success")):
-        table = results.success_table(rows)
+        table = results.make_success_table(rows)
         assert str(table.columns[4].header).startswith(first)
         assert table.caption == (None if rows == [row_of()] else "success: " + judged["criterion"])
     assert results.summarize(found).startswith("mean return 7.93 (data: 8.00), success 100.0%")
