@@ -344,8 +344,8 @@ def test_wrappers_that_data_cannot_name_are_found_by_playing_again(wrap, says):
     name = recorded("my/wrapped-v0", "MountainCar-v0", lambda seen: 0, 1, wrap)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        assert len(loaded(name, "MountainCar-v0")) == 1
-    told = [str(each.message) for each in warned if "may not have been recorded" in str(each)]
+        loaded(name, "MountainCar-v0")
+    told = [str(each.message) for each in warned if "may not have been" in str(each)]
     assert len(told) == (says is not None)
     assert says is None or f"with its seed 0 has another {says}; look for wrappers" in told[0]
 
@@ -375,24 +375,12 @@ LARGEST = float(np.finfo(np.float32).max)  # as environments of earlier versions
     ("level", "change", "says"),
     [
         ("MountainCar", lambda s, a: s["low"].__setitem__(0, -0.5), "each observation is in Box"),
-        (
-            "MountainCar",
-            lambda s, a: a.update(n=4),
-            r"each action is in Discrete\(4\), and in Mount",
-        ),
-        (
-            "MountainCar",
-            lambda s, a: a.update(start=1),
-            r"each action is in Discrete\(3, start=1\)",
-        ),
+        ("MountainCar", lambda s, a: a.update(n=4), r"each action is in Discrete\(4\), and"),
+        ("MountainCar", lambda s, a: a.update(start=1), "each action is in .*start=1"),
         ("MountainCar", lambda s, a: s["low"].__setitem__(0, -1.2000001), None),  # rounded
         ("MountainCar", lambda s, a: s.update(dtype="float64"), None),
         ("Corridor", lambda s, a: s["subspaces"]["here"].update(high=[LARGEST] * 2), None),
-        (
-            "Corridor",
-            lambda s, a: s["subspaces"]["lamp"].update(n=4),
-            r"each observation\['lamp'\]",
-        ),
+        ("Corridor", lambda s, a: s["subspaces"]["lamp"].update(n=4), "each observation.*lamp"),
     ],
 )
 def test_spaces_that_are_not_those_of_the_environment(level, change, says):
