@@ -46,19 +46,19 @@ def solved(digits, side):
 
 
 def test_the_search_finds_every_board_and_no_other():
-    every = boards.solutions(np.zeros(16, np.int32), most=1000)
+    every = boards.find_solutions(np.zeros(16, np.int32), most=1000)
     assert len(every) == 288  # as is known of 4 by 4
     assert len({tuple(board) for board in every}) == 288
     assert all(solved(board, 4) for board in every)
     contradiction = np.zeros(16, np.int32)
     contradiction[[0, 3]] = 2
-    assert boards.solutions(contradiction) == []
+    assert boards.find_solutions(contradiction) == []
 
 
 def test_the_search_finds_the_solution_of_a_published_board():
     clues = "530070000600195000098000060800060003400803001700020006060000280000419005000080079"
     solution = "534678912672195348198342567859761423426853791713924856961537284287419635345286179"
-    (found,) = boards.solutions(np.array(list(clues), int))
+    (found,) = boards.find_solutions(np.array(list(clues), int))
     assert "".join(map(str, found)) == solution
 
 
@@ -69,7 +69,7 @@ def test_boards_have_so_many_clues_and_one_solution(size):
         clues, solution = boards.draw(size, seed)
         assert (clues > 0).sum() == size.clues
         assert (clues == np.where(clues > 0, solution, 0)).all() and solved(solution, size.side)
-        (only,) = boards.solutions(clues)
+        (only,) = boards.find_solutions(clues)
         np.testing.assert_array_equal(only, solution)
         seen.add(tuple(clues))
         np.testing.assert_array_equal(boards.draw(size, seed)[0], clues)
@@ -117,7 +117,7 @@ def test_a_transformed_window_is_that_of_another_board(size, cell):
         assert board.cell == cell
         rest = size.cells - cell
         assert (window.actions[rest:] == size.side).all()  # the end action
-        (solution,) = boards.solutions(board.digits)  # what is left has one solution
+        (solution,) = boards.find_solutions(board.digits)  # what is left has one solution
         np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
         assert (board.digits[:cell] > 0).all()
         clues = (board.digits[cell:] > 0).sum()
@@ -257,19 +257,6 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     assert share(both, ((), ()), certain) == share(energy, (), certain)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("Sudoku9", "unknown level 'Sudoku9': expected Sudoku<4 or 9>x<clues>, such as Sudoku4x6"),
-        ("sudoku9x36", "did you mean Sudoku9x36"),
-        ("Sudoku4x17", r"clues must be in 4 \.\. 16"),
-    ],
-)
-def test_unknown_levels_are_one_line(name, message):
-    with pytest.raises(UserError, match=message):
-        boards.find_level(name)
-
-
 def test_data_that_solve_no_board_are_refused():
     domain = make("Sudoku4x6", Settings())
     (demonstration,) = domain.demonstrations.collect(1, 0, lambda done: None).demonstrations
@@ -314,18 +301,6 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_searc
     # Eight clues leave little open. What two steps have learned is next to nothing.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]
     assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
-
-
-@pytest.mark.parametrize(
-    ("less", "solved"),
-    [pytest.param("", 6, marks=only_long), ("--horizon 5 --iterations 5", 3)],
-)
-def test_rules_go_on_where_the_board_is(less, solved, tmp_path, one_search):
-    """Planned anew after every few digits, and only as far."""
-    toy = "--level Sudoku4x8 --episodes 8 --no-pictures --method rules --executed 4"
-    assert sudoku.main([*toy.split(), *less.split()]) == 0
-    row, _ = results.read(tmp_path / "runs" / "sudoku.jsonl")
-    assert row["successes"] >= solved
 
 
 @pytest.mark.parametrize(
