@@ -67,7 +67,7 @@ def test_both_figures_are_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(qualitative, "ITERATIONS", (2,))
     monkeypatch.setattr(qualitative, "PLANNED", ("GoToLocalS7N5",))
     monkeypatch.setattr(qualitative, "ASKED", (("composition-easy", "sum"),))
-    monkeypatch.setattr(qualitative.analysis, "models_of", lambda *_: [untrained, untrained])
+    monkeypatch.setattr(qualitative.cases, "models_of", lambda *_: [untrained, untrained])
     assert qualitative.main(["--test-seed", "0"]) == 0
     refined, asked = (Image.open(tmp_path / "runs" / f"{name}.png") for name in qualitative.FIGURES)
     assert refined.size == (2 * 336, 370) and asked.size == (336, 370)
