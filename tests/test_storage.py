@@ -153,7 +153,7 @@ def test_observations_of_another_world_are_refused(minari_folder):
 
 def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
     name = "leapjax/GoToLocalS7N5/bot-5-seed0-v1"
-    assert storage.dataset_id(LEVEL, 5, 0) == name.replace("v1", "v2")
+    assert storage.name_dataset(LEVEL, 5, 0) == name.replace("v1", "v2")
     save(saved, name)
     assert "earlier version" in refused(name)
     save(saved, name.replace("v1", "v2"))
@@ -176,7 +176,7 @@ def test_a_killed_save_leaves_nothing_under_the_name(
         with pytest.raises(Killed):
             save(local_demonstrations)
     assert any(minari_folder.glob(f"{writing.SCRATCH}*"))  # what a killed program leaves behind
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
     assert "no Minari data set" in refused()
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Minari warns of what is no data set
@@ -210,7 +210,7 @@ def test_a_save_that_is_killed_between_two_names_is_mended_by_the_next(saved, mo
         patch.setattr(Path, "rename", die_at_the_second)
         with pytest.raises(Killed):
             save(saved[:1])
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
     save(saved[:1], "leapjax/other-v0")
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
@@ -254,7 +254,7 @@ def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
     monkeypatch.setattr(MinariStorage, "update_metadata", full)
     with pytest.raises(UserError, match="cannot write the data set .*No space left on device"):
         save(local_demonstrations)
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
 
 
 @pytest.mark.parametrize("kind", ["a file", "empty", "below a file"])
@@ -263,7 +263,7 @@ def test_a_folder_of_data_sets_that_cannot_be(kind, tmp_path, monkeypatch):
     path = {"a file": tmp_path / "file", "empty": "", "below a file": tmp_path / "file" / "sets"}
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(path[kind]))
     with pytest.raises(UserError, match="MINARI_DATASETS_PATH"):
-        storage.exists(NAME)
+        storage.has_dataset(NAME)
 
 
 def test_a_folder_of_data_sets_that_is_relative(local_demonstrations, tmp_path, monkeypatch):
@@ -277,11 +277,11 @@ def test_a_folder_of_data_sets_that_is_relative(local_demonstrations, tmp_path, 
 @pytest.mark.parametrize("name", ["leapjax/none-v0", "no such name!", "leapjax/GoToLocalS7N5"])
 def test_a_missing_data_set(saved, name):
     assert "no Minari data set" in refused(name)
-    assert storage.exists(NAME) and not storage.exists("a" * 300)
+    assert storage.has_dataset(NAME) and not storage.has_dataset("a" * 300)
 
 
 def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
-    ours, theirs = storage.dataset_id(LEVEL, 1, 0), "my/own-v0"
+    ours, theirs = storage.name_dataset(LEVEL, 1, 0), "my/own-v0"
     for name in (ours, theirs):
         (minari_folder / name / "data").mkdir(parents=True)
         assert "cannot be read" in refused(name)
@@ -589,7 +589,7 @@ MINIGRID = {
 )  # fmt: skip
 def test_observations_of_other_data_sets(local_demonstrations, spaces, change, says):
     states = local_demonstrations[0].observations._asdict()
-    known = storage.observation_space(LEVEL.blank).spaces
+    known = storage.make_observation_space(LEVEL.blank).spaces
     if spaces is MINIGRID:
         other_data_set(gym.spaces.Dict(spaces), change(states))
     else:
@@ -603,7 +603,7 @@ def test_arrays_and_continuous_actions_of_other_data_sets(local_demonstrations):
     assert "no observation 'grid'" in refused()
     states, steps = local_demonstrations[0].observations, len(local_demonstrations[0].actions)
     minari.delete_dataset(NAME)
-    space = storage.observation_space(LEVEL.blank)
+    space = storage.make_observation_space(LEVEL.blank)
     other_data_set(space, states._asdict(), box, np.zeros((steps, 4), np.float32))
     assert "action" in refused()
 
@@ -611,7 +611,7 @@ def test_arrays_and_continuous_actions_of_other_data_sets(local_demonstrations):
 def test_a_users_data_set_without_seeds(local_demonstrations):
     [demonstration] = local_demonstrations[:1]
     other_data_set(
-        storage.observation_space(LEVEL.blank), demonstration.observations._asdict(),
+        storage.make_observation_space(LEVEL.blank), demonstration.observations._asdict(),
         gym.spaces.Discrete(6), list(demonstration.actions),
     )  # fmt: skip
     expected = demonstration._replace(
@@ -625,7 +625,7 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
 
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
-    ids = [storage.dataset_id(LEVEL._replace(level=level.name), 500, 0) for level in known]
-    ids += [storage.dataset_id(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
+    ids = [storage.name_dataset(LEVEL._replace(level=level.name), 500, 0) for level in known]
+    ids += [storage.name_dataset(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
     shared = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
     assert not shared
