@@ -19,7 +19,7 @@ import pytest
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
 from experiments.tables.atari import ENCODED, played
-from leapjax.configuration import configuration_hash
+from leapjax.configuration import hash_config
 from leapjax.data import windows
 from leapjax.domains.atari import augmentation, domain, encoders, replay
 from leapjax.domains.atari.adapter import AtariAdapter
@@ -509,24 +509,24 @@ def test_the_table_has_normalised_scores():
         "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
         "configuration": {"planner": {"temperature": 0.1}},
     }  # fmt: skip
-    name = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
     # Its checkpoint played again is no other seed.
     again = dataclasses.replace(
         find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
     )
-    rows += [{**rows[0], "train_steps": 0, "hash": configuration_hash(again, 0)}]
+    rows += [{**rows[0], "train_steps": 0, "hash": hash_config(again, 0)}]
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
-    second = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
+    second = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
     assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows, {})
     # Who always takes the best action plays four games, however often.
-    name = configuration_hash(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
     table = played([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
