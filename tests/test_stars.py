@@ -243,7 +243,7 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
         assert animation.n_frames == 3 * 2  # graphs, passes
         assert animation.width == 2 * star_animation.SIDE
     rows = results.read(tmp_path / "runs" / "stars.jsonl")
-    found = [(row["train_steps"], row["iterations"], results.planner_name(row)) for row in rows]
+    found = [(row["train_steps"], row["iterations"], results.name_planner(row)) for row in rows]
     assert found == [
         (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
     ]  # fmt: skip

@@ -305,7 +305,7 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_searc
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     assert sudoku.main([*toy, "--method", "rules"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
-    found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
+    found = [(row["method"], row["iterations"], results.name_planner(row)) for row in rows]
     assert found == [
         ("leap", 16, "N = 16, confident"), ("leap", 1, "N = 1"),
         ("leap", 16, "N = 16, confident, rules 1.0"),
