@@ -524,7 +524,7 @@ WAYS = [f"--method {method}" for method in ("dt", "cql", "bc", "qr_dqn", "rem")]
 
 
 @only_long
-@pytest.mark.parametrize("options", [*WAYS, "--preset paper --run 2 --context 4"])
+@pytest.mark.parametrize("options", [*WAYS, "--preset paper --consecutive 2 --context 4"])
 def test_every_way_to_learn_trains_and_plays(
     collected, tmp_path, monkeypatch, quick_begin, options
 ):
