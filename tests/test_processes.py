@@ -86,22 +86,11 @@ def test_processes_that_cannot_be_are_refused(options, message):
 
 
 def test_alone_a_process_agrees_with_itself():
-<<<<<<< HEAD
-    assert processes.is_first()
-    assert processes.gather({"a": 1}) == [{"a": 1}]
-    assert processes.run_on_first(lambda: 3) == processes.run_together(lambda: 3) == 3
-
     def refuse():
         raise UserError("no")
 
     for ask in (processes.run_on_first, processes.run_together):
-=======
-    def refuse():
-        raise UserError("no")
-
-    for ask in (processes.first_does, processes.together):
         assert ask(lambda: 3) == 3
->>>>>>> main
         with pytest.raises(UserError, match="no"):
             ask(refuse)
 

@@ -113,7 +113,7 @@ def make_mesh(config: AnyConfig) -> Mesh:
         UserError: they cannot share the batch.
     """
     try:
-        examples = config.training.batch // config.training.run
+        examples = config.training.batch // config.training.consecutive
         return sharding.make_mesh(examples, jax.devices(), config.cluster.fsdp)
     except ValueError as error:
         raise UserError(f"--batch, --fsdp: {error}") from None
