@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import atari, planning, quality, scaling, training
+from benchmarks import atari, methods, planning, quality, scaling, training
 from benchmarks.flops import matmul_flops
 from leapjax import pretrained, sharding
 from leapjax.configuration import make_domain, specify
@@ -155,3 +155,22 @@ def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypat
     assert (row["processes"], row["devices"], row["fsdp"]) == (1, 8, 4)
     assert row["examples_per_second"] == pytest.approx(24 / row["seconds_per_step"])
     assert row["exchange_seconds"] > 0 and row["parameters"] == 64 * 64 + 3
+
+
+def test_a_row_for_each_method_and_for_each_setting(tmp_path, monkeypatch):
+    def launch(arguments, count, devices, fsdp):
+        measured = {"seconds_per_step": 0.1, "examples_per_second": 10.0, "exchange_seconds": 0.01}
+        return {"processes": count, "devices": count * devices, "fsdp": fsdp, **measured}
+
+    def rows_of(program, *options):
+        assert program.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
+        return json.loads((tmp_path / "rows.json").read_text())
+
+    calls = []
+    monkeypatch.setattr(methods, "make_call", lambda *given: lambda: calls.append(given))
+    options = "--batch 2 --rounds 2 --seconds 0 --level PickUpLoc".split()
+    assert [row["method"] for row in rows_of(methods, *options)] == list(methods.METHODS)
+    assert calls == [("PickUpLoc", method, 2) for method in methods.METHODS] * 2  # they take turns
+    monkeypatch.setattr(scaling, "launch", launch)
+    found = [(row["processes"], row["devices"], row["fsdp"]) for row in rows_of(scaling)]
+    assert found == [(count, count * each, fsdp) for count, each, fsdp in scaling.SETTINGS]

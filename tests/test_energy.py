@@ -1,4 +1,5 @@
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,6 @@ from tests.enumerable import (
     enumerable_energy,
     fit_p_value,
     joint_probabilities,
-    no_tilt,
     random_table,
 )
 from tests.quick import quick_jit
@@ -33,7 +33,11 @@ HORIZON, ACTIONS = 3, 3
 MASK = mask_token(ACTIONS)
 EVERYWHERE = np.arange(HORIZON)
 PLANS = all_plans(HORIZON, ACTIONS)
-NO_TILT = no_tilt(HORIZON, ACTIONS)
+assert_close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+assert_equal = np.testing.assert_array_equal
+NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
+ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
+TABLE, OTHER_TABLE = random_table(0, HORIZON, ACTIONS), random_table(1, HORIZON, ACTIONS)
 
 
 @functools.cache
@@ -54,24 +58,19 @@ def evaluator(energy):
     return evaluate
 
 
-def evaluate(energy, params, context, plans):
+class Said(NamedTuple):
+    """What an energy says of many plans."""
+
+    conditional: np.ndarray  # [plans, T, A]: of every action, one position at a time
+    total: np.ndarray
+    violation: np.ndarray
+
+
+def ask(energy, params=TABLE, context=NO_TILT, plans=PLANS):
     # One shape for all, so that an energy is compiled once: the rest repeats the first plan.
     rows = np.resize(plans, (len(PLANS), HORIZON)).astype(np.int32)
     results = evaluator(energy)(params, context, rows)
-    return [np.array(result)[: len(plans)] for result in results]
-
-
-def conditionals(energy, params, context, plans=PLANS):
-    """The energies `[plans, T, A]` of every action, one position at a time."""
-    return evaluate(energy, params, context, plans)[0]
-
-
-def totals(energy, params, context, plans=PLANS):
-    return evaluate(energy, params, context, plans)[1]
-
-
-def violations(energy, params, context, plans=PLANS):
-    return evaluate(energy, params, context, plans)[2]
+    return Said(*(np.array(result)[: len(plans)] for result in results))
 
 
 def probabilities(energies):
@@ -86,27 +85,18 @@ def exact_conditionals(joint, plans=PLANS):
     )
 
 
-ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
-TABLE, OTHER_TABLE = random_table(0, HORIZON, ACTIONS), random_table(1, HORIZON, ACTIONS)
-
-
 # The helper that the other tests take for the truth.
 
 
 def test_enumerable_energy_is_the_joint():
     tilt = np.random.default_rng(5).normal(size=(HORIZON, ACTIONS)).astype(np.float32)
     joint = joint_probabilities(TABLE, tilt)
-    np.testing.assert_allclose(
-        totals(ENUMERABLE, TABLE, tilt), -np.log(joint.reshape(-1)), rtol=1e-5, atol=1e-5
-    )
+    assert_close(ask(ENUMERABLE, context=tilt).total, -np.log(joint.reshape(-1)))
     masked = np.array([[MASK, MASK, MASK], [2, MASK, 0], [MASK, 1, MASK], [0, 2, MASK]], np.int32)
-    plans = np.concatenate([PLANS[::5], masked])
-    np.testing.assert_allclose(
-        probabilities(conditionals(ENUMERABLE, TABLE, tilt, plans)),
-        exact_conditionals(joint, plans),
-        atol=1e-5,
-    )
-    assert np.isposinf(totals(ENUMERABLE, TABLE, tilt, masked)).all()
+    plans = np.concatenate([masked, PLANS[::5]])
+    found = ask(ENUMERABLE, context=tilt, plans=plans)
+    assert_close(probabilities(found.conditional), exact_conditionals(joint, plans))
+    assert np.isposinf(found.total[:4]).all()
 
 
 # The pseudo-likelihood of a masked language model.
@@ -135,7 +125,7 @@ def test_pseudo_likelihood_total_is_a_loop_over_positions():
     for row, t in np.ndindex(len(PLANS), HORIZON):
         masked = np.where(t == EVERYWHERE, MASK, PLANS[row])
         expected[row] -= pairwise_log_likelihood(masked, t)[PLANS[row, t]]
-    np.testing.assert_allclose(totals(PAIRWISE, VOTES, BIAS), expected, rtol=1e-5)
+    assert_close(ask(PAIRWISE, VOTES, BIAS).total, expected)
 
 
 def test_an_autoregressive_energy_is_that_of_the_joint():
@@ -150,21 +140,21 @@ def test_an_autoregressive_energy_is_that_of_the_joint():
 
     energy = autoregressive(ENUMERABLE.encode, logits, ACTIONS)
     joint = joint_probabilities(TABLE)
-    found, sums, _ = evaluate(energy, TABLE, NO_TILT, PLANS)
-    np.testing.assert_allclose(sums, -np.log(joint.reshape(-1)), rtol=1e-4)
+    found, sums, _ = ask(energy)
+    assert_close(sums, -np.log(joint.reshape(-1)))
     for plan, energies in zip(PLANS, found, strict=True):
         before = [np.where(t > EVERYWHERE, plan, MASK) for t in range(HORIZON)]
         expected = [-np.log(conditional_by_counting(joint, before[t], t)) for t in range(HORIZON)]
         np.testing.assert_allclose(energies, expected, rtol=1e-3, atol=1e-4)
-    assert np.isposinf(totals(energy, TABLE, NO_TILT, np.array([[0, 1, MASK]]))).all()
+    assert np.isposinf(ask(energy, plans=np.array([[0, 1, MASK]])).total).all()
 
 
 @pytest.mark.parametrize("energy", [PAIRWISE, from_total(PAIRWISE.encode, PAIRWISE.total, ACTIONS)])
 def test_incomplete_plan_has_infinite_total(energy):
     incomplete = [[t if s != t else token for s in range(3)] for t in range(3) for token in (3, 4)]
     incomplete += [[MASK] * 3, [pad_token(ACTIONS)] * 3, [0, -1, 0]]
-    assert np.isposinf(totals(energy, VOTES, BIAS, np.array(incomplete, np.int32))).all()
-    assert np.isfinite(totals(energy, VOTES, BIAS)).all()
+    assert np.isposinf(ask(energy, VOTES, BIAS, plans=np.array(incomplete, np.int32)).total).all()
+    assert np.isfinite(ask(energy, VOTES, BIAS).total).all()
 
 
 def test_forbidden_action_is_infinite_and_not_nan():
@@ -172,16 +162,11 @@ def test_forbidden_action_is_infinite_and_not_nan():
         forbidden = (positions[:, None] == 1) & (jnp.arange(ACTIONS) == 2)
         return jnp.where(forbidden, -jnp.inf, pairwise_logits(params, memory, tokens, positions))
 
-    energy = pseudo_likelihood(PAIRWISE.encode, logits, ACTIONS)
-    forbidden = PLANS[:, 1] == 2
-    actual = totals(energy, VOTES, BIAS)
-    assert np.isposinf(actual[forbidden]).all()
-    assert np.isfinite(actual[~forbidden]).all()
-    table = conditionals(energy, VOTES, BIAS)
-    assert np.isposinf(table[:, 1, 2]).all()
-    assert np.isfinite(np.delete(table.reshape(-1, 9), 5, axis=1)).all()
+    found = ask(pseudo_likelihood(PAIRWISE.encode, logits, ACTIONS), VOTES, BIAS)
+    assert_equal(np.isposinf(found.total), PLANS[:, 1] == 2)
+    assert np.isposinf(found.conditional[:, 1, 2]).all()
     # What is left is still a distribution.
-    np.testing.assert_allclose(np.exp(-table).sum(-1), 1, rtol=1e-5)
+    assert_close(np.exp(-found.conditional).sum(-1), np.ones(PLANS.shape))
 
 
 # An energy from its total alone.
@@ -190,7 +175,7 @@ def test_forbidden_action_is_infinite_and_not_nan():
 def test_totals_may_be_counts():
     energy = from_total(lambda p, c: None, lambda p, m, actions: jnp.sum(actions == 1), ACTIONS)
     assert energy.total(None, None, np.array([1, 0, 1])).dtype == jnp.float32
-    np.testing.assert_array_equal(
+    assert_equal(
         energy.conditional(None, None, np.array([1, 0, 1]), np.array([1, 2])),
         [[2, 3, 2], [1, 2, 1]],
     )
@@ -202,19 +187,11 @@ def test_totals_may_be_counts():
 @pytest.mark.parametrize("weights", [None, (0.5, 2.0)])
 def test_composition_is_the_weighted_product_of_the_joints(weights):
     first, second = weights or (1.0, 1.0)
-    composed = compose([ENUMERABLE, ENUMERABLE], weights)
-    params, context = (TABLE, OTHER_TABLE), NO_TILT
-    logs = [np.log(joint_probabilities(table)) for table in params]
-    summed = first * logs[0] + second * logs[1]
-    np.testing.assert_allclose(
-        totals(composed, params, context), -summed.reshape(-1), rtol=1e-5, atol=1e-4
-    )
-    product = np.exp(summed) / np.exp(summed).sum()
-    np.testing.assert_allclose(
-        probabilities(conditionals(composed, params, context)),
-        exact_conditionals(product),
-        atol=1e-5,
-    )
+    found = ask(compose([ENUMERABLE, ENUMERABLE], weights), (TABLE, OTHER_TABLE))
+    logs = [np.log(joint_probabilities(table)) for table in (TABLE, OTHER_TABLE)]
+    product = np.exp(first * logs[0] + second * logs[1])
+    assert_close(found.total, -np.log(product.reshape(-1)))
+    assert_close(probabilities(found.conditional), exact_conditionals(product / product.sum()))
 
 
 ZERO = Energy(
@@ -239,17 +216,12 @@ INFINITE = Energy(
 )
 def test_composing_with_nothing_changes_nothing(other, weights):
     composed = compose([ENUMERABLE, other], weights)
-    params = (TABLE, OTHER_TABLE)
-    np.testing.assert_array_equal(
-        conditionals(composed, params, NO_TILT), conditionals(ENUMERABLE, TABLE, NO_TILT)
-    )
-    np.testing.assert_array_equal(
-        totals(composed, params, NO_TILT), totals(ENUMERABLE, TABLE, NO_TILT)
-    )
+    found, expected = ask(composed, (TABLE, OTHER_TABLE)), ask(ENUMERABLE)
+    assert_equal(found.conditional, expected.conditional)
+    assert_equal(found.total, expected.total)
     # A constraint counts, whatever the weight of the energy that has it.
-    assert (violations(composed, params, NO_TILT) == (other is INFINITE)).all()
-    assert composed.accepts_mask and composed.num_actions == ACTIONS
-    assert not compose([ENUMERABLE, INFINITE]).accepts_mask
+    assert (found.violation == (other is INFINITE)).all()
+    assert composed.accepts_mask and not compose([ENUMERABLE, INFINITE]).accepts_mask
 
 
 FORBIDDING = constrain(ENUMERABLE, lambda context, actions: 1.0 * (actions[0] == 1))
@@ -304,28 +276,20 @@ def test_constraint_adds_the_penalty_of_the_changed_plan(price):
     # Where every action is forbidden another position has to change, so none is preferred.
     hopeless = np.isinf(added).all(-1, keepdims=True)
     assert hopeless.any() == np.isinf(price)
-    added = np.where(hopeless, 0, added)
-    np.testing.assert_allclose(
-        conditionals(CONSTRAINED, TABLE, context),
-        conditionals(ENUMERABLE, TABLE, NO_TILT) + added,
-        rtol=1e-5,
-        atol=1e-5,
-    )
+    found, free = ask(CONSTRAINED, context=context), ask(ENUMERABLE)
+    assert_close(found.conditional, free.conditional + np.where(hopeless, 0, added))
     penalties = np.array([repeats_of(p) * price if repeats_of(p) else 0 for p in PLANS])
-    np.testing.assert_allclose(
-        totals(CONSTRAINED, TABLE, context), totals(ENUMERABLE, TABLE, NO_TILT) + penalties,
-        rtol=1e-5,
-    )  # fmt: skip
-    np.testing.assert_array_equal(violations(CONSTRAINED, TABLE, context) > 0, penalties > 0)
+    assert_close(found.total, free.total + penalties)
+    assert_equal(found.violation > 0, penalties > 0)
 
 
 def test_constraint_waits_for_a_complete_plan():
     context = {"tilt": NO_TILT, "price": np.float32(np.inf)}
     plans = np.array([[MASK, MASK, MASK], [0, 1, MASK], [0, MASK, MASK]], np.int32)
-    constrained = conditionals(CONSTRAINED, TABLE, context, plans)
-    expected = conditionals(ENUMERABLE, TABLE, NO_TILT, plans)
+    constrained = ask(CONSTRAINED, context=context, plans=plans).conditional
+    expected = ask(ENUMERABLE, plans=plans).conditional
     expected[1, 2, 1] = np.inf  # only there is a position that completes a plan
-    np.testing.assert_array_equal(constrained, expected)
+    assert_equal(constrained, expected)
 
 
 def test_a_partial_penalty_judges_what_is_certain_already():
@@ -336,46 +300,35 @@ def test_a_partial_penalty_judges_what_is_certain_already():
         constrain(ENUMERABLE, starts_with_zero, partial=partial) for partial in (False, True)
     )
     blank = np.full((1, HORIZON), MASK, np.int32)
-    free = conditionals(ENUMERABLE, TABLE, NO_TILT, blank)
-    np.testing.assert_array_equal(conditionals(waits, TABLE, NO_TILT, blank), free)
-    found = conditionals(judges, TABLE, NO_TILT, blank)[0, 0]
+    free = ask(ENUMERABLE, plans=blank).conditional
+    assert_equal(ask(waits, plans=blank).conditional, free)
+    found = ask(judges, plans=blank).conditional[0, 0]
     np.testing.assert_allclose(found - free[0, 0], [50, 0, 0], rtol=1e-4)
-    np.testing.assert_array_equal(
-        conditionals(judges, TABLE, NO_TILT), conditionals(waits, TABLE, NO_TILT)
-    )
+    assert_equal(ask(judges).conditional, ask(waits).conditional)
 
 
 def test_a_neutral_action_is_as_good_as_the_best_of_the_others_and_mask_to_the_rest():
-    energy = neutral(ENUMERABLE, [2])
-    for plan in PLANS:
-        seen = np.where(plan == 2, MASK, plan)[None]
-        expected = conditionals(ENUMERABLE, TABLE, NO_TILT, seen.astype(np.int32))[0].copy()
-        expected[:, 2] = expected[:, :2].min(axis=1)
-        found = conditionals(energy, TABLE, NO_TILT, plan[None])[0]
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
-        total = totals(energy, TABLE, NO_TILT, plan[None])[0]
-        np.testing.assert_allclose(total, expected[np.arange(HORIZON), plan].sum(), rtol=1e-5)
+    expected = ask(ENUMERABLE, plans=np.where(PLANS == 2, MASK, PLANS)).conditional
+    expected[..., 2] = expected[..., :2].min(axis=-1)
+    found = ask(neutral(ENUMERABLE, [2]))
+    assert_close(found.conditional, expected)
+    assert_close(found.total, np.take_along_axis(expected, PLANS[..., None], -1).sum((1, 2)))
 
 
 def test_a_reward_excuses_no_other_violation():
+    first = PLANS[:, 0] == 2
     rewarded = constrain(CONSTRAINED, lambda context, actions: -5.0 * (actions[0] == 2))
     context = {"tilt": NO_TILT, "price": np.float32(1.0)}
-    found = violations(rewarded, TABLE, context)
-    np.testing.assert_allclose(found, violations(CONSTRAINED, TABLE, context))
-    assert (found[PLANS[:, 0] == 2] > 0).any()
-    np.testing.assert_allclose(
-        totals(rewarded, TABLE, context),
-        totals(CONSTRAINED, TABLE, context) - 5 * (PLANS[:, 0] == 2),
-        rtol=1e-5,
-    )
+    found, without = (ask(energy, context=context) for energy in (rewarded, CONSTRAINED))
+    assert_equal(found.violation, without.violation)
+    assert (found.violation[first] > 0).any()
+    assert_close(found.total, without.total - 5 * first)
 
 
 def test_view_hides_the_rest_of_the_context():
     context = {"tilt": random_table(8, 2, ACTIONS), "more": np.float32(1)}
-    energy = view(ENUMERABLE, lambda context: context["tilt"])
-    np.testing.assert_array_equal(
-        totals(energy, TABLE, context), totals(ENUMERABLE, TABLE, context["tilt"])
-    )
+    seen = ask(view(ENUMERABLE, lambda context: context["tilt"]), context=context)
+    assert_equal(seen.total, ask(ENUMERABLE, context=context["tilt"]).total)
 
 
 # Methods that choose one action at a time.
@@ -403,10 +356,8 @@ def test_one_action_at_temperature_one_is_a_sample_of_the_policy():
 
 def test_the_total_of_one_action_is_its_score():
     memory = SINGLE.encode(SCORES, np.float32(0))
-    for action in range(CHOICES + 1):
-        expected = -SCORES[action] if action < CHOICES else np.inf
-        assert SINGLE.total(SCORES, memory, jnp.array([action])) == expected
-    assert SINGLE.total(SCORES, memory, jnp.array([mask_token(CHOICES + 1)])) == np.inf
+    found = [SINGLE.total(SCORES, memory, jnp.array([action])) for action in range(CHOICES + 2)]
+    assert_equal(found, [*-SCORES, np.inf, np.inf])  # the end action and MASK
 
 
 # What is refused where values can be seen.
@@ -427,7 +378,7 @@ def test_a_constraint_that_leaves_only_what_the_model_forbids_says_nothing():
     asked = constrain(free, lambda context, plan: jnp.where(plan[0] == 1, 0.0, jnp.inf))
     start, first = jnp.zeros(HORIZON, jnp.int32), jnp.array([0])
     found = asked.conditional(None, (None, None), start, first)
-    np.testing.assert_array_equal(found, free.conditional(None, None, start, first))
+    assert_equal(found, free.conditional(None, None, start, first))
     assert asked.violation(None, (None, None), start) > 0
 
 
@@ -458,26 +409,21 @@ def total_of(total):
 WRONG = [
     *(
         (lambda w=weight: compose([ENUMERABLE, ENUMERABLE], [1.0, w]), "weights must be")
-        for weight in (-1.0, float("nan"), 1e39, "1")
+        for weight in (-1.0, float("nan"))
     ),
     (lambda: compose([ENUMERABLE, ENUMERABLE], [1.0]), "2 energies need as many weights"),
     (lambda: compose([], []), "at least one energy"),
     (lambda: compose([FREE, enumerable_energy(3, 4)]), r"one action set, got sizes \[3, 4\]"),
     (lambda: compose(FREE), "a sequence of energies, got one energy"),
     (lambda: compose([FREE, None]), "expected Energy, got"),
-    (lambda: constrain(FREE.total, lambda c, a: 0), "expected Energy, got"),
     (lambda: compose([FREE, FREE]).encode((None,), None), "params of 2 composed energies"),
-    (lambda: compose([FREE, FREE]).encode({"a": 1, "b": 2}, None), "params of 2 composed energies"),
     (lambda: neutral(TABLED, [0]), "accepts MASK"),
-    (lambda: neutral(ENUMERABLE, []), "expected some of 3 actions"),
     (lambda: neutral(ENUMERABLE, [0, 1, 2]), "expected some of 3 actions"),
     (lambda: neutral(ENUMERABLE, [3]), "neutral actions must be at most 2"),
     (lambda: total_of(jnp.zeros(3)), r"must be one number, got shape \(3,\)"),
     (lambda: total_of(jnp.float32(jnp.nan)), "energy of the plan is NaN"),
     (lambda: without_distribution([np.nan, 0, 0]), r"energies at positions \[1\] are NaN"),
-    (lambda: without_distribution([-np.inf] * 3), r"energies at positions \[1\] are NaN"),
     (lambda: conditional_of(scoring(np.zeros((3, 2)))), r"logits must be of shape \(2, 3\)"),
-    (lambda: violation_of(np.ones(HORIZON)), "a penalty must be"),
     (lambda: violation_of(None), "a penalty must be"),
     (lambda: conditional_of(FREE, positions=[-1]), r"positions .* are not all in 0 \.\. 2"),
     (lambda: conditional_of(TABLED, positions=[0, 3]), r"positions .* are not all in 0 \.\. 2"),
@@ -556,4 +502,4 @@ def test_scores_of_any_real_type_are_the_numbers_that_they_say(kind):
     scores = jnp.array([1, 0], kind)  # an unsigned -1 would be 2^32 - 1
     energy = single_action(lambda params, context: (), lambda p, m: scores, 3)
     energies = energy.conditional(None, (), jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32))
-    np.testing.assert_array_equal(energies, [[-1, 0, np.inf]])
+    assert_equal(energies, [[-1, 0, np.inf]])

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from leapjax.batching import NotANumber, check_fit, compile_planner, plan_keys, split_batch
 from leapjax.energy import compose, constrain, from_total, view
@@ -27,21 +25,21 @@ from tests.enumerable import (
     enumerable_energy,
     fit_p_value,
     joint_probabilities,
-    no_tilt,
     plan_counts,
     random_table,
-    total_variation,
 )
 from tests.quick import quick_jit
 
 HORIZON, ACTIONS = 3, 3
 PLANS = all_plans(HORIZON, ACTIONS)
-NO_TILT = no_tilt(HORIZON, ACTIONS)
+NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
 ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
 FROM_TOTAL = from_total(ENUMERABLE.encode, ENUMERABLE.total, ACTIONS)
 TABLE = random_table(0, HORIZON, ACTIONS)
 JOINT = joint_probabilities(TABLE)
 CHAINS = 5000
+assert_equal = np.testing.assert_array_equal
+assert_close = functools.partial(np.testing.assert_allclose, rtol=1e-4)
 REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: a sampler that is wrong, one that may be right
 
 
@@ -84,15 +82,18 @@ def _blind_to_other_actions(params, memory, actions, positions):
     return ENUMERABLE.conditional(params, memory, masked, positions)
 
 
+def likelier(pairs, joint=JOINT):
+    """The distribution of the likelier plan of two that are drawn as such a pair `[A^T, A^T]`."""
+    p, rows = joint.reshape(-1), np.arange(len(PLANS))
+    found = np.where(p[:, None] >= p, rows[:, None], rows)
+    return np.bincount(found.reshape(-1), pairs.reshape(-1), len(rows))
+
+
 def best_of(probabilities, count):
     """The distribution of the plan of least energy among independent draws."""
-    probabilities, energies = np.ravel(probabilities), -np.log(JOINT.reshape(-1))
-    order = np.argsort(energies)
-    # At least this energy: all draws at least this, less all draws at least the next.
-    tail = np.append(np.cumsum(probabilities[order][::-1])[::-1], 0.0)
-    result = np.zeros(len(order))
-    result[order] = tail[:-1] ** count - tail[1:] ** count
-    return result
+    if count == 1:
+        return np.ravel(probabilities)
+    return likelier(np.outer(best_of(probabilities, count - 1), probabilities))
 
 
 def best_child(parents, beginnings):
@@ -102,18 +103,12 @@ def best_child(parents, beginnings):
         parents: `[A^T]` probabilities.
         beginnings: how many actions a plan can begin with; with one alone, it is kept.
     """
-    exact = np.zeros(len(PLANS))
-    for plan, probability in zip(PLANS, parents, strict=True):
-        for t in range(HORIZON):
-            possible = range(ACTIONS if t else beginnings)
-            others = [action for action in possible if action != plan[t]] or [plan[t]]
-            for action in others:
-                child = np.where(np.arange(HORIZON) == t, action, plan)
-                row = np.ravel_multi_index(
-                    max(plan, child, key=lambda p: JOINT[tuple(p)]), (3,) * 3
-                )
-                exact[row] += probability / HORIZON / len(others)
-    return exact
+    differ, pairs = PLANS[:, None] != PLANS, 0
+    for t in range(HORIZON):
+        others = differ[..., t] & (differ.sum(-1) == 1) & (PLANS[:, 0] < beginnings)
+        others |= ~others.any(1, keepdims=True) & np.eye(len(PLANS), dtype=bool)
+        pairs += parents[:, None] * others / others.sum(1, keepdims=True) / HORIZON
+    return likelier(pairs)
 
 
 def action_by_action(temperature):
@@ -127,21 +122,11 @@ def action_by_action(temperature):
     return exact
 
 
-def better_of_two(joint, replaced):
-    """The better of two plans: {a, b} has probability p_a p_b / (1 - p_a) and the reverse.
-
-    Args:
-        joint: `[A] * T`.
-        replaced: whether the second may be the first again.
-    """
+def two_beams(joint, replaced):
+    """The better of two plans, of which the second may be the first again if it is replaced."""
     p = joint.reshape(-1)
-    pairs = np.outer(p, p)
-    if not replaced:
-        pairs = pairs / (1 - p)[:, None]
-        np.fill_diagonal(pairs, 0)
-    rank = np.argsort(np.argsort(-p))
-    better = np.where(rank[:, None] < rank, np.arange(len(p))[:, None], np.arange(len(p)))
-    return np.bincount(better.reshape(-1), pairs.reshape(-1), len(p))
+    pairs = np.outer(p, p) if replaced else np.outer(p / (1 - p), p) * (1 - np.eye(len(p)))
+    return likelier(pairs, joint)
 
 
 class Sampler(NamedTuple):
@@ -163,7 +148,7 @@ GUARDED = from_total(ENUMERABLE.encode, _guarded_total, ACTIONS)
 PRODUCT = WEIGHTS[0] * TABLE.astype(np.float64) + WEIGHTS[1] * OTHER_TABLE
 COLD_JOINT = joint_probabilities(2 * TABLE.astype(np.float64))
 COMPOSED = compose([ENUMERABLE, ENUMERABLE], WEIGHTS)
-STEEP_BEAMS = [better_of_two(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
+STEEP_BEAMS = [two_beams(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
 BRED = CrossEntropyConfig(HORIZON, 2, candidates=2, elites=1)
 BEGIN_ALIKE = best_of((PLANS[:, 0] == 0) / 9, 2)
 SAMPLERS = {
@@ -206,7 +191,6 @@ def test_plans_are_drawn_from_the_exact_distribution(name):
     config, exact, wrong, energy, params, context = SAMPLERS[name]
     counts = plan_counts(plans_of(energy, config, params, context).actions, ACTIONS)
     assert fit_p_value(counts, exact) > ACCEPTED
-    assert total_variation(counts, exact) < 0.04
     assert fit_p_value(counts, wrong) < REJECTED
 
 
@@ -222,7 +206,6 @@ def test_plans_are_drawn_from_the_exact_distribution(name):
 def test_a_broken_sampler_does_not_pass_for_the_joint(energy, config):
     counts = plan_counts(plans_of(energy, config).actions, ACTIONS)
     assert fit_p_value(counts, JOINT) < REJECTED
-    assert total_variation(counts, JOINT) > 0.06
 
 
 def greedy_traces(config):
@@ -346,14 +329,14 @@ def test_a_plan_is_the_end_of_its_trace_with_its_exact_energy_and_a_function_of_
     plan = plans_of(ENUMERABLE, config, chains=50)
     assert plan.trace.shape == (50, getattr(config, "iterations", 1), HORIZON)
     assert plan.actions.dtype == plan.trace.dtype == np.int32
-    np.testing.assert_array_equal(plan.trace[:, -1], plan.actions)
-    np.testing.assert_allclose(plan.energy, joint_energies(plan.actions), rtol=1e-4)
+    assert_equal(plan.trace[:, -1], plan.actions)
+    assert_close(plan.energy, joint_energies(plan.actions))
     assert plan.satisfied.all() and plan.valid.all()
     assert (plan.trace_energies is None) == (config is not SCORED)
     if config is SCORED:
-        np.testing.assert_array_equal(plan.trace_energies[:, -1], plan.energy)
+        assert_equal(plan.trace_energies[:, -1], plan.energy)
         assert np.isposinf(plan.trace_energies[:, :-1]).all()  # what is not complete has none yet
-    jax.tree.map(np.testing.assert_array_equal, plan, plans_of(ENUMERABLE, config, chains=50))
+    jax.tree.map(assert_equal, plan, plans_of(ENUMERABLE, config, chains=50))
     other = plans_of(ENUMERABLE, config, chains=50, seed=1)
     assert (plan.actions != other.actions).any(-1).mean() > 0.2
     unscored = jax.eval_shape(
@@ -383,10 +366,10 @@ def test_cross_entropy_keeps_the_elites_and_breeds_from_each():
     elites = first[np.argsort(energies[:12])[:3]]
     distances = (second[:, None] != elites[None]).sum(-1)  # [candidates, elites]
     assert sorted(distances.min(1)) == [0] * 3 + [1] * 9
-    np.testing.assert_array_equal((distances == 0).sum(0), [1, 1, 1])
-    np.testing.assert_array_equal((distances == 1).sum(0), [3, 3, 3])
-    np.testing.assert_array_equal(plan.trace[0], elites[0])
-    np.testing.assert_array_equal(plan.actions, scored[energies.argmin()])
+    assert_equal((distances == 0).sum(0), [1, 1, 1])
+    assert_equal((distances == 1).sum(0), [3, 3, 3])
+    assert_equal(plan.trace[0], elites[0])
+    assert_equal(plan.actions, scored[energies.argmin()])
 
 
 # Beam search.
@@ -415,7 +398,7 @@ def test_beam_search_against_a_slow_one(width, temperature):
         joint = joint_probabilities(table)
         config = BeamConfig(HORIZON, width, temperature)
         [trace] = plans_of(ENUMERABLE, config, table, chains=1).trace
-        np.testing.assert_array_equal(trace, slow_beam_search(joint, width))
+        assert_equal(trace, slow_beam_search(joint, width))
         found.append((trace[-1] == PLANS[joint.argmax()]).all())
     assert all(found) == (width > 1)
 
@@ -433,7 +416,7 @@ def test_beam_search_keeps_no_plan_that_is_forbidden_while_another_is_allowed(pa
     config = BeamConfig(HORIZON, 40, temperature, score=True)
     plan = plans_of(safe, config, np.zeros_like(TABLE), tilt, chains=100)
     assert (plan.actions[:, 0] == 2).all() and plan.satisfied.all() and plan.valid.all()
-    np.testing.assert_array_equal(plan.actions, plan.trace[:, -1])
+    assert_equal(plan.actions, plan.trace[:, -1])
     assert np.isfinite(plan.energy).all()
 
 
@@ -449,8 +432,7 @@ CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), price
 
 def prices(*forbidden, price=np.inf):
     result = np.zeros((HORIZON, ACTIONS), np.float32)
-    for position, action in forbidden:
-        result[position, action] = price
+    result[tuple(np.transpose(forbidden))] = price
     return result
 
 
@@ -458,27 +440,27 @@ def price_of(plans, price):
     return price[np.arange(HORIZON), plans].sum(-1)
 
 
-CONSTRAINED_CONFIGS = {
-    "gibbs": GibbsConfig(HORIZON, iterations=3, temperature=1.0, score=True, score_trace=True),
-    "restarts": GibbsConfig(HORIZON, iterations=3, restarts=2, temperature=0.3, score=True),
-    "shooting": ShootingConfig(HORIZON, candidates=2, score=True),
-    "cross entropy": CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
-}
-
-
-@pytest.mark.parametrize("config", CONSTRAINED_CONFIGS.values(), ids=CONSTRAINED_CONFIGS)
+@pytest.mark.parametrize(
+    "config",
+    [
+        GibbsConfig(HORIZON, iterations=3, temperature=1.0, score=True, score_trace=True),
+        GibbsConfig(HORIZON, iterations=3, restarts=2, temperature=0.3, score=True),
+        ShootingConfig(HORIZON, candidates=2, score=True),
+        CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
+    ],
+)
 def test_a_plan_that_breaks_a_constraint_is_never_called_satisfied(config):
     some = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 0), (2, 2)]
     for price in (prices(*some, price=0.5), prices(*some), np.full_like(NO_TILT, np.inf)):
         plan = plans_of(CONSTRAINED, config, context={"tilt": NO_TILT, "price": price}, chains=300)
         penalties = price_of(plan.actions, price)
-        np.testing.assert_array_equal(plan.satisfied, penalties == 0)
+        assert_equal(plan.satisfied, penalties == 0)
         assert penalties.any() and (penalties > 0).all() == (price > 0).all()
         # No NaN either, and an infinite price makes an infinite energy.
-        np.testing.assert_allclose(plan.energy, joint_energies(plan.actions) + penalties, rtol=1e-4)
+        assert_close(plan.energy, joint_energies(plan.actions) + penalties)
         if plan.trace_energies is not None:
             expected = joint_energies(plan.trace) + price_of(plan.trace, price)
-            np.testing.assert_allclose(plan.trace_energies, expected, rtol=1e-4)
+            assert_close(plan.trace_energies, expected)
 
 
 def test_constrained_gibbs_samples_the_joint_given_the_constraint():
@@ -536,34 +518,30 @@ def one_by_one(config):
 @EACH_PLANNER
 def test_a_batch_is_a_loop_over_its_contexts_on_any_number_of_devices(config):
     keys, contexts = batch_of(20)
-    for batch, devices in [(1, None), (2, None), (7, None), (9, None), (20, None), (20, 2)]:
-        if devices and config is not GIBBS:
-            continue
-        planner = batched(config, devices)
+    for batch, devices in [(1, None), (2, None), (7, None), (9, None), (20, 2)]:
+        planner = batched(config, devices if config is GIBBS else None)
         plan = planner(TABLE, keys[:batch], {"tilt": contexts["tilt"][:batch]})
+        expected = jax.tree.map(lambda x, n=batch: x[:n], one_by_one(config))
         for name in ("actions", "trace", "satisfied"):
-            expected = getattr(one_by_one(config), name)[:batch]
-            np.testing.assert_array_equal(getattr(plan, name), expected)
-        np.testing.assert_allclose(plan.energy, one_by_one(config).energy[:batch], rtol=1e-5)
+            assert_equal(getattr(plan, name), getattr(expected, name))
+        assert_close(plan.energy, expected.energy)
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 500), st.sets(st.integers(1, 70), min_size=1, max_size=4))
-def test_chunks_cover_every_row_exactly_once(batch, sizes):
-    chunks = split_batch(batch, sorted(sizes))
-    covered = [row for start, _, used in chunks for row in range(start, start + used)]
-    assert covered == list(range(batch))
-    assert all(size in sizes for _, size, _ in chunks)
-
-
-def test_a_chunk_is_not_padded_to_several_times_what_is_left():
-    for batch, sizes, chunks in [
-        (40, (16, 128), [16, 16, 16]),
-        (4, (1, 16), [1, 1, 1, 1]),
-        (5, (1, 16), [16]),
-        (110, (32, 128), [128]),
-    ]:
-        assert [size for _, size, _ in split_batch(batch, sizes)] == chunks
+@pytest.mark.parametrize(
+    ("batch", "sizes", "chunks"),
+    [
+        (40, [16, 128], [16, 16, 16]),
+        (4, [1, 16], [1, 1, 1, 1]),
+        (5, [1, 16], [16]),
+        (300, [32, 128], [128, 128, 32, 32]),
+        (110, [32, 128], [128]),
+    ],
+)
+def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunks):
+    found = split_batch(batch, sizes)
+    assert [size for _, size, _ in found] == chunks
+    rows = [row for start, _, used in found for row in range(start, start + used)]
+    assert rows == list(range(batch))
 
 
 def test_after_compiling_ahead_nothing_is_traced():
@@ -587,69 +565,68 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
     episodes, replans = np.array([3, 0, 3, 1]), np.array([0, 2, 1, 2])
     data = np.asarray(jax.random.key_data(plan_keys(7, episodes, replans)))
     shuffled = jax.random.key_data(plan_keys(7, episodes[::-1], replans[::-1]))
-    np.testing.assert_array_equal(shuffled, data[::-1])
-    np.testing.assert_array_equal(plan_keys(7, episodes[1:2], replans[1:2]), data[1:2])
+    assert_equal(shuffled, data[::-1])
+    assert_equal(plan_keys(7, episodes[1:2], replans[1:2]), data[1:2])
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2)
     keys = [jax.random.key_data(plan_keys(seed, grid[:, 0], grid[:, 1])) for seed in (0, 1)]
     assert len(np.unique(np.concatenate(keys), axis=0)) == 2 * len(grid)
     with jax.default_prng_impl("rbg"):
-        np.testing.assert_array_equal(plan_keys(7, episodes, replans), data)
+        assert_equal(plan_keys(7, episodes, replans), data)
 
 
 def test_parameters_are_placed_again_where_they_or_their_place_in_the_tree_change():
     keys, contexts = batch_of(8)
     first, second = jnp.asarray(TABLE), jnp.asarray(OTHER_TABLE)
-    expected = [
-        np.asarray(batched(GIBBS)(table, keys, contexts).actions) for table in (first, second)
-    ]
-    assert (expected[0] != expected[1]).any()
-    either = compile_planner(
-        TILTED._replace(
-            encode=lambda p, c: TILTED.encode(p["a"] if p["b"] is None else second, c)
-        ),
-        GIBBS, (8,),
-    )  # fmt: skip
-    for params, plan in [
-        ({"a": first, "b": None}, 0), ({"a": first, "b": None}, 0), ({"a": second, "b": None}, 1),
-        ({"a": first, "b": None}, 0), ({"a": None, "b": first}, 1),
-    ]:  # fmt: skip
-        np.testing.assert_array_equal(either(params, keys, contexts).actions, expected[plan])
+    planner = compile_planner(
+        TILTED._replace(encode=lambda p, c: TILTED.encode(p[0] if p[1] is None else -p[1], c)),
+        GIBBS,
+        (8,),
+    )
+
+    def check(params, table):
+        expected = batched(GIBBS)(table, keys, contexts)
+        assert_equal(planner(params, keys, contexts).actions, expected.actions)
+
+    for table in (first, first, second, first):
+        check((table, None), table)
+    check((None, first), -first)
     # An array of NumPy that its owner writes to is not remembered.
-    table = np.array(first)
-    np.testing.assert_array_equal(batched(GIBBS)(table, keys, contexts).actions, expected[0])
-    table[...] = second
-    np.testing.assert_array_equal(batched(GIBBS)(table, keys, contexts).actions, expected[1])
+    written = np.array(first)
+    check((written, None), first)
+    written[...] = second
+    check((written, None), second)
 
 
 # Energies that are no numbers. Parameters: a table, and what stands where an energy should be.
 
-UNDEFINED_TOTAL = ENUMERABLE._replace(
-    encode=lambda params, context: ENUMERABLE.encode(params[0], context),
-    total=lambda params, memory, actions: params[1],
+UNDEFINED = ENUMERABLE._replace(
+    encode=lambda params, context: (ENUMERABLE.encode(params[0], context), params[1]),
+    conditional=lambda params, memory, *plan: ENUMERABLE.conditional(params, memory[0], *plan),
+    total=lambda params, memory, actions: memory[1],
 )
 
 
 def _undefined_at_first(params, memory, actions, positions):
-    energies = ENUMERABLE.conditional(params[0], memory, actions, positions)
-    return jnp.where(jnp.all(actions == ACTIONS), energies.at[0, 1].set(params[1]), energies)
-
-
-UNDEFINED_STEP = UNDEFINED_TOTAL._replace(conditional=_undefined_at_first)
+    energies = UNDEFINED.conditional(params, memory, actions, positions)
+    return jnp.where(jnp.all(actions == ACTIONS), energies.at[0, 1].set(memory[1]), energies)
 
 
 @pytest.mark.parametrize(
-    ("energy", "config"),
+    "config",
     [
-        (UNDEFINED_STEP, GibbsConfig(HORIZON, 3)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, score=True)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, score_trace=True)),
-        (UNDEFINED_TOTAL, GibbsConfig(HORIZON, 3, restarts=2)),
-        (UNDEFINED_TOTAL, ShootingConfig(HORIZON)),
-        (UNDEFINED_TOTAL, CrossEntropyConfig(HORIZON)),
-        (UNDEFINED_TOTAL, BeamConfig(HORIZON, score=True)),
+        GibbsConfig(HORIZON, 3),
+        GibbsConfig(HORIZON, 3, score=True),
+        GibbsConfig(HORIZON, 3, score_trace=True),
+        GibbsConfig(HORIZON, 3, restarts=2),
+        ShootingConfig(HORIZON),
+        CrossEntropyConfig(HORIZON),
+        BeamConfig(HORIZON, score=True),
     ],
 )
-def test_a_plan_whose_energy_is_no_number_is_not_valid(energy, config):
+def test_a_plan_whose_energy_is_no_number_is_not_valid(config):
+    energy = UNDEFINED
+    if config == GibbsConfig(HORIZON, 3):  # which asks for no total
+        energy = UNDEFINED._replace(conditional=_undefined_at_first)
     for value, valid in ((np.nan, False), (-np.inf, False), (1.0, True)):
         plan = plans_of(energy, config, (TABLE, np.float32(value)), chains=2)
         assert (plan.valid == valid).all()
@@ -663,7 +640,7 @@ def test_an_energy_that_is_nan_is_an_error_and_not_a_plan():
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
     plan = error.value.plan
     assert plan.valid.sum() == 19
-    np.testing.assert_array_equal(plan.actions[4:], one_by_one(GIBBS).actions[4:])
+    assert_equal(plan.actions[4:], one_by_one(GIBBS).actions[4:])
 
 
 # What a planner takes, and mistakes.
@@ -680,7 +657,7 @@ def test_keys_and_contexts_of_every_type_are_taken():
     types = {str(kind): np.zeros(2, kind) for kind in (jnp.bfloat16, np.uint64, bool)}
     for keys in (jax.random.wrap_key_data(KEYS), [*KEYS], KEYS):
         plan = batched(GIBBS)(TABLE, keys, CONTEXTS | (types if keys is KEYS else {}))
-        jax.tree.map(np.testing.assert_array_equal, plan, expected)
+        jax.tree.map(assert_equal, plan, expected)
     for fits in FITS:
         check_fit("context", {"x": np.array(fits)})
 
@@ -697,12 +674,10 @@ def _of_another_shape(name, config):
 WIDE = (np.array([0, 2**31]), np.array([0, 2**32], np.uint64), np.array([np.inf, -1e39]))
 WRONG = [
     (lambda: _plan(KEYS[0]), "expected one for each context"),
-    (lambda: _plan(jax.random.key(0)), "expected one for each context"),
     (lambda: _plan(KEYS.astype(np.int64)), r"raw keys must be \[B, 2\] uint32"),
     (lambda: _plan("keys"), "keys must be an array"),
     (lambda: _plan(KEYS[:0], tilt=np.zeros((0, HORIZON, ACTIONS))), "no contexts"),
     (lambda: _plan(tilt=np.zeros((3, HORIZON, ACTIONS))), r"'tilt'\] has .* number of keys, 2"),
-    (lambda: _plan(tilt=np.float32(0)), r"context\['tilt'\] has shape .* number of keys, 2"),
     (lambda: _plan(mission=np.array(["go", "stay"])), r"'mission'\] holds <U\d+, not numbers"),
     *(
         (lambda w=wide: _plan(more=[w]), r"context\['more'\]\[0\] holds .*does not fit")
@@ -719,7 +694,6 @@ WRONG = [
     (lambda: plan_keys(0, np.array([5.9]), np.array([0])), "episode must be"),
     (lambda: plan_keys(0, np.array([0]), np.array([2**32])), "replan must be"),
     (lambda: plan_keys(0, np.arange(2), np.arange(1)), "2 episodes, but 1 replans"),
-    (lambda: compile_planner(TILTED, GIBBS, ()), "chunk sizes"),
     (lambda: compile_planner(TILTED, GIBBS, (8, -1)), "chunk sizes"),
     (lambda: compile_planner(TILTED, GIBBS, (1,), ["cpu"]), "devices must be a sequence"),
     (lambda: batched(GIBBS).compile(TABLE, CONTEXTS, 0), "batch must be at least 1"),
@@ -730,9 +704,7 @@ WRONG = [
     (lambda: GibbsConfig(3, resampled=4), "resampled is 4, .* the horizon 3"),
     (lambda: GibbsConfig(3, order="backwards"), "unknown order 'backwards': .*sequential"),
     (lambda: GibbsConfig(5, 2, 2, fill="margin"), "needs 3"),
-    (lambda: ShootingConfig(candidates=0), "candidates must be at least 1, got 0"),
     (lambda: CrossEntropyConfig(candidates=2, elites=3), "3 elites out of 2 candidates"),
-    (lambda: BeamConfig(beams=0), "beams must be at least 1"),
     (lambda: BeamConfig(temperature=-1.0), "a temperature must be in"),
     (lambda: GibbsConfig(temperature=1e31), "a temperature must be in"),
 ]

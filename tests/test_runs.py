@@ -14,7 +14,7 @@ from leapjax.agents.batches import run_batches
 from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.domain import Augmentations
-from leapjax.domains.babyai import encoders as babyai
+from leapjax.domains.babyai.encoders import state_tokens as babyai
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig

@@ -290,6 +290,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
         row = {
             "experiment": analysis.name,
             "hash": name,
+            "domain": analysis.domain,
             "trained": [configuration_hash(each, seed) for each in settings],
             "train_seconds": round(seconds, 3),
             "versions": work.versions,
@@ -446,7 +447,6 @@ def play(
     violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
     good = found.lengths[found.successes]
     row = {
-        "domain": specification.domain,
         "level": case.level,
         "case": case.name,
         "way": way.name,

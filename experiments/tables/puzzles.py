@@ -30,25 +30,15 @@ def uses(row: Row) -> bool:
     )
 
 
-def searches(rows: Sequence[Row]) -> str:
-    """Success of every way to search with the same trained energy, beside methods of one action."""
+def searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> str:
+    """Success of a few ways to search with one energy, by level and energy."""
     found = rows_by_search(rows)
     lines = []
-    for each in zip(*found.values(), strict=True):  # one search, on every level
-        name, passes, _ = each[0]
-        lines.append([name, passes, *(rate(of) for _, _, of in each)])
-    return table(" | ".join(["planner", "passes", *found]), lines)
-
-
-def search_pays(rows: Sequence[Row]) -> str:
-    """Success of a few ways to search, on the puzzles where they differ."""
-    found = rows_by_search(rows)
-    lines = []
-    for each in zip(*(found[column] for column in PAYS_ON), strict=True):
+    for each in zip(*(found[column] for column in columns), strict=True):
         name, passes, _ = each[0]
         if (name, passes) in PAYING:
             lines.append([name, passes, *(rate(of) for _, _, of in each)])
-    return table(" | ".join(["search", "passes", *PAYS_ON]), lines)
+    return table(" | ".join(["search", "passes", *columns]), lines)
 
 
 def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
