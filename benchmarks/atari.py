@@ -63,9 +63,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints tables, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.atari", given)
-    return shell.guarded("benchmarks.atari", given, lambda: run(options))
+    return shell.run_program("benchmarks.atari", given, lambda: run(options))
 
 
 def run(options: Options) -> None:

@@ -60,10 +60,12 @@ class Collect:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     if given[:1] == ["collect"]:
         options = shell.parse(Collect, "experiments.atari collect", given[1:])
-        return shell.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+        return shell.run_interruptible_program(
+            f"experiments.{EXPERIMENT.name}", given, lambda _: run(options)
+        )
     return running.main(EXPERIMENT, given)
 
 

@@ -22,7 +22,7 @@ from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
 from leapjax.domains import check_imported, find_domain
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, first_line
-from leapjax.extras import missing_explained
+from leapjax.extras import report_missing
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -272,7 +272,7 @@ def _import_checkpoints() -> types.ModuleType:
     Raises:
         UserError: it is not installed.
     """
-    with missing_explained():
+    with report_missing():
         return importlib.import_module("leapjax.checkpoints")
 
 

@@ -242,7 +242,7 @@ def test_damaged_lines(tmp_path_factory, data):
     other = {**ROW, "hash": "y"}
     path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(other)) + b"\n")
     rows = outcome(lambda: results.read(path))
-    for table in (results.success_table, results.time_table) if rows else ():
+    for table in (results.make_success_table, results.make_time_table) if rows else ():
         assert table(rows).row_count >= len(rows) >= 1
 
 

@@ -20,7 +20,7 @@ from leapjax.errors import UserError
 from leapjax.files import only_process_in
 from leapjax.running import jax_setup, results
 from leapjax.running import train as running_train
-from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
+from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
 from leapjax.running.metrics import read_metrics
 from leapjax.running.progress import Meter
 from leapjax.types import TrainState
@@ -132,7 +132,7 @@ def test_a_library_has_no_handlers():
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
-    with interruptible() as interruption:
+    with catch_signals() as interruption:
         for look in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
             with pytest.raises(Interrupted, match="SIGTERM"):
                 look()
@@ -142,10 +142,10 @@ def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
 
 def test_a_deferred_signal_waits_and_a_second_one_does_not():
     refused = pytest.raises(Interrupted, match="SIGINT")
-    with interruptible() as interruption, refused, interruption.deferred():
+    with catch_signals() as interruption, refused, interruption.deferred():
         os.kill(os.getpid(), signal.SIGINT)
         assert interruption.requested == signal.SIGINT
-    with interruptible() as interruption, pytest.raises(Interrupted), interruption.deferred():
+    with catch_signals() as interruption, pytest.raises(Interrupted), interruption.deferred():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("the second waited")
@@ -155,15 +155,15 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
 def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
     monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
-    with interruptible(ended.append) as interruption:
+    with catch_signals(ended.append) as interruption:
         with pytest.raises(Interrupted), interruption.deferred():
             os.kill(os.getpid(), number)
             time.sleep(0.2)
         assert not ended
-    with interruptible(ended.append), pytest.raises(Interrupted):
+    with catch_signals(ended.append), pytest.raises(Interrupted):
         os.kill(os.getpid(), number)
     assert not ended  # it had its effect in time
-    with interruptible(ended.append):
+    with catch_signals(ended.append):
         with pytest.raises(Interrupted):  # and here, as in a compiler, it has none
             os.kill(os.getpid(), number)
         deadline = time.monotonic() + 20

@@ -44,8 +44,8 @@ def test_a_process_that_has_joined_others_can_still_be_stopped():
     program = f"""
 import os, signal, time
 from leapjax.running import jax_setup
-from leapjax.running.interruption import Interrupted, interruptible
-with interruptible():
+from leapjax.running.interruption import Interrupted, catch_signals
+with catch_signals():
     jax_setup.connect(jax_setup.Cluster({free_address()!r}, 1, 0))
     try:
         os.kill(os.getpid(), signal.SIGTERM)

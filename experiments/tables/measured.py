@@ -18,8 +18,8 @@ from leapjax.running.schema import (
     Number,
     OneOf,
     Schema,
-    loads,
-    problem,
+    find_problem,
+    parse_json,
 )
 
 PART = {"part": str, "ms": POSITIVE, "gflop": AMOUNT}
@@ -73,12 +73,12 @@ def read(path: Path) -> Any:
         UserError: it cannot be read, or tables could not be made from it; names the field.
     """
     try:
-        found = loads(read_text(path))
+        found = parse_json(read_text(path))
     except (ValueError, RecursionError) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
-    wrong = problem(found, MEASURED[path.stem]) or _contradiction(path.stem, found)
+    wrong = find_problem(found, MEASURED[path.stem]) or _contradiction(path.stem, found)
     if wrong:
         raise UserError(f"{path}: {wrong}")
     return found

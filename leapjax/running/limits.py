@@ -127,7 +127,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
     observation = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
     context = (observation + 8) * (config.context + 1)
     tokens = 2 * (horizon + config.context) if paper else horizon
-    layer = layer_bytes(model, tokens)
+    layer = count_layer_bytes(model, tokens)
     times = domain.max_steps if paper else 0  # each has an embedding
     embeddings = times + tokens + domain.num_actions
     needs = {
@@ -161,7 +161,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
     memory.check(needs)
 
 
-def layer_bytes(model: ModelConfig, tokens: int) -> int:
+def count_layer_bytes(model: ModelConfig, tokens: int) -> int:
     """Bytes that a layer makes of so many tokens, at least."""
     # Queries, keys, values and so on; and the weights of attention.
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)

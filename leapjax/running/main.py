@@ -16,15 +16,15 @@ from leapjax.running.data import load_demonstrations
 from leapjax.running.evaluate import evaluate
 from leapjax.running.interruption import Interruption
 from leapjax.running.record import record
-from leapjax.running.run import Experiment, Run, find_folder, open_run, rows_path
+from leapjax.running.run import Experiment, Run, find_folder, locate_rows, open_run
 from leapjax.running.train import train
 from leapjax.running.trained import add_rules, load_trained
 
 
 def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
     """Runs every level and seed asked for; the exit code."""
-    given = shell.arguments_of(arguments)
-    return shell.stoppable(
+    given = shell.read_arguments(arguments)
+    return shell.run_interruptible_program(
         experiment.module, given, lambda interruption: run_all(experiment, given, interruption)
     )
 
@@ -33,7 +33,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     """Every level and seed of a command line; the failure of one comes after all others."""
     configs = parse(experiment.domain, arguments, experiment.config, experiment.module)
     jax_setup.start(configs[0].cluster)
-    versions = results.versions()  # of the code that runs, whatever is committed meanwhile
+    versions = results.find_versions()  # of the code that runs, whatever is committed meanwhile
     console = Console(quiet=not processes.is_first(), markup=False)
     runs = [(config, seed) for config in configs for seed in config.seeds]
     rows, failure = [], None
@@ -47,7 +47,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
                 console.print(f"{config.level}, seed {seed}, failed: {shell.describe(error)}")
             failure = failure or error
     if rows:
-        console.print(results.success_table(rows), results.time_table(rows))
+        console.print(results.make_success_table(rows), results.make_time_table(rows))
     if failure is not None:
         raise failure
 
@@ -61,7 +61,7 @@ def finish(
     interruption: Interruption,
 ) -> results.Row:
     """Returns the row of one level and one seed; runs it where it is not recorded yet."""
-    rows, name = rows_path(experiment, config), configuration_hash(config, seed)
+    rows, name = locate_rows(experiment, config), configuration_hash(config, seed)
     # Read even where nothing is looked for: a damaged file is better found now than after the run.
     known = processes.first_does(lambda: results.find(rows, name))
     if config.record and not config.force and known is not None:
@@ -117,7 +117,7 @@ def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[
     def out_of_reach() -> int:
         if folder.is_dir():
             return 0
-        known = {row["hash"] for row in results.read(rows_path(experiment, config))}
+        known = {row["hash"] for row in results.read(locate_rows(experiment, config))}
         return sum(configuration_hash(each, seed) not in known for each in found)
 
     count = processes.first_does(out_of_reach)

@@ -98,7 +98,7 @@ class Run:
     interruption: Interruption
     opened: contextlib.ExitStack
     plays: bool = True
-    log: Log = loggers.nowhere
+    log: Log = loggers.log_nothing
     programs: BackgroundPrograms = dataclasses.field(default_factory=BackgroundPrograms)
     seconds: dict[str, float] = dataclasses.field(
         default_factory=lambda: {"demos": 0.0, "compile": 0.0, "train": 0.0, "eval": 0.0}
@@ -117,7 +117,7 @@ class Run:
     @property
     def rows(self) -> Path:
         """The file that its row goes to."""
-        return rows_path(self.experiment, self.config)
+        return locate_rows(self.experiment, self.config)
 
 
 @contextlib.contextmanager
@@ -150,7 +150,7 @@ def open_run(
             console, interruption, opened, plays,
         )  # fmt: skip
         if processes.is_first():
-            log = opened.enter_context(loggers.opened(config.loggers, lambda: _describe(run)))
+            log = opened.enter_context(loggers.open_loggers(config.loggers, lambda: _describe(run)))
             run = dataclasses.replace(run, log=log)
         yield run
 
@@ -164,9 +164,9 @@ def _describe(run: Run) -> About:
     return About(run.folder, run.name, resolved(run.config, run.seed), done)
 
 
-def rows_path(experiment: Experiment, config: AnyConfig) -> Path:
+def locate_rows(experiment: Experiment, config: AnyConfig) -> Path:
     """The file that rows go to."""
-    return results.folder(config.record, config.runs) / f"{experiment.name}.jsonl"
+    return results.choose_folder(config.record, config.runs) / f"{experiment.name}.jsonl"
 
 
 def find_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:

@@ -24,7 +24,7 @@ from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
 from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
-from leapjax.extras import missing_explained
+from leapjax.extras import report_missing
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
 
@@ -74,7 +74,7 @@ def make(name: str, settings: Settings) -> Domain:
         UserError: there is none, or ale-py is not installed.
     """
     game = find_game(name)
-    with missing_explained("atari"):
+    with report_missing("atari"):
         import ale_py  # noqa: F401, PLC0415  (to say so now if it is missing)
 
     def make_adapter() -> Adapter:
