@@ -402,17 +402,17 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
     assert collect.find_shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
 
 
-@pytest.mark.parametrize(("game", "run"), [("Pong", 1)])
-def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
+@pytest.mark.parametrize(("game", "number"), [("Pong", 1)])
+def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, number):
     folder, arguments = collected
-    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
-    where = ["--folder", str(tmp_path), "--game", game, "--replay-run", str(run)]
+    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(number))
+    where = ["--folder", str(tmp_path), "--game", game, "--dqn-seed", str(number)]
     assert atari.main([*arguments, *where]) == 2
     error = capsys.readouterr().err
-    assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
+    assert f"holds games of Breakout, seed 1, not of {game}, seed {number}" in error
     assert error.count("\n") == 1
-    settings = domain.Settings(transitions=100, replay_run=run)
-    with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
+    settings = domain.Settings(transitions=100, dqn_seed=number)
+    with pytest.raises(UserError, match=f"of Breakout, seed 1, not of {game}, seed {number}"):
         domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
 
 
@@ -466,7 +466,7 @@ def test_every_way_to_learn_trains_and_plays(
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "did you mean Pong"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
-        (["collect", "--game", "Pong", "--replay-run", "0"], "--replay-run must be at least 1"),
+        (["collect", "--game", "Pong", "--dqn-seed", "0"], "--dqn-seed must be at least 1"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
