@@ -10,7 +10,7 @@ import pytest
 
 from leapjax import batching
 from leapjax.agents import bc
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig

@@ -7,7 +7,7 @@ import pytest
 
 from leapjax import batching
 from leapjax.agents import classifier
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig

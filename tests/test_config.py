@@ -13,7 +13,7 @@ import pytest
 import experiments.__main__ as programs
 from experiments.common.searches import searches
 from leapjax import domains, files, pretrained, serialization
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import configuration_hash, make_domain, resolved, specify
 from leapjax.domains import DOMAINS, find_domain
 from leapjax.domains.babyai.domain import BABYAI

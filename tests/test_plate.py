@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from leapjax.agents import plate
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
@@ -47,7 +47,7 @@ def untrained(architecture, past):
 
 def network(architecture, past):
     setup = setup_of(architecture, past)
-    return plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+    return plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
 
 
 @EACH_ARCHITECTURE

@@ -10,7 +10,7 @@ import pytest
 
 from leapjax import training
 from leapjax.agents import cql, qr_dqn, rem
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.types import Agent, TrainState

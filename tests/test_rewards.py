@@ -9,7 +9,7 @@ import pytest
 
 from leapjax import batching
 from leapjax.agents import bc, bcq, dt, iql, leap, mopo, returns
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
@@ -117,7 +117,7 @@ def test_iql_values_lie_between_what_the_data_do_and_what_is_best():
         mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
         TrainingConfig(), SETTINGS["iql"],
     )  # fmt: skip
-    module = setup.policy(("value", 1), ("q1", 3), ("q2", 3))
+    module = setup.make_policy(("value", 1), ("q1", 3), ("q2", 3))
     said = quick_jit(jax.vmap(module.apply, (None, 0)))(critic, mixed.contexts(0))
     best = mixed.best_values(0.9)
     value = np.asarray(said["value"])[:, 0, 0]
@@ -134,7 +134,7 @@ def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_ot
         mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
         TrainingConfig(), SETTINGS["mopo"],
     )  # fmt: skip
-    module = mopo.Networks(setup.policy(("features", 32)), 3, SETTINGS["mopo"].members)
+    module = mopo.Networks(setup.make_policy(("features", 32)), 3, SETTINGS["mopo"].members)
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None))
@@ -203,10 +203,12 @@ def test_the_return_that_is_wanted_is_less_by_what_was_given():
     np.testing.assert_array_equal(returns.returns_to_go(given, jnp.float32(10)), [17, 16, 14, 10])
     domain = mixed.DOMAIN._replace(return_scale=4.0)
     settings = dt.Settings(target_return=10.0)
-    wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
+    compute = returns.condition_on_target(
+        Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings)
+    )
     context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 1.0]), return_so_far=2.0)
-    np.testing.assert_allclose(wanted(context), np.array([10, 9, 8]) / 4)
-    np.testing.assert_allclose(wanted(context, jnp.float32(5)), np.array([7, 6, 5]) / 4)
+    np.testing.assert_allclose(compute(context), np.array([10, 9, 8]) / 4)
+    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([7, 6, 5]) / 4)
 
 
 @pytest.mark.parametrize("name", list(MODULES))

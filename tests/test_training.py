@@ -11,9 +11,11 @@ import optax
 import pytest
 
 from leapjax import schedules, sharding, training
-from leapjax.agents import leap, learning
-from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents import leap
+from leapjax.agents.base import Setup, TrainingConfig
+from leapjax.agents.batches import make_blank_steps, window_batches
+from leapjax.agents.optimizer import make_optimizer, mask_decayed_parameters
+from leapjax.agents.update import make_update
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import blank_context
@@ -363,7 +365,7 @@ def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
     """A model's parameters, and the paths of the modules that are embeddings or norms."""
     model = dataclasses.replace(MODEL, architecture=architecture)
     made = Setup(LEVEL, 2, 3, model, TRAINING, leap.Settings())
-    module = trajectory.build(model, made.sizes, made.encoder())
+    module = trajectory.build(model, made.sizes, made.make_encoder())
     found = set()
 
     def note(call, args, kwargs, context):
@@ -385,7 +387,7 @@ def parameters_of(architecture: str) -> tuple[dict, set[tuple[str, ...]]]:
 def test_weight_decay_leaves_embeddings_norms_and_biases(architecture):
     params, special = parameters_of(architecture)
     assert len(special) > 4
-    mask = learning.decayed_parameters(params)
+    mask = mask_decayed_parameters(params)
     assert jax.tree.structure(mask) == jax.tree.structure(params)
     decayed = 0
     for path, is_decayed in jax.tree_util.tree_leaves_with_path(mask):
@@ -399,7 +401,7 @@ def test_weight_decay_leaves_embeddings_norms_and_biases(architecture):
 
 def test_weight_decay_shrinks_what_has_no_gradient():
     config = TrainingConfig(steps=100, warmup=0, learning_rate=0.5, weight_decay=0.1)
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {
         "dense": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)},
         "norm": {"scale": jnp.ones(2)},
@@ -416,7 +418,7 @@ def test_weight_decay_shrinks_what_has_no_gradient():
 
 def learning_rates(config: TrainingConfig) -> np.ndarray:
     """What each step really moves: Adam's update of a constant gradient is the rate itself."""
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {"bias": jnp.zeros(())}
 
     def step(state, _):
@@ -449,7 +451,7 @@ def test_a_short_run_warms_up_for_a_tenth_of_it_at_most(steps):
 def test_gradients_are_clipped_by_their_global_norm():
     config = TrainingConfig(steps=10, warmup=0, clip=1.0)
     # Adam forgets the scale of a gradient, so look at what it remembers of the first.
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {"bias": jnp.zeros(2)}
     start, update = optimizer.init(params), jax.jit(optimizer.update)
 
@@ -523,7 +525,7 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     assert mesh.size == 8
     agent = leap.make_agent(setup(), mesh)
     data = sharding.replicate(data, mesh)
-    begin, step = training.compile_ahead(agent, mesh, learning.blank_steps(toy.DOMAIN))
+    begin, step = training.compile_ahead(agent, mesh, make_blank_steps(toy.DOMAIN))
     begun = begin(0)
     rows = step.draw(begun[1], begun[0].step, data)
     jax.tree.map(np.testing.assert_array_equal, rows, drawn)
@@ -639,7 +641,7 @@ def average_agent(mesh) -> Agent:
         extra = {"average": jnp.ones((SIZE, SIZE)), "steps": jnp.int32(0)}
         return TrainState({"w": w}, optimizer.init({"w": w}), jnp.int32(0), extra)
 
-    update = learning.make_update(loss, optimizer, mesh, next_extra)
+    update = make_update(loss, optimizer, mesh, next_extra)
     return Agent(init, lambda key, data: data, update, None)
 
 
