@@ -221,7 +221,7 @@ def random_steps(domain: Domain) -> Steps:
         )
         for episode in range(EPISODES)
     ]  # fmt: skip
-    return concatenate(played, domain.extras)
+    return concatenate(played, domain.augmentations.extras)
 
 
 def table(rows: Sequence[Row]) -> Table:

@@ -64,7 +64,7 @@ def report(options: Options) -> None:
         specification = pretrained.read_specification(run)
         if specification.method != "leap":
             raise UserError(f"{run} is of method {specification.method}: only leap masks actions")
-        if pretrained.make_domain(specification).collect is None:
+        if pretrained.make_domain(specification).demonstrations.collect is None:
             raise UserError(
                 f"{run} is of {specification.level}, which nobody here demonstrates: there are no "
                 "other demonstrations to compare with"
@@ -77,9 +77,10 @@ def report(options: Options) -> None:
 def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
     """Some demonstrations that a run has learned from."""
     count = min(count, origin.demos)
-    if domain.source is not None:
-        where = origin.demonstrations or domain.source.default
-        return domain.source.load(where, origin.seed).demonstrations[:count]
+    source = domain.demonstrations.source
+    if source is not None:
+        where = origin.demonstrations or source.default
+        return source.load(where, origin.seed).demonstrations[:count]
     if origin.demonstrations is not None:
         return storage.load(origin.demonstrations, domain, count).demonstrations
     return _collect(domain, count, origin.seed)
@@ -92,8 +93,9 @@ def others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration
 
 
 def _collect(domain: Domain, count: int, seed: int) -> Sequence[Demonstration]:
-    assert domain.collect is not None  # see `report`; all levels of BabyAI have a demonstrator
-    return domain.collect(count, seed, lambda done: None).demonstrations
+    collect = domain.demonstrations.collect
+    assert collect is not None  # see `report`; all levels of BabyAI have a demonstrator
+    return collect(count, seed, lambda done: None).demonstrations
 
 
 def describe(planner: Pretrained, options: Options, title: str) -> Table:

@@ -19,10 +19,9 @@ from leapjax.files import read_text, write_text
 from leapjax.running import results, shell, startup
 from leapjax.running.results import Row
 
-DOCUMENTS = ("README.md", "docs/performance.md", "docs/experiments.md", "docs/results.md")
+DOCUMENTS = ("README.md", "docs/performance.md", "docs/reproduction.md")
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
-PROPERTIES = ("adaptation", "generalization", "composition", "constraints")  # a table each
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,14 +101,13 @@ def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str]
     Args:
         rows: by source: some tables take a second one.
     """
+    properties = ANALYSES["properties"]
     return {
-        "results": (babyai.success, "babyai"),
-        "steps": (babyai.steps, "babyai"),
+        "results": (functools.partial(babyai.success, settings=babyai.PRESETS), "babyai"),
         "iterations": (babyai.iterations, "babyai"),
         "methods": (babyai.methods, "babyai"),
-        "acting": (babyai.acting, "babyai"),
         "price": (functools.partial(babyai.price, measured=rows["methods"]), "babyai"),
-        "searches": (puzzles.searches, "puzzles"),
+        "search-pays": (puzzles.searches, "puzzles"),
         "arms": (puzzles.arms, "puzzles"),
         "atari": (functools.partial(atari.played, data=rows["atari-data"]), "atari"),
         "atari-data": (atari.data, "atari-data"),
@@ -122,19 +120,25 @@ def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str]
         "parts": (speed.parts, "training"),
         "quality": (speed.quality, "quality"),
         "landscape": (analyses.landscape, "landscape"),
-        "planning-adds": (
-            functools.partial(analyses.compared, ANALYSES["properties"]),
+        "table-3": (
+            functools.partial(
+                analyses.compared,
+                properties,
+                ways=analyses.AS_THE_PAPER,
+                cases=analyses.OF_THE_PAPER,
+            ),
+            "properties",
+        ),
+        "exploring": (
+            functools.partial(analyses.compared, properties, ways=analyses.EXPLORING),
+            "properties",
+        ),
+        "two-constraints": (
+            functools.partial(analyses.compared, properties, cases=analyses.ERRANDS),
             "properties",
         ),
         **{
-            kind: (
-                functools.partial(analyses.analysed, ANALYSES["properties"], kind=kind),
-                "properties",
-            )
-            for kind in PROPERTIES
-        },
-        **{
-            name: (functools.partial(analyses.analysed, each), name)
+            name: (functools.partial(analyses.compared, each), name)
             for name, each in ANALYSES.items()
             if name != "properties"
         },

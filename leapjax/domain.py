@@ -1,11 +1,10 @@
-"""What a run needs of a domain: the only seam between methods and the worlds they act in.
+"""`Domain`: what training and planning need of one level of a family of environments.
 
-A domain is a family of levels: BabyAI's, the games of Atari, one environment of your own. A
-`Domain` describes one level of it, a `DomainType` makes them. To add a domain is to write one
-of each, in a folder of its own, and a line in `leapjax.domains`.
+A family is BabyAI, the games of Atari, or one environment of your own. A `DomainType` makes the
+`Domain` of each of its levels. To add a family, write both in a folder of its own, and add a line
+to `leapjax.domains`.
 """
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.environments import Adapter, Criterion
-from leapjax.errors import UserError, did_you_mean
+from leapjax.errors import UserError
 from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
 
 if TYPE_CHECKING:
@@ -24,33 +23,36 @@ if TYPE_CHECKING:
     from leapjax.models.trajectory import ModelConfig
 
 EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
+Encoders = Mapping[str, EncoderMaker]  # by architecture
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
-# what a network must know of its training data, kept with its checkpoint: by array of an
-# observation, by column of it
-Augmentation = Callable[[jax.Array, Window], Window]
-# (key, window) -> window: one training example as it could have been
+# Statistics of training data, kept in checkpoints: by array of an observation, by column, numbers.
+Augmentation = Callable[[jax.Array, Window], Window]  # (key, window) -> changed window
 
 
 class Collection(NamedTuple):
-    """Demonstrations, and what was dropped on the way to them.
+    """Demonstrations, and a count of the episodes that were dropped.
 
     Attributes:
-        demonstrations: those that can be used.
-        dropped: how many were dropped, by the reason.
+        demonstrations: the episodes that can be used.
+        dropped: number of dropped episodes, by reason.
     """
 
     demonstrations: list[Demonstration]
     dropped: Mapping[str, int]
 
 
+Collect = Callable[[int, int, Callable[[int], None]], Collection]
+# (count, training seed, progress) -> demonstrations
+
+
 class Recording(NamedTuple):
-    """An episode of n steps as somebody else recorded it, with observations of their own.
+    """An episode of n steps from a data set, whose observations may not be the domain's.
 
     Attributes:
         observations: `[n + 1, ...]`.
         actions: `[n]` int64.
         rewards: `[n]` float32.
-        seed: with which the environment was reset; negative where nobody knows.
+        seed: of the environment's reset; negative if unknown.
     """
 
     observations: Any
@@ -60,16 +62,16 @@ class Recording(NamedTuple):
 
 
 class Described(NamedTuple):
-    """What a data set says of itself; what is wrong with that is said when it is loaded.
+    """The environment of a data set, as its metadata describe it; None is unknown.
 
     Attributes:
-        level: the id of the environment that it was recorded in.
-        episodes: how many it holds.
-        arguments: of that environment.
-        wrappers: around it, the innermost first, each with `name`, `entry_point` and `kwargs`;
-            None: the data set does not say.
-        max_steps: of an episode, by that environment.
-        spaces: of each "observation" and "action", where it says more than shapes and types.
+        level: id of the environment.
+        episodes: number of episodes in the data set.
+        arguments: of the environment.
+        wrappers: around the environment, the innermost first, each with `name`, `entry_point` and
+            `kwargs`.
+        max_steps: step limit of the environment.
+        spaces: of "observation" and "action", if they say more than shapes and types.
     """
 
     level: str | None = None
@@ -81,14 +83,15 @@ class Described(NamedTuple):
 
 
 class Source(NamedTuple):
-    """Where demonstrations are kept, and how: as Minari data sets, or in a format of their own.
+    """Where demonstrations are stored, and how they are made and read.
 
     Attributes:
-        default: where they are, if nobody says.
-        exists: (where) -> whether they are there.
-        make: (where, progress) -> what was made, in words; writes them.
-        load: (where, training seed) -> as many as are asked for; UserError if there are fewer.
-        amount: how many `make` makes, and tells the progress of.
+        default: the place that is used if the user names none.
+        exists: (place) -> whether the demonstrations are there.
+        make: (place, progress) -> a summary; makes and stores the demonstrations.
+        load: (place, training seed) -> at least as many demonstrations as were asked for, or
+            UserError.
+        amount: how many units `make` makes, and reports the progress of.
         unit: of the amount, such as "demonstrations".
     """
 
@@ -100,101 +103,106 @@ class Source(NamedTuple):
     unit: str
 
 
-def level_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
-    """The two numbers of a level's name, such as 3 and 5 of Star3x5.
-
-    Args:
-        name: of the level.
-        pattern: a regular expression with a group for each number.
-        expected: what names are like, for whoever gives another.
-        known: examples.
-
-    Raises:
-        UserError: the name is not like that.
-    """
-    found = re.fullmatch(pattern, name)
-    if found is None:
-        raise UserError(
-            f"unknown level {name!r}: expected {expected}, such as "
-            f"{', '.join(known)}{did_you_mean(name, known)}"
-        )
-    return int(found[1]), int(found[2])
-
-
-def _nothing_to_check(observations: PyTree, where: str) -> None:
+def _accept_observations(observations: PyTree, where: str) -> None:
     del observations, where
 
 
-def _no_statistics(demonstrations: Sequence[Demonstration]) -> Statistics:
-    del demonstrations
-    return ()
-
-
-def _nothing_to_compare(recorded: Described, where: str) -> None:
+def _accept_environment(recorded: Described, where: str) -> None:
     del recorded, where
 
 
-def _no_extras(demonstration: Demonstration) -> PyTree:
+def _make_no_extras(demonstration: Demonstration) -> PyTree:
     del demonstration
     return ()
 
 
-class Domain(NamedTuple):
-    """One level of a domain. Functions are pure, except `make_adapter` and `collect`.
+class Demonstrations(NamedTuple):
+    """How demonstrations of a level are made, and how recorded episodes are checked.
+
+    A domain gives `collect`, whose demonstrations are stored as Minari data sets, or `source`, or
+    neither: the user then names a data set.
 
     Attributes:
-        level: its name.
-        make_adapter: makes an environment.
-        collect: (count, training seed, progress) -> so many demonstrations, or UserError if there
-            are none; None: nobody here demonstrates it.
-        actions: names; the last is the end action.
-        max_steps: of the longest episode.
-        blank: an observation of zeros, as NumPy arrays: shapes and types.
-        encoders: by architecture, (model, K) -> encoder.
-        augmentations: each (key, window) -> window; (f, g) makes f(g(window)) of a window.
-        measure: (demonstrations) -> what encoders must know of the training data.
-        encoders_for: (what was measured) -> `encoders` that know it; UserError if it is not of this
-            level's observations. None: `encoders` need to know nothing.
-        extras: (demonstration) -> what augmentations must know of each step, `[n, ...]`; no model
-            sees it.
+        collect: (count, training seed, progress) -> `count` demonstrations, or UserError.
+        source: of demonstrations in a format of the domain's own.
         check: (observations `[n + 1, ...]`, where) -> UserError if a value is out of range.
-        replay: makes a demonstration of an episode of other observations, or says why it is none;
-            None where nothing is known of such observations.
-        source: of demonstrations; None: `collect`, kept by `leapjax.data.storage`.
-        arguments: JSON values that its environment is made with, and that of data must agree with;
-            None: theirs do not matter.
-        check_recorded: (what a data set says of itself, its name) -> UserError if it contradicts
-            the environment in more than `arguments`.
-        criterion: when an episode succeeds; None: the environment says so.
-        rules: an energy of what is known without learning; it has no parameters, ().
-        shortest_limit: steps that every episode may last, if that is known.
-        signature: JSON values that a checkpoint must agree on.
-        return_scale: what returns are divided by before a network sees them.
-        made_from: its domain's name in `leapjax.domains` and the settings that `make_domain` made
-            it with; None: it is of no such domain, and no planner of it can be saved.
+        check_environment: (description of a data set, where) -> UserError if the data set was
+            recorded in another environment.
+        replay: makes a demonstration of an episode with other observations, or returns the reason
+            why it cannot; None if it does not know such observations.
+        criterion: when a recorded episode succeeds; None if only the environment can tell.
+    """
+
+    collect: Collect | None = None
+    source: Source | None = None
+    check: Callable[[PyTree, str], None] = _accept_observations
+    check_environment: Callable[[Described, str], None] = _accept_environment
+    replay: Callable[[Recording], Demonstration | str | None] | None = None
+    criterion: Criterion | None = None
+
+
+class Augmentations(NamedTuple):
+    """Random changes of training windows.
+
+    Attributes:
+        functions: each (key, window) -> window; the last one is applied first.
+        extras: (demonstration) -> arrays `[n, ...]` that the functions need for each step; no
+            model sees them.
+    """
+
+    functions: Sequence[Augmentation] = ()
+    extras: Callable[[Demonstration], PyTree] = _make_no_extras
+
+
+class Scaling(NamedTuple):
+    """How numbers are scaled before a network sees them.
+
+    Attributes:
+        returns: divisor of returns.
+        measure: (demonstrations) -> statistics of the training data; None if encoders need none.
+        encoders: (statistics) -> encoders that scale observations by them, or UserError if the
+            statistics are of other observations.
+    """
+
+    returns: float = 1.0
+    measure: Callable[[Sequence[Demonstration]], Statistics] | None = None
+    encoders: Callable[[Statistics], Encoders] | None = None
+
+
+class Domain(NamedTuple):
+    """One level: its environment, its actions, and how a network reads its observations.
+
+    The first six fields are needed; `demonstrations` and `augmentations` matter for training.
+    All functions are pure, except `make_adapter` and those that read or write demonstrations.
+
+    Attributes:
+        level: name of the level.
+        make_adapter: makes an environment.
+        actions: names of the actions; the last one ends a plan.
+        max_steps: steps of the longest episode.
+        blank: an observation of zeros, as NumPy arrays: shapes and types.
+        encoders: by architecture, (model, K) -> encoder of contexts.
+        demonstrations: how they are made and checked.
+        augmentations: random changes of training windows.
+        scaling: of returns and observations.
+        rules: an energy without parameters, `()`, that is lowest for plans that obey known rules;
+            None if there are none.
+        signature: JSON values that a checkpoint and the level must agree on.
+        made_from: name in `leapjax.domains` and settings that `make_domain` made the level from;
+            None for a domain that is not registered, whose planners cannot be saved.
     """
 
     level: str
     make_adapter: Callable[[], Adapter]
-    collect: Callable[[int, int, Callable[[int], None]], Collection] | None
     actions: tuple[str, ...]
     max_steps: int
     blank: PyTree
-    encoders: Mapping[str, EncoderMaker]
-    augmentations: Sequence[Augmentation] = ()
-    measure: Callable[[Sequence[Demonstration]], Statistics] = _no_statistics
-    encoders_for: Callable[[Statistics], Mapping[str, EncoderMaker]] | None = None
-    extras: Callable[[Demonstration], PyTree] = _no_extras
-    check: Callable[[PyTree, str], None] = _nothing_to_check
-    replay: Callable[[Recording], Demonstration | str | None] | None = None
-    source: Source | None = None
-    arguments: Mapping[str, Any] | None = None
-    check_recorded: Callable[[Described, str], None] = _nothing_to_compare
-    criterion: Criterion | None = None
+    encoders: Encoders
+    demonstrations: Demonstrations = Demonstrations()
+    augmentations: Augmentations = Augmentations()
+    scaling: Scaling = Scaling()
     rules: Energy | None = None
-    shortest_limit: int | None = None
     signature: Mapping[str, Any] = {}
-    return_scale: float = 1.0
     made_from: tuple[str, Any] | None = None
 
     @property
@@ -207,9 +215,9 @@ class DomainType(NamedTuple):
     """A family of levels.
 
     Attributes:
-        settings: a frozen dataclass: options of encoder and augmentation.
-        make: (level, settings) -> domain; UserError for an unknown level.
-        levels: the paper's.
+        settings: a frozen dataclass: options of encoders, augmentations and environment.
+        make: (level, settings) -> domain, or UserError for an unknown level.
+        levels: names of the levels in the paper.
     """
 
     settings: type
@@ -217,19 +225,24 @@ class DomainType(NamedTuple):
     levels: tuple[str, ...]
 
 
+def measure_statistics(domain: Domain, demonstrations: Sequence[Demonstration]) -> Statistics:
+    """Measures the statistics of training data that a level's encoders need; `()` for none."""
+    return domain.scaling.measure(demonstrations) if domain.scaling.measure else ()
+
+
 def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
-    """Returns a level whose encoders know statistics of their training data, if they need any.
+    """Returns a level whose encoders scale by statistics of their training data.
 
     Raises:
-        UserError: the statistics are not of this level's observations.
+        UserError: the statistics are of other observations.
     """
-    if domain.encoders_for is None or not statistics:
+    if domain.scaling.encoders is None or not statistics:
         return domain
-    return domain._replace(encoders=domain.encoders_for(statistics))
+    return domain._replace(encoders=domain.scaling.encoders(statistics))
 
 
 def blank_context(domain: Domain, length: int) -> Context:
-    """A context with K = `length` of the right shapes, all zeros."""
+    """Makes a context with K = `length` of zeros, with the shapes and types of a level's."""
     blank = to_plain_dicts(domain.blank)
     past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), blank)
     return Context(
@@ -243,10 +256,15 @@ def blank_context(domain: Domain, length: int) -> Context:
 
 
 def check_context(context: Context, domain: Domain, length: int) -> None:
-    """Refuses what another network would be needed for, while a program is being traced.
+    """Checks the structure, shapes and types of a context; works while a program is traced.
+
+    Args:
+        context: to check.
+        domain: level of the network that reads the context.
+        length: K of that network.
 
     Raises:
-        UserError: says what has which shape.
+        UserError: the network was made for other contexts; names the array that differs.
     """
     blank = blank_context(domain, length)
     structures = [str(jax.tree.structure(tree)) for tree in (context, blank)]

@@ -12,7 +12,7 @@ from leapjax.agents.base import TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows
-from leapjax.domain import Domain, apply_statistics
+from leapjax.domain import Domain, apply_statistics, measure_statistics
 from leapjax.domains import make_level
 from leapjax.errors import UserError
 from leapjax.methods import find_method, learns_from_rewards
@@ -117,7 +117,7 @@ def fit(
     if learns_from_rewards(method, settings) and not any(d.rewards.any() for d in data):
         raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
     name_of_data = demonstrations if isinstance(demonstrations, str) else None
-    statistics = domain.measure(data) if data else ()
+    statistics = measure_statistics(domain, data) if data else ()
     domain = apply_statistics(domain, statistics)
     context = asked.get("context", config.context)
     specification = Specification(
@@ -128,7 +128,9 @@ def fit(
     compilation.use_disk_cache()
     agent = pretrained.make_agent(specification, domain, mesh)
     begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
-    steps_of_all: Any = windows.concatenate(data, domain.extras, padded=True) if data else ()
+    steps_of_all: Any = (
+        windows.concatenate(data, domain.augmentations.extras, padded=True) if data else ()
+    )
 
     def report(done: int, state: TrainState, means: dict[str, float]) -> None:
         del state
@@ -147,8 +149,8 @@ def _read(
 ) -> list[Demonstration]:
     """The demonstrations that `fit` was given, each checked against the domain."""
     if isinstance(demonstrations, str):
-        if domain.source is not None:
-            return domain.source.load(demonstrations, seed).demonstrations
+        if domain.demonstrations.source is not None:
+            return domain.demonstrations.source.load(demonstrations, seed).demonstrations
         return storage.load(demonstrations, domain).demonstrations
     return [
         storage.check_demonstration(check_kind(each, Demonstration), domain, f"demonstration {i}")

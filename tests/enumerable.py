@@ -59,10 +59,6 @@ def random_table(seed: int, horizon: int, num_actions: int, scale: float = 1.5) 
     return rng.normal(scale=scale, size=(num_actions,) * horizon).astype(np.float32)
 
 
-def no_tilt(horizon: int, num_actions: int) -> np.ndarray:
-    return np.zeros((horizon, num_actions), np.float32)
-
-
 def all_plans(horizon: int, num_actions: int) -> np.ndarray:
     """Every plan `[A^T, T]`, in the order of the flattened joint."""
     return np.array(list(itertools.product(range(num_actions), repeat=horizon)), np.int32)
@@ -113,8 +109,3 @@ def fit_p_value(counts: np.ndarray, probabilities: np.ndarray) -> float:
     counts = np.append(counts[:enough].sum(), counts[enough:])
     expected = np.append(expected[:enough].sum(), expected[enough:])
     return float(stats.chisquare(counts, expected).pvalue)
-
-
-def total_variation(counts: np.ndarray, probabilities: np.ndarray) -> float:
-    counts = np.asarray(counts, np.float64).reshape(-1)
-    return 0.5 * float(np.abs(counts / counts.sum() - np.asarray(probabilities).reshape(-1)).sum())

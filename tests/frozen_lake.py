@@ -11,7 +11,7 @@ import numpy as np
 
 from leapjax.configuration import AnyConfig, change
 from leapjax.data.solved import collect_solved
-from leapjax.domain import Domain, DomainType
+from leapjax.domain import Demonstrations, Domain, DomainType
 from leapjax.environments import GymnasiumAdapter
 from leapjax.models.encoder import Encoder
 from leapjax.presets import common, environments
@@ -60,11 +60,11 @@ def make(level: str, settings: Settings) -> Domain:
     return Domain(
         level=level,
         make_adapter=make_adapter,
-        collect=functools.partial(collect_solved, make_adapter, solve),
         actions=("left", "down", "right", "up", "end"),
         max_steps=100,
         blank=np.zeros((), np.int64),
         encoders=dict.fromkeys(("paper", "leapjax"), lambda model, context: Cell(model.width)),
+        demonstrations=Demonstrations(functools.partial(collect_solved, make_adapter, solve)),
     )
 
 

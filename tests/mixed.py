@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.data import windows
+from leapjax.domain import Augmentations
 from leapjax.models.encoder import Encoder
 from leapjax.types import Demonstration
 from tests import toy
@@ -42,7 +43,7 @@ DOMAIN = toy.DOMAIN._replace(
         "leapjax": lambda model, context: Place(model.width),
         "paper": lambda model, context: Places(model.width),
     },
-    augmentations=(),
+    augmentations=Augmentations(),
 )
 
 

@@ -504,7 +504,7 @@ def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, gam
     assert error.count("\n") == 1
     settings = domain.Settings(transitions=100, replay_run=run)
     with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
-        domain.source(GAMES[game], settings).load(str(tmp_path), 0)
+        domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
 
 
 def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path):
@@ -513,13 +513,13 @@ def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path)
     shutil.copytree(folder, copy)
     wanted = collect.find_shards(copy, BREAKOUT, 100, 1)
     assert wanted == range(1) and collect.find_shards(copy, BREAKOUT, 10_000, 1) is None
-    found = domain.source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
+    found = domain.make_source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
     logs = replay.replay_logs(copy, BREAKOUT, 1)
     shutil.rmtree(logs.parent / "leapjax")  # what was unpacked
     for path in logs.glob("*_ckpt.0.gz"):  # half a file that nobody asks for
         if "action" in path.name:
             shutil.copy(path, logs / path.name.replace(".0.", ".9."))
-    again = domain.source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
+    again = domain.make_source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
     lengths = [[len(d.actions) for d in each.demonstrations] for each in (found, again)]
     assert lengths[0] == lengths[1]
 

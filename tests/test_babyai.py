@@ -253,7 +253,7 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--method", "bcx"], "unknown method 'bcx': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
         (["--episodes", "0"], "--episodes must be at least 1"),
-        (["--horizon", "50", "--resampled", "1"], "longer than an episode"),
+        (["--horizon", "50", "--resampled", "1"], "longer than any episode"),
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),

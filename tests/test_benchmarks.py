@@ -16,7 +16,7 @@ from leapjax.domain import blank_context
 from leapjax.models.linear import rows_times_matrix
 from leapjax.presets import find_preset
 from leapjax.running.jax_setup import Cluster
-from tests.programs import only_long, untrained_run, with_options
+from tests.programs import only_long, with_options
 
 HORIZON = 5
 SMALL = {"width": 16, "heads": 2, "layers": 1, "features": 2}  # of a network for games
@@ -73,37 +73,16 @@ def test_the_benchmark_writes_rows_and_a_plot(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "LEVELS", ("GoToLocalS7N5",))
     monkeypatch.setattr(planning, "make_energy", functools.cache(planning.make_energy))
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
-    written = ["--json", str(rows), "--plot", str(plot), "--batches", "1", "2", "--chunks", "1"]
-    assert planning.main([*written, "--seconds", "0.01", "--large", "2"]) == 0
+    options = ["--json", str(rows), "--plot", str(plot), "--batches", "1", "2", "--chunks", "1"]
+    assert planning.main([*options, "--seconds", "0.01", "--large", "2"]) == 0
     assert "2 plans of (5, 10)" in capsys.readouterr().out
-    fields = (
-        "horizon iterations batch preset compile_seconds plans_per_second gflops peak_gflops "
-        "fraction_of_peak"
-    ).split()
     written = json.loads(rows.read_text())
-    assert [row["batch"] for row in written] == [1, 2] and {row["chunk"] for row in written} == {1}
+    assert [(row["batch"], row["chunk"]) for row in written] == [(1, 1), (2, 1)]
     # What a batch of one has compiled serves two.
     assert written[0]["compile_seconds"] > 0 == written[1]["compile_seconds"]
-    assert all(row["versions"]["leapjax"].startswith("0.") for row in written)
-    assert all(set(fields) <= row.keys() for row in written)
-    assert all(row[field] > 0 for row in written for field in fields[5:])
+    measured = ("plans_per_second", "gflops", "peak_gflops", "fraction_of_peak")
+    assert all(row[field] > 0 for row in written for field in measured)
     assert plot.stat().st_size > 1000
-
-
-def test_methods_take_turns_and_an_action_costs_its_share_of_a_plan(tmp_path, monkeypatch):
-    calls = []
-
-    def make_call(level, method, batch):
-        return lambda: calls.append((level, method, batch))
-
-    monkeypatch.setattr(methods, "make_call", make_call)
-    path = tmp_path / "rows.json"
-    small = ["--batch", "2", "--rounds", "2", "--seconds", "0"]
-    assert methods.main([*small, "--level", "PickUpLoc", "--json", str(path)]) == 0
-    assert calls == [("PickUpLoc", method, 2) for method in methods.METHODS] * 2
-    rows = json.loads(path.read_text())
-    assert [row["method"] for row in rows] == list(methods.METHODS)
-    assert all(row["plans_per_second"] > 0 and row["batch"] == 2 for row in rows)
 
 
 @only_long
@@ -114,15 +93,8 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, qui
     arguments = ["--levels", "GoToLocalS7N5", "--presets", "leapjax", "--seconds", "0.01"]
     assert training.main([*arguments, "--json", str(rows)]) == 0
     (row,) = json.loads(rows.read_text())
-    assert row["preset"] == "leapjax" and row["batch"] == row["devices"] == 4
-    for field in ("steps_per_second", "flops_per_step", "fraction_of_peak", "training_seconds"):
-        assert row[field] > 0
-    assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"])
-    names = [part["part"] for part in row["parts"]]
-    assert names == [
-        "drawing and augmenting a batch", "context to memory", "actions to loss", "optimizer",
-    ]  # fmt: skip
-    assert all(part["ms"] > 0 for part in row["parts"])
+    assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"]) > 0
+    assert len(row["parts"]) == 4 and all(part["ms"] > 0 for part in row["parts"])
     # The products of a step are those of encoder and transformer, values and gradients.
     products = 1e9 * sum(part["gflop"] for part in row["parts"])
     assert 0.9 * products < row["flops_per_step"] < 1.1 * products
@@ -137,28 +109,19 @@ def test_the_benchmark_of_games_says_what_a_decision_is_made_of(tmp_path, monkey
     arguments = ["--presets", "leapjax", "--batches", "2", "--no-training", "--seconds", "0.01"]
     assert atari.main([*arguments, "--json", str(rows)]) == 0
     (row,) = json.loads(rows.read_text())
-    assert (row["level"], row["batch"]) == ("Breakout", 2)
-    for part in ("planning", "encoding", "anew", "playing"):
-        assert row[f"{part}_seconds"] > 0
+    assert all(row[f"{part}_seconds"] > 0 for part in ("planning", "encoding", "playing"))
     # The convolutions alone: 20 * 20, 9 * 9 and 7 * 7 places, of 2, 4 and 4 features.
     products = 400 * 64 * 2 + 81 * 32 * 4 + 49 * 36 * 4
     assert row["encoding_flops"] > 2 * 2 * products
-    assert row["peak_gflops"] > 0
 
 
 @pytest.mark.parametrize(
     ("program", "arguments", "said"),
     [
-        (planning, ["--json", "file/rows.json"], "cannot write to file"),
         (training, ["--json", "file/rows.json"], "cannot write to file"),
         (quality, ["GoToLocalS7N5", "--batch", "0"], "--batch 0"),
-        (atari, ["--training-json", "file/rows.json"], "cannot write to file"),
-        (atari, ["--batches", "16", "0"], "--batches 0"),
         (planning, ["--batches", "4", "0"], "--batches 4 0: expected positive numbers"),
-        (training, ["--microbatch", "-1"], "--microbatch -1"),
-        (training, ["--levels", "Nowhere"], "Nowhere"),
         (planning, ["--plot", "plot.foo"], "a figure can be"),
-        (atari, ["--run", "7", "--presets", "paper"], "a batch of 64 windows is not made of runs"),
         (atari, ["--no-training", "--training-json", "rows.json"], "--no-training"),
         (scaling, ["--level", "GoToLocal"], "unknown level"),
     ],
@@ -171,16 +134,6 @@ def test_what_cannot_be_written_is_not_measured(
     monkeypatch.setattr(program, "measure", lambda *given: pytest.fail("measured"))
     assert program.main(arguments) == 2
     assert said in capsys.readouterr().err
-
-
-def test_who_judges_whole_plans_is_not_asked_to_fill_them(tmp_path, monkeypatch):
-    run = untrained_run(tmp_path / "run", "--method", "classifier")
-    monkeypatch.setattr(quality, "measure", lambda options, path, name, search: search)
-    monkeypatch.setattr(quality, "table", lambda searches: {search.fill for search in searches})
-    shown = []
-    monkeypatch.setattr(quality, "Console", lambda: SimpleNamespace(print=shown.append))
-    assert quality.main([str(run)]) == 0
-    assert shown == [{"together"}]
 
 
 def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypatch):
@@ -204,29 +157,20 @@ def test_the_scaling_benchmark_measures_whole_batches_and_the_exchange(monkeypat
     assert row["exchange_seconds"] > 0 and row["parameters"] == 64 * 64 + 3
 
 
-def test_the_scaling_benchmark_writes_a_row_for_each_setting(tmp_path, monkeypatch, capsys):
+def test_a_row_for_each_method_and_for_each_setting(tmp_path, monkeypatch):
     def launch(arguments, count, devices, fsdp):
         measured = {"seconds_per_step": 0.1, "examples_per_second": 10.0, "exchange_seconds": 0.01}
         return {"processes": count, "devices": count * devices, "fsdp": fsdp, **measured}
 
+    def rows_of(program, *options):
+        assert program.main([*options, "--json", str(tmp_path / "rows.json")]) == 0
+        return json.loads((tmp_path / "rows.json").read_text())
+
+    calls = []
+    monkeypatch.setattr(methods, "make_call", lambda *given: lambda: calls.append(given))
+    options = "--batch 2 --rounds 2 --seconds 0 --level PickUpLoc".split()
+    assert [row["method"] for row in rows_of(methods, *options)] == list(methods.METHODS)
+    assert calls == [("PickUpLoc", method, 2) for method in methods.METHODS] * 2  # they take turns
     monkeypatch.setattr(scaling, "launch", launch)
-    rows = tmp_path / "rows.json"
-    assert scaling.main(["--json", str(rows)]) == 0
-    found = [tuple(row[n] for n in ("processes", "devices", "fsdp")) for row in read(rows)]
+    found = [(row["processes"], row["devices"], row["fsdp"]) for row in rows_of(scaling)]
     assert found == [(count, count * each, fsdp) for count, each, fsdp in scaling.SETTINGS]
-    assert "100%" in capsys.readouterr().out
-
-
-def read(path):
-    return json.loads(path.read_text())
-
-
-@only_long
-def test_the_scaling_benchmark_measures_in_processes_of_its_own(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(scaling, "SETTINGS", ((2, 1, 2),))
-    rows = tmp_path / "rows.json"
-    options = ["--per-device", "1", "--seconds", "0.01", "--json", str(rows)]
-    assert scaling.main(options) == 0
-    written = read(rows)
-    assert [(row["processes"], row["devices"], row["fsdp"]) for row in written] == [(2, 2, 2)]
-    assert all(row["examples_per_second"] > 0 < row["exchange_seconds"] for row in written)

@@ -1,4 +1,4 @@
-"""The losses of every method that learns from rewards, and PlaTe's, written down once more.
+"""The losses of methods, written down once more.
 
 Each is a function of the trained parameters alone: all that a method holds fixed is computed
 before, so that not only its value but also its gradient says whether the method is what it is.
@@ -13,11 +13,12 @@ import numpy as np
 import optax
 import pytest
 
-from leapjax.agents import bcq, cql, iql, mopo, plate, qr_dqn, rem
+from leapjax.agents import bc, bcq, classifier, cql, iql, mopo, plate, qr_dqn, rem
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.models.trajectory import ModelConfig
 from tests import mixed, toy
+from tests.parameters import random_like
 from tests.programs import only_long
 from tests.quick import quick_jit
 
@@ -25,6 +26,8 @@ BATCH, PAST, WIDTH, CHOICES, DISCOUNT = 16, 2, 16, 2, 0.9
 DOMAIN = mixed.DOMAIN._replace(actions=("left", "right", "end"))
 MODEL = ModelConfig("paper", layers=1, heads=1, width=WIDTH, dropout=0.0)
 KEY = jax.random.key(4)
+KEYS = jax.vmap(jax.random.fold_in, (None, 0))(KEY, np.arange(BATCH))  # of examples
+DRAWS = jax.vmap(jax.random.split)(KEYS)[:, 1]  # where they drop nothing out with the others
 IQL = {
     "discount": DISCOUNT, "expectile": 0.8, "inverse_temperature": 2.0, "largest_weight": 1.5
 }  # fmt: skip
@@ -39,23 +42,30 @@ class Case(NamedTuple):
     batch: object
 
 
-def make_case(module, settings, domain=DOMAIN, horizon=1, data=mixed.steps, seed=0):
+def make_case(module, settings, domain=DOMAIN, horizon=1):
+    """On mixed steps, or on plans of demonstrations."""
     learn = TrainingConfig(batch=BATCH, windows="step")
     setup = Setup(domain, PAST, horizon, MODEL, learn, settings)
     agent = module.make_agent(setup)
-    rng = np.random.default_rng(seed)
-    state = jax.tree.map(
-        lambda x: jnp.asarray(rng.normal(scale=0.5, size=x.shape), x.dtype),
-        jax.eval_shape(agent.init, jax.random.key(0)),
-    )
-    batch = quick_jit(agent.batch)(jax.random.key(3), jax.tree.map(jnp.asarray, data()))
+    state = random_like(jax.eval_shape(agent.init, jax.random.key(0)))
+    data = mixed.steps() if horizon == 1 else windows.concatenate(toy.demonstrations())
+    batch = quick_jit(agent.batch)(jax.random.key(3), jax.tree.map(jnp.asarray, data))
     return Case(setup, agent, state, batch)
 
 
 def assert_is(case, loss):
-    """The agent's loss, and the norm of its gradient, are those of a function of parameters."""
-    update = quick_jit(lambda *inputs: case.agent.update(*inputs)[1])
-    found = update(case.state, case.batch, KEY)
+    """The agent's loss, and the norm of its gradient, are those of a function of parameters.
+
+    A target network that has all of its parameters follows slowly.
+    """
+    after, found = quick_jit(case.agent.update)(case.state, case.batch, KEY)
+    if jax.tree.structure(after.extra) == jax.tree.structure(after.params):
+        rate = case.setup.settings.target_rate
+        expected = optax.incremental_update(after.params, case.state.extra, rate)
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
+            after.extra, expected,
+        )  # fmt: skip
     expected, gradient = quick_jit(jax.value_and_grad(loss))(case.state.params)
     assert float(found["loss"]) == pytest.approx(float(expected), rel=1e-4)
     norm = float(optax.tree.norm(gradient))
@@ -121,7 +131,37 @@ def many(module):
     return lambda params, contexts: call(params, "__call__", contexts)
 
 
-@only_long  # its values are those of value iteration: test_rewards.py
+def test_bc():
+    """Of every state of a context; not of what was before the episode."""
+    case = make_case(bc, bc.Settings())
+    encode = jax.vmap(case.agent.energy.encode, (None, 0))
+    actions = jnp.concatenate([case.batch.context.actions, case.batch.actions], axis=1)
+    known = actions < CHOICES
+    assert not known.all()
+
+    def loss(params):
+        logits = encode(params, case.batch.context)["logits"]
+        return mean(cross_entropy(logits, jnp.where(known, actions, 0)), known)
+
+    assert_is(case, loss)
+
+
+def test_classifier():
+    case = make_case(classifier, classifier.Settings(), mixed.DOMAIN, horizon=4)
+    setup, batch = case.setup, case.batch
+    call = caller(classifier.SequenceClassifier(setup.model, setup.sizes, setup.make_encoder()))
+    corrupted, degrees = jax.vmap(classifier.corrupt, (0, 0, 0, None))(
+        KEYS, batch.actions, batch.imitated, toy.DOMAIN.num_actions
+    )
+
+    def loss(params):
+        found = call(params, "degree", call(params, "encode", batch.context), corrupted)
+        return ((found - degrees) ** 2).mean()
+
+    assert_is(case, loss)
+    assert not case.agent.energy.accepts_mask
+
+
 def test_bcq():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = around(case.batch)
@@ -154,7 +194,6 @@ def iql_loss(value, qs, least, logits, returns, taken):
     )
 
 
-@only_long  # it learns in test_rewards.py
 def test_iql():
     case = make_case(iql, iql.Settings(**IQL))
     steps, params = around(case.batch), case.state.params["params"]
@@ -175,10 +214,9 @@ def test_iql():
 
 
 @only_long
-@pytest.mark.parametrize("share", [pytest.param(1.0, marks=only_long), 0.5])
-def test_mopo(share):
-    """Of the data alone; and of what is imagined, two steps far, too."""
-    settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=share)
+def test_mopo():
+    """Of the data, and of what is imagined, two steps far."""
+    settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=0.5)
     case = make_case(mopo, settings)
     steps, old, target = around(case.batch), case.state.params, case.state.extra
     call = caller(mopo.Networks(case.setup.make_policy(("features", WIDTH)), CHOICES, 3))
@@ -205,16 +243,13 @@ def test_mopo(share):
             + jnp.logaddexp(0, -ended)
         ).sum(axis=1)
         cloned = cross_entropy(call(params, "behaviour", now), steps.taken)
-        return mean(share * policy + ensemble + cloned, steps.known)
+        return mean(0.5 * policy + ensemble + cloned, steps.known)
 
     imagined = []  # features [B, 1, D], actions, returns, and how alive it still is
     features, alive = seen[:, -1:], jnp.ones((BATCH, 1))
-    keys = jax.vmap(lambda place: jax.random.split(jax.random.fold_in(KEY, place))[1])(
-        jnp.arange(BATCH)
-    )
     for step in range(2):
         draws = jax.vmap(lambda key, step=step: jax.random.split(jax.random.split(key, 2)[step]))(
-            keys
+            DRAWS
         )
         logits = call(old, "logits", features)
         taken = jax.vmap(jax.random.categorical)(draws[:, 0], logits)
@@ -234,7 +269,7 @@ def test_mopo(share):
             value, *qs = call(params, "judge", features)
             logits, least = call(params, "logits", features), least_of(features, taken)
             each = alive * iql_loss(value, qs, least, logits, returns, taken)
-            total += (1 - share) * each.mean() / 2
+            total += 0.5 * each.mean() / 2
         return total
 
     assert_is(case, loss)
@@ -288,8 +323,7 @@ def test_rem():
     case = make_case(rem, rem.Settings(discount=DISCOUNT, q_heads=count))
     steps = around(case.batch)
     apply = many(case.setup.make_policy(("q", CHOICES * count)))
-    keys = [jax.random.split(jax.random.fold_in(KEY, place))[1] for place in range(BATCH)]
-    mixtures = jnp.stack([rem.mixture(key, count) for key in keys])
+    mixtures = jnp.stack([rem.mixture(key, count) for key in DRAWS])
 
     def say(params, contexts):
         """[B, P, 2]: each example's own mixture."""
@@ -309,10 +343,7 @@ def test_rem():
 def test_plate():
     """Past an end nothing is chosen, and no state is predicted; those it predicts do not move."""
     horizon = 4
-    case = make_case(
-        plate, plate.Settings(state_weight=0.6), mixed.DOMAIN, horizon,
-        lambda: windows.concatenate(toy.demonstrations()),
-    )  # fmt: skip
+    case = make_case(plate, plate.Settings(state_weight=0.6), mixed.DOMAIN, horizon)
     actions, setup = case.batch.actions, case.setup
     module = plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
     call = caller(module)

@@ -107,7 +107,7 @@ def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(
     workplace, capsys, quick_begin
 ):
     lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
-    collection = lake.collect(3, 0, lambda done: None)
+    collection = lake.demonstrations.collect(3, 0, lambda done: None)
     for demonstration in collection.demonstrations:
         demonstration.rewards[:] = 0
     storage.save("mine/unrewarded-v0", collection, lake, "nothing is rewarded")

@@ -9,7 +9,8 @@ import optax
 import pytest
 
 from leapjax.agents.base import Setup, TrainingConfig
-from leapjax.domains.babyai import encoders, runs
+from leapjax.domains.babyai import repeats
+from leapjax.domains.babyai.encoders import state_tokens
 from leapjax.methods import find_method
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
@@ -38,7 +39,7 @@ def test_a_function_is_computed_once_for_each_run(size):
 
         return quick_jit(jax.value_and_grad(total, argnums=(0, 1)))(rows, 1.5)
 
-    found = gradient(lambda rows, function: runs.map_runs(function, pair, rows, size))
+    found = gradient(lambda rows, function: repeats.map_repeats(function, pair, rows, size))
     jax.effects_barrier()
     computed = len(parts)
     expected = gradient(lambda rows, f: jax.vmap(jax.vmap(f, (0, None)))(pair, rows))
@@ -62,8 +63,8 @@ def contexts(past):
 
 @pytest.mark.parametrize("differentiated", [False, pytest.param(True, marks=only_long)])
 def test_states_are_encoded_as_each_is_alone(differentiated, monkeypatch, past=3):
-    monkeypatch.setattr(encoders, "AT_A_TIME", 16)
-    encoder, batch = encoders.StateTokens(SIDE, 16).add_later_state(), contexts(past)
+    monkeypatch.setattr(state_tokens, "AT_A_TIME", 16)
+    encoder, batch = state_tokens.StateTokens(SIDE, 16).add_later_state(), contexts(past)
     one = jax.tree.map(lambda leaf: leaf[0], batch)
     params = quick_jit(encoder.init)(jax.random.key(0), one)
     weights = np.random.default_rng(0).normal(size=(4, past + 2, 16)).astype(np.float32)

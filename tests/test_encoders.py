@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.domains.babyai import encoders
+from leapjax.domains.babyai.encoders import cells, convolutions, distances, instructions
 from tests.quick import quick_jit
 
 SIDE = 6
@@ -44,7 +44,7 @@ def unrolled(start, cost, sweeps):
     """The recursion as it is written, for autodiff."""
 
     def sweep(distance, _):
-        padded = jnp.pad(distance, ((1, 1), (1, 1), (0, 0)), constant_values=encoders.FAR)
+        padded = jnp.pad(distance, ((1, 1), (1, 1), (0, 0)), constant_values=distances.FAR)
         near = [padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]]
         return jnp.minimum(start, cost + jnp.stack(near).min(axis=0)), None
 
@@ -53,27 +53,27 @@ def unrolled(start, cost, sweeps):
 
 def test_distances_are_dijkstras(field):
     start, cost = map(np.asarray, field)
-    distance = encoders.min_plus(*field, SIDE**2)
+    distance = distances.find_distances(*field, SIDE**2)
     for channel in range(start.shape[-1]):
         expected = dijkstra(start[..., channel], cost[..., channel])
         np.testing.assert_allclose(distance[..., channel], expected, rtol=1e-5)
 
 
 def test_a_way_is_found_only_within_the_sweeps():
-    start = jnp.full((SIDE, SIDE, 1), encoders.FAR).at[0, 0].set(0.0)
-    distance = encoders.min_plus(start, jnp.ones((SIDE, SIDE, 1)), 3)
+    start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[0, 0].set(0.0)
+    distance = distances.find_distances(start, jnp.ones((SIDE, SIDE, 1)), 3)
     x, y = np.indices((SIDE, SIDE))
-    expected = np.where(x + y <= 3, x + y, encoders.FAR)
+    expected = np.where(x + y <= 3, x + y, distances.FAR)
     np.testing.assert_array_equal(distance[..., 0], expected)
 
 
 def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
     odds = np.full((SIDE, SIDE, 1), 0.001 / 0.999)  # of being blocked
     odds[2, :-1] = 0.95 / 0.05  # a wall with a gap at its end
-    cost = encoders.entering_cost(jnp.log(odds))
-    np.testing.assert_allclose(cost[2, 0, 0], 1 - encoders.BARRIER * np.log(0.05), rtol=1e-5)
-    start = jnp.full((SIDE, SIDE, 1), encoders.FAR).at[3, 0].set(0.0)
-    distance = encoders.min_plus(start, cost, SIDE**2)[..., 0]
+    cost = distances.compute_entering_cost(jnp.log(odds))
+    np.testing.assert_allclose(cost[2, 0, 0], 1 - distances.BARRIER * np.log(0.05), rtol=1e-5)
+    start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[3, 0].set(0.0)
+    distance = distances.find_distances(start, cost, SIDE**2)[..., 0]
     around = 2 * (SIDE - 1) + 2
     np.testing.assert_allclose(distance[1, 0], around, rtol=0.01)
 
@@ -87,7 +87,7 @@ def test_the_gradient_is_autodiffs(field):
 
         return jax.jit(jax.grad(loss, argnums=(0, 1)))(*field)
 
-    for ours, expected in zip(gradient(encoders.min_plus), gradient(unrolled), strict=True):
+    for ours, expected in zip(gradient(distances.find_distances), gradient(unrolled), strict=True):
         np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
@@ -96,7 +96,7 @@ def test_the_gradient_is_autodiffs(field):
 )
 def test_a_convolution_is_xlas(side, padding, stride):
     image = jax.random.normal(jax.random.key(0), (5, 7, 3))
-    layer = encoders.Convolution(4, side, padding, stride)
+    layer = convolutions.Convolution(4, side, padding, stride)
     params = layer.init(jax.random.key(1), image)
     kernel = params["params"]["Dense_0"]["kernel"].reshape(side, side, 3, 4)
     expected = jax.lax.conv_general_dilated(
@@ -108,17 +108,17 @@ def test_a_convolution_is_xlas(side, padding, stride):
 
 def test_without_distance_fields_a_goal_is_only_known_nearby():
     """Convolutions alone carry what is in a cell as many cells as there are rounds of them."""
-    encoder = encoders.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
-    cells = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
+    encoder = distances.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
+    grid = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
     agent, near, far = jnp.array([0, 0]), jnp.array([2, 2]), jnp.array([3, 0])
-    params = jax.jit(encoder.init)(jax.random.key(1), cells, agent, near)
-    features, distances = encoder.apply(params, cells, agent, near)
+    params = jax.jit(encoder.init)(jax.random.key(1), grid, agent, near)
+    features, here = encoder.apply(params, grid, agent, near)
     assert features.shape == (SIDE, SIDE, 8)
-    assert distances.shape == (0,)
+    assert here.shape == (0,)
     assert {"source", "step"} == params["params"].keys()
 
     def read(changed):
-        return encoder.apply(params, cells.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
+        return encoder.apply(params, grid.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
 
     assert not np.allclose(read(near), features[0, 0])
     np.testing.assert_array_equal(read(far), features[0, 0])
@@ -128,15 +128,15 @@ def test_reading_around_and_at_a_cell():
     image = jnp.arange(SIDE * SIDE * 2, dtype=jnp.float32).reshape(SIDE, SIDE, 2)
     padded = np.pad(np.asarray(image), ((2, 2), (2, 2), (0, 0)))
     for x, y in ((0, 0), (3, 2), (5, 5)):
-        around = encoders.neighbourhood(image, jnp.array([x, y]), 2)
+        around = cells.read_neighbourhood(image, jnp.array([x, y]), 2)
         np.testing.assert_array_equal(around, padded[x : x + 5, y : y + 5].reshape(-1))
-        np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([x, y])), image[x, y])
-    assert not encoders.one_cell(jnp.array([-1, -1]), SIDE).any()
-    np.testing.assert_array_equal(encoders.feature_at(image, jnp.array([-1, -1])), [0, 0])
+        np.testing.assert_array_equal(cells.read_cell(image, jnp.array([x, y])), image[x, y])
+    assert not cells.mark_cell(jnp.array([-1, -1]), SIDE).any()
+    np.testing.assert_array_equal(cells.read_cell(image, jnp.array([-1, -1])), [0, 0])
 
 
 def test_the_state_after_the_last_word_ignores_padding():
-    encoder = encoders.InstructionEncoder(10, 8)
+    encoder = instructions.InstructionEncoder(10, 8)
     words = jnp.array([3, 1, 4, 0, 0])
     params = jax.jit(encoder.init)(jax.random.key(0), words)
     encode = jax.jit(encoder.apply)
@@ -149,19 +149,19 @@ def test_the_state_after_the_last_word_ignores_padding():
 
 
 def test_cells_attend_to_the_words_that_are_given():
-    encoder, attention = encoders.InstructionEncoder(10, 8), encoders.WordAttention(2, 4)
-    cells = jax.random.normal(jax.random.key(0), (3, 4, 5))
+    encoder, attention = instructions.InstructionEncoder(10, 8), instructions.WordAttention(2, 4)
+    grid = jax.random.normal(jax.random.key(0), (3, 4, 5))
     words = jnp.array([3, 1, 4])
     encoded = jax.jit(encoder.init_with_output)(jax.random.key(1), words)[0]
-    params = jax.jit(attention.init)(jax.random.key(2), cells, encoded)
+    params = jax.jit(attention.init)(jax.random.key(2), grid, encoded)
     attend = jax.jit(attention.apply)
-    said = attend(params, cells, encoded)
-    assert said.shape == cells.shape
+    said = attend(params, grid, encoded)
+    assert said.shape == grid.shape
     padded = jax.tree.map(lambda x: jnp.concatenate([x, 100 * x]), encoded)
     padded = padded._replace(given=jnp.arange(6) < 3, whole=encoded.whole)
-    np.testing.assert_allclose(attend(params, cells, padded), said, atol=1e-6)
+    np.testing.assert_allclose(attend(params, grid, padded), said, atol=1e-6)
     # Each cell by itself, and none is told the same as another.
-    alone = attend(params, cells[1:2, 2:3], encoded)
+    alone = attend(params, grid[1:2, 2:3], encoded)
     np.testing.assert_allclose(alone[0, 0], said[1, 2], atol=1e-6)
     assert np.unique(np.asarray(said).reshape(12, -1).round(4), axis=0).shape[0] == 12
 
@@ -175,7 +175,7 @@ def test_halving_is_max_pooling(shape):
         return jax.value_and_grad(lambda x: (pool(x) ** 2).sum())(image)
 
     usual = loss(lambda x: nn.max_pool(x, (2, 2), (2, 2)))
-    for ours, theirs in zip(loss(encoders.halved), usual, strict=True):
+    for ours, theirs in zip(loss(convolutions.halve), usual, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
@@ -194,14 +194,14 @@ def test_groups_are_normalised_as_by_flax(shape):
 
         return quick_jit(jax.value_and_grad(of, argnums=(0, 1), has_aux=True))(params, image)
 
-    ours, usual = loss(encoders.GroupNorm()), loss(nn.GroupNorm(encoders.NORM_GROUPS))
+    ours, usual = loss(convolutions.GroupNorm()), loss(nn.GroupNorm(convolutions.NORM_GROUPS))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, usual)
 
 
 def test_normalisation_has_the_parameters_of_flax():
     """So that what was trained with either is read by the other; and its precision."""
     image = jnp.ones((2, 2, 8), jnp.bfloat16)
-    ours, usual = encoders.GroupNorm(jnp.bfloat16), nn.GroupNorm(8, dtype=jnp.bfloat16)
+    ours, usual = convolutions.GroupNorm(jnp.bfloat16), nn.GroupNorm(8, dtype=jnp.bfloat16)
     shapes = [jax.eval_shape(module.init, jax.random.key(0), image) for module in (ours, usual)]
     assert jax.tree.all(jax.tree.map(lambda a, b: a == b, *shapes))
     assert ours.apply(usual.init(jax.random.key(0), image), image).dtype == jnp.bfloat16

@@ -11,6 +11,7 @@ import leapjax as leap
 from leapjax import fitting, pretrained
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import specify
+from leapjax.domain import Demonstrations
 from leapjax.models.trajectory import ModelConfig
 from leapjax.presets import find_preset
 from tests import frozen_lake
@@ -23,7 +24,7 @@ SMALL = ModelConfig(width=16, heads=2, layers=1, dropout=0.0)
 def star():
     """A level, and demonstrations of it."""
     domain = leap.make_domain("stars", "Star2x3")
-    return domain, domain.collect(6, 0, lambda count: None).demonstrations
+    return domain, domain.demonstrations.collect(6, 0, lambda count: None).demonstrations
 
 
 def test_what_is_fitted_is_what_is_saved(star, tmp_path):
@@ -79,7 +80,7 @@ def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypat
         jax.tree.map(lambda x: np.zeros((3, *x.shape), x.dtype), made.blank),
         np.zeros(2, np.int32), np.ones(2, np.float32), True, False, 0,
     )  # fmt: skip
-    made = made._replace(check=lambda observations, where: None)
+    made = made._replace(demonstrations=Demonstrations())
     found = leap.fit([episode], made, method).specification
     chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
     expected = specify(chosen, 0, made)
@@ -89,7 +90,7 @@ def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypat
 def test_a_domain_that_no_table_has_can_be_fitted_and_not_saved(monkeypatch, tmp_path):
     monkeypatch.setattr(fitting, "make_begin", make_begin)
     lake = frozen_lake.make(frozen_lake.LEVEL, None)
-    data = lake.collect(2, 0, lambda count: None).demonstrations
+    data = lake.demonstrations.collect(2, 0, lambda count: None).demonstrations
     planner = leap.fit(data, lake, "bc", steps=0, model=SMALL)
     with pytest.raises(leap.UserError, match="cannot be saved"):
         planner.save(tmp_path / "mine")

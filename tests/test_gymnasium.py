@@ -27,7 +27,7 @@ from experiments import gymnasium as program
 from leapjax import domains
 from leapjax.data import storage, windows
 from leapjax.data.storage.spaces import SPACES
-from leapjax.domain import Collection, Domain, blank_context
+from leapjax.domain import Collection, Demonstrations, Domain, blank_context
 from leapjax.domains.gymnasium.domain import GYMNASIUM, Settings, make
 from leapjax.domains.gymnasium.observations import (
     Part,
@@ -36,6 +36,7 @@ from leapjax.domains.gymnasium.observations import (
     check_choices,
     parts_of,
 )
+from leapjax.domains.gymnasium.recorded import describe_environment
 from leapjax.environments import Criterion, GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.rollouts import evaluate
@@ -196,7 +197,7 @@ def test_success_is_what_the_environment_says_or_the_user():
     assert play(make("CartPole-v1", Settings(success_return=2.0)), [0] * 3)[:2] == [False, True]
     # What is asked of MountainCar is not to lose more than 110, which nobody has at the start.
     assert not any(play(make("MountainCar-v0", Settings()), [1] * 20))
-    assert make("Odd-v0", Settings()).arguments is None
+    assert describe_environment(gym.make("Odd-v0")).arguments is None
     short = make("Corridor-v0", Settings(max_steps=2))
     assert short.max_steps == 2 and make("Endless-v0", Settings(max_steps=7)).max_steps == 7
     adapter = short.make_adapter()
@@ -237,7 +238,9 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
     shares = {None: 1 / 5, 1.0: 3 / 5, 0.0: 4 / 5, -2.0: 1.0}
     for least, share in shares.items():
         criterion = Criterion(least, least is not None)
-        found = judge_data(data, domain._replace(criterion=criterion))
+        found = judge_data(
+            data, domain._replace(demonstrations=Demonstrations(criterion=criterion))
+        )
         assert found == {"success": share, "return": pytest.approx(0.2)}
         played = []
         for each in data:
@@ -245,13 +248,13 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
             adapter.reset(0)
             played.append([adapter.step(0).success for _ in each.rewards][-1])
         assert np.mean(played) == share
-    assert judge_data(data, domain._replace(criterion=None)) is None
+    assert judge_data(data, domain._replace(demonstrations=Demonstrations())) is None
     assert judge_data([], domain) is None
 
 
 def test_a_criterion_says_where_it_comes_from():
     criteria = {
-        name: make(name, Settings(success_return=least)).criterion
+        name: make(name, Settings(success_return=least)).demonstrations.criterion
         for name, least in (("CartPole-v1", None), ("CartPole-v0", 3.0), ("Corridor-v0", None))
     }
     assert criteria["CartPole-v1"] == Criterion(475.0)
@@ -612,7 +615,7 @@ def test_dicts_of_any_kind_are_one_structure_in_data(minari_folder):
     seen = {"b": np.arange(3), "a": np.ones((3, 2), np.float32)}
     rest = np.zeros(2, np.int32), np.zeros(2, np.float32), True, False, storage.UNKNOWN_SEED
     kinds = (dict, OrderedDict, FrozenDict)
-    domains = [Domain("Own", nothing, None, ("go", "end"), 9, kind(blank), {}) for kind in kinds]
+    domains = [Domain("Own", nothing, ("go", "end"), 9, kind(blank), {}) for kind in kinds]
     collection = Collection([Demonstration(kind(seen), *rest) for kind in kinds], {})
     storage.save("my/kinds-v0", collection, domains[0], "kinds")
     for domain in domains:
@@ -633,7 +636,7 @@ def test_choices_that_there_are_not_are_refused():
     with pytest.raises(UserError, match="episode 0: more: a choice of 2, expected 0 to 1"):
         check_choices(several, {**good, "more": np.array([[0, 0], [2, 3]])}, "episode 0")
     with pytest.raises(UserError, match="a choice of 16, expected 0 to 15"):
-        make("FrozenLake-v1", Settings()).check(np.array([16]), "episode 0")
+        make("FrozenLake-v1", Settings()).demonstrations.check(np.array([16]), "episode 0")
 
 
 def test_what_is_made_is_closed(monkeypatch):

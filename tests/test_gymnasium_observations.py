@@ -305,7 +305,7 @@ def test_statistics_are_kept_with_the_specification(tmp_path):
         "gymnasium", ["--level=Sign-v0", *SMALL, "--steps=0", "--demos=0"]
     )
     before = specify(chosen, 0, domain)
-    after = dataclasses.replace(before, statistics=domain.measure(data))
+    after = dataclasses.replace(before, statistics=domain.scaling.measure(data))
     assert after.statistics == (((100.0, 200.0),),)
     assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before
     assert pretrained.identity(before) != pretrained.identity(after)

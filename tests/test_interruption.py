@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from experiments import babyai
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
 from leapjax.files import only_process_in
-from leapjax.running import jax_setup, results, startup
+from leapjax.running import jax_setup, results
 from leapjax.running import train as running_train
 from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
 from leapjax.running.metrics import read_metrics
@@ -54,38 +55,19 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
             super().update(done, note)
 
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, pytest.raises(SystemExit, match=str(code)):
         patch.setattr(running_train, "Meter", Stopped)
         patch.setattr(jax_setup, "exit_at_once", sys.exit)
-        with pytest.raises(SystemExit, match=str(code)):
-            babyai.main(options)
-    error = capsys.readouterr().err
-    stopped = f"stopped by {signal.Signals(number).name}"
-    assert error == f"{stopped}; continue with: python -m experiments.babyai {' '.join(options)}\n"
+        babyai.main(options)
+    stopped = f"stopped by {signal.Signals(number).name}; continue with: python -m"
+    said = capsys.readouterr().err
+    assert said == f"{stopped} experiments.babyai {' '.join(options)}\n"
     (folder,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["20"]
-    assert not (tmp_path / "runs" / "babyai.jsonl").exists()
     assert babyai.main(options) == 0
     assert "continuing at step 20 of 60" in capsys.readouterr().out
     assert [m["step"] for m in read_metrics(folder)] == [20, 40, 60]
     assert len(results.read(tmp_path / "runs" / "babyai.jsonl")) == 1
-
-
-@only_long
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_process_that_is_asked_to_stop_goes_on_as_if_it_had_not_been(place, number, code):
-    runs = f"stopped{number}"
-    run = place.start(runs)
-    place.wait_for_checkpoint(run, runs)
-    run.send_signal(number)
-    assert run.wait(60) == code
-    error = run.stderr.read()
-    assert f"stopped by {signal.Signals(number).name}; continue with: python -m" in error
-    assert f"--runs {runs}" in error and "Traceback" not in error
-    assert 0 < max(place.steps_saved(runs)) < STEPS
-    assert not place.rows(runs)
-    place.finish(place.start(runs))
-    place.check_same_end(runs)
 
 
 @only_long
@@ -116,22 +98,22 @@ def catches_signals(process):
 def test_a_signal_while_a_program_is_imported(tmp_path, trial):
     rng = np.random.default_rng(trial)
     number, code = ((signal.SIGINT, 130), (signal.SIGTERM, 0))[trial % 2]
+    installed = (
+        "import sys; sys.argv[0] = 'bin/leapjax'; from leapjax.__main__ import main; "
+        "main(['stars', *sys.argv[1:]])"
+    )
     program = (
-        [*"-m experiments.stars".split(), *RANDOM],
-        ["-m", "benchmarks.methods"],
-        ["-c", "import sys; sys.argv[0] = 'bin/leapjax'; from leapjax.__main__ import main; "
-         "main(['stars', *sys.argv[1:]])", *RANDOM],
+        ["-m", "experiments.stars", *RANDOM], ["-m", "benchmarks.methods"],
+        ["-c", installed, *RANDOM],
     )[trial % 3]  # fmt: skip
     run = subprocess.Popen(
-        [sys.executable, *program], cwd=tmp_path, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        [sys.executable, *program], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
     )  # fmt: skip
     while not catches_signals(run):
         assert run.poll() is None, run.stderr.read()
         time.sleep(0.001)
     time.sleep(rng.uniform(0, 3))
-    assert run.poll() is None
     run.send_signal(number)
     assert run.wait(60) == code
     (line,) = run.stderr.read().splitlines()
@@ -140,39 +122,33 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
 
 def test_a_library_has_no_handlers():
     """`experiments` changes nothing unless it is the program."""
-    assert not startup.is_program()
     check = (
         "import signal, sys, experiments, leapjax.checkpoints\n"
         "leapjax.checkpoints.hush_orbax()\n"
         "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL\n"
         "assert sys.unraisablehook is sys.__unraisablehook__"
     )
-    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=False).returncode == 0
+    subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True)
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
     with interruptible() as interruption:
-        with pytest.raises(Interrupted, match="SIGTERM"):
-            os.kill(os.getpid(), signal.SIGTERM)
-        with pytest.raises(Interrupted, match="SIGTERM"):  # as if nobody had seen it
-            interruption.check()
+        for look in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
+            with pytest.raises(Interrupted, match="SIGTERM"):
+                look()
         with pytest.raises(Interrupted, match="SIGTERM"), interruption.deferred():
             pytest.fail("long work began")
 
 
 def test_a_deferred_signal_waits_and_a_second_one_does_not():
-    with interruptible() as interruption:
-        with pytest.raises(Interrupted, match="SIGINT"), interruption.deferred():
-            assert not interruption.requested
-            os.kill(os.getpid(), signal.SIGINT)
-            assert interruption.requested == signal.SIGINT
-        reached = False
-    with interruptible() as interruption:
-        with pytest.raises(Interrupted), interruption.deferred():
-            os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGTERM)
-            reached = True
-        assert not reached
+    refused = pytest.raises(Interrupted, match="SIGINT")
+    with interruptible() as interruption, refused, interruption.deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+        assert interruption.requested == signal.SIGINT
+    with interruptible() as interruption, pytest.raises(Interrupted), interruption.deferred():
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("the second waited")
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -201,24 +177,22 @@ def state(step):
 
 
 def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path):
-    saved = Checkpoints(tmp_path / "checkpoints")
+    saved, said = Checkpoints(tmp_path), []
     for step in (1, 2, 3):
         saved.save(state(step))
     saved.close()
-    for file in (tmp_path / "checkpoints" / "3" / "default").rglob("*"):
+    for file in (tmp_path / "3" / "default").rglob("*"):
         if file.is_file():
             file.write_bytes(file.read_bytes()[:20])
-    saved, said = Checkpoints(tmp_path / "checkpoints"), []
+    saved = Checkpoints(tmp_path)
     restored = saved.restore(state(0), skipped=said.append)
     assert int(restored.step) == 2
     np.testing.assert_array_equal(restored.params["w"], 2.0)
-    assert len(said) == 1 and "checkpoints/3 is damaged" in said[0]
-    assert "the one before is used" in said[0]
-    # The step that was damaged can be saved again.
-    saved.save(state(3))
+    assert len(said) == 1 and re.search("3 is damaged.*the one before is used", said[0])
+    saved.save(state(3))  # the step that was damaged
     saved.close()
-    assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 3
-    assert (tmp_path / "checkpoints" / "3.damaged").is_dir()
+    assert int(Checkpoints(tmp_path).restore(state(0)).step) == 3
+    assert (tmp_path / "3.damaged").is_dir()
 
 
 def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp_path, monkeypatch):
@@ -237,66 +211,19 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp
 
 def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
     (tmp_path / "below").mkdir()
-    saved = Checkpoints(tmp_path / "below" / ".." / "checkpoints")  # which leads to the same
+    folder = tmp_path / "below" / ".." / "checkpoints"  # which leads to the same
+    saved = Checkpoints(folder)
     saved.save(state(1))
     saved.close()
-    like = jax.eval_shape(lambda: state(0)).params
-    found = restore_params(tmp_path / "below" / ".." / "checkpoints", like)
+    found = restore_params(folder, jax.eval_shape(lambda: state(0)).params)
     np.testing.assert_array_equal(found["w"], 1.0)
     other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
     with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
-        Checkpoints(tmp_path / "checkpoints").restore(other)
-    assert (tmp_path / "checkpoints" / "1").is_dir()
+        Checkpoints(folder).restore(other)
+    assert (folder / "1").is_dir()
 
 
 def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
     refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
     with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
         pass
-    with only_process_in(tmp_path / "run"):
-        pass
-
-
-def test_a_disk_that_is_full_is_one_line_and_older_files_stay(tmp_path):
-    program = f"""
-import resource, sys
-from pathlib import Path
-import jax
-import jax.numpy as jnp
-from leapjax import files
-from leapjax.checkpoints import Checkpoints
-from leapjax.errors import UserError
-from leapjax.types import TrainState
-def state(step, size):
-    noise = jax.random.normal(jax.random.key(0), (size, size))  # does not compress
-    return TrainState({{"w": noise}}, (), jnp.int32(step))
-folder = Path({str(tmp_path)!r})
-files.write_text(folder / "row.json", "old")
-saved = Checkpoints(folder / "checkpoints")
-saved.save(state(1, 50))
-saved._manager.wait_until_finished()
-# No file may grow beyond this: what a full disk does, to this process alone.
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-try:
-    files.write_text(folder / "row.json", "new" * 100_000)
-except UserError as error:
-    print("row:", error)
-try:
-    saved.save(state(2, 1000))
-    saved.close()
-except UserError as error:
-    print("state:", error)
-resource.setrlimit(resource.RLIMIT_FSIZE, (0, 100_000))
-with files.only_process_in(folder / "run"):  # which takes no room
-    print("inside")
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False
-    )
-    lines = done.stdout.splitlines()
-    assert lines[0].startswith(f"row: cannot write {tmp_path}/row.json"), done.stderr[-2000:]
-    assert lines[1].startswith(f"state: cannot write a checkpoint to {tmp_path}/checkpoints")
-    assert lines[2] == "inside"
-    assert (tmp_path / "row.json").read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".row")] == []
-    assert int(Checkpoints(tmp_path / "checkpoints").restore(state(0)).step) == 1

@@ -6,8 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.domains.babyai import encoders, symmetries, vocabulary
+from leapjax.domains.babyai import symmetries, vocabulary
 from leapjax.domains.babyai.adapter import END, NUM_ACTIONS
+from leapjax.domains.babyai.encoders.context_tokens import ContextTokens
+from leapjax.domains.babyai.encoders.state_tokens import StateTokens
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
@@ -42,8 +44,8 @@ def make(kind, architecture, past, dtype="float32"):
     config = ModelConfig(architecture, 2, 2, width=16, dtype=dtype, neighbours=neighbours)
     settings = Settings(channels=8, rounds=1, fields=2, sweeps=5, word_heads=2)
     encoder = {
-        "paper": encoders.StateTokens(SIDE, config.width, dtype),
-        "leapjax": encoders.ContextTokens(settings, config.width, dtype),
+        "paper": StateTokens(SIDE, config.width, dtype),
+        "leapjax": ContextTokens(settings, config.width, dtype),
     }[architecture]
     return kind(config, Sizes(ACTIONS, past, HORIZON, MAX_STEPS), encoder)
 
@@ -495,7 +497,7 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
 )
 def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     """The current one, as equation 4 has it; or what does not depend on where the agent is."""
-    encoder = encoders.StateTokens(SIDE, 16)
+    encoder = StateTokens(SIDE, 16)
     sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
     module = build(ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state)
     here = random_context(0, past)
@@ -522,7 +524,7 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
 
 
 def test_where_embeddings_of_the_paper_start():
-    encoder = encoders.StateTokens(SIDE, 64)
+    encoder = StateTokens(SIDE, 64)
 
     @quick_jit
     def tables(key):

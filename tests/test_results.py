@@ -3,8 +3,6 @@
 import json
 import math
 import subprocess
-from importlib import metadata
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from experiments.tables import measured
 from leapjax.errors import UserError
 from leapjax.rollouts import Episodes
 from leapjax.running import results
-from tests.programs import ROOT
+from tests.programs import ROOT, toy_row
 
 
 @pytest.fixture
@@ -51,33 +49,7 @@ def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
     assert results.code_version(checkout) == f"+g{latest}" != version
 
 
-def test_without_a_repository_only_the_version_is_known(tmp_path):
-    assert results.code_version(tmp_path) == ""
-    (tmp_path / ".git").write_text("damaged")
-    assert results.code_version(tmp_path) == ""
-
-
-def test_a_row_can_be_made_without_the_packages_of_other_domains(monkeypatch):
-    def version(name):
-        if name in ("minigrid", "ale-py"):
-            raise metadata.PackageNotFoundError(name)
-        return "1.0"
-
-    monkeypatch.setattr(results.metadata, "version", version)
-    found = results.versions()
-    assert found["jax"] == "1.0" and not {"minigrid", "ale-py"} & found.keys()
-
-
-def test_rows_name_the_devices_that_they_were_made_with(monkeypatch):
-    alone = results.versions()["machine"]
-    assert "H100" not in alone  # the devices of these tests are cores
-    gpus = [SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")] * 2
-    monkeypatch.setattr(results.jax, "local_devices", lambda: gpus)
-    assert results.versions()["machine"] == f"{alone}, 2 NVIDIA H100"
-
-
-ROW = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
-ROW["success"] = 1.0
+ROW = toy_row()
 
 
 def write_rows(path, *rows):
@@ -102,13 +74,10 @@ def test_a_row_twice_is_refused_in_files_that_were_merged(tmp_path):
     [
         ({"seed": True}, "seed is a bool, expected int"),
         ({"seed": 2**32}, "seed is 4294967296, expected at least 0 and at most 4294"),
-        ({"episodes": 0}, "episodes is 0, expected at least 1"),
         ({"successes": 2}, "2 successes of 1 episodes"),
+        ({"success": 0.6}, r"success is 0\.6, of 1 of 1 episodes"),
         ({"mean_length": float("nan")}, "mean_length is nan: no number that a run could"),
-        ({"mean_length": 1e300}, "mean_length is 1e.300: no number that a run could"),
-        ({"plans_per_second": 0}, "plans_per_second is 0, expected at least"),
         ({"paper_success": "95"}, "paper_success is a str, expected float"),
-        ({"configuration": None}, "configuration is a NoneType, expected object"),
         ({"configuration": {"planner": 3}}, "configuration.planner is a int, expected object"),
         ({"mean_return": None}, "mean_return is a NoneType, expected float"),
     ],
@@ -132,12 +101,8 @@ def test_an_object_that_names_a_field_twice(tmp_path):
         ("planning", lambda v: v[3].update(batch="1"), r"\[3\].batch is a str, expected int"),
         ("training", lambda v: v[0]["parts"][1].pop("ms"), r"\[0\].parts\[1\] without ms"),
         ("quality", lambda v: v[0].update(successes=10**6), "1000000 successes of"),
-        ("methods", lambda v: v[0].update(plans_per_second=0), "expected at least"),
         ("landscape", lambda v: v.clear(), "empty"),
-        ("landscape", lambda v: v[0]["planning"]["mean"].pop(), "other lengths"),
-        ("atari-data", lambda v: v["Pong"].clear(), "Pong.*empty"),
         ("atari-energy", lambda v: v["Pong"]["returns"].pop(), "Pong.*other numbers"),
-        ("atari-cost", lambda v: v[0].update(preset="x"), "expected one of leapjax, paper"),
     ],
 )
 def test_measurements_that_no_table_can_show(tmp_path, name, change, says):
@@ -149,13 +114,10 @@ def test_measurements_that_no_table_can_show(tmp_path, name, change, says):
         measured.read(path)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("mean_return", math.nan), ("planner", {"temperature": math.inf})]
-)
-def test_a_row_is_json_or_refused(tmp_path, field, value):
+def test_a_row_is_json_or_refused(tmp_path):
     path = tmp_path / "rows.jsonl"
-    with pytest.raises(UserError, match=f"{field} of a new row is not finite"):
-        results.record(path, {"hash": "a", field: value})
+    with pytest.raises(UserError, match="planner of a new row is not finite"):
+        results.record(path, {"hash": "a", "planner": {"temperature": math.inf}})
     assert not path.exists()
 
 

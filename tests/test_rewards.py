@@ -8,86 +8,97 @@ import numpy as np
 import pytest
 
 from leapjax import batching
-from leapjax.agents import bc, bcq, dt, iql, leap, mopo, returns
+from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, returns
 from leapjax.agents.base import Setup, TrainingConfig
+from leapjax.domain import Scaling
 from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
 from tests.programs import only_long
 from tests.quick import quick_jit
-from tests.toy import LEFT, RIGHT
+from tests.toy import LEFT, RIGHT, WAIT
 
-MODULES = {"bc": bc, "dt": dt, "bcq": bcq, "iql": iql, "mopo": mopo}
 QUICKLY = {"discount": 0.9, "target_rate": 0.1}
-SETTINGS = {
-    "bc": bc.Settings(), "dt": dt.Settings(),
-    "bcq": bcq.Settings(**QUICKLY),
+# Without waiting, which nobody does in the data: what is not there has any value at all, and
+# only CQL and BCQ know what to do about that.
+COVERED = mixed.DOMAIN._replace(actions=("left", "right", "end"))
+CASES = {
+    "bc": (bc, bc.Settings(), mixed.DOMAIN),
+    "dt": (dt, dt.Settings(), mixed.DOMAIN),
+    "bcq": (bcq, bcq.Settings(**QUICKLY), mixed.DOMAIN),
     # Advantages are small here: far from the middle a wrong step costs a tenth.
-    "iql": iql.Settings(**QUICKLY, inverse_temperature=20.0),
+    "iql": (iql, iql.Settings(**QUICKLY, inverse_temperature=20.0), mixed.DOMAIN),
     # What is imagined is wrong at first: with more of it, some runs end up going one way.
-    "mopo": mopo.Settings(**QUICKLY, inverse_temperature=10.0, real_share=0.8),
+    "mopo": (
+        mopo, mopo.Settings(**QUICKLY, inverse_temperature=10.0, real_share=0.8), mixed.DOMAIN
+    ),
+    # The conservative term must not cost more than a wrong step.
+    "cql": (cql, cql.Settings(**QUICKLY, alpha=0.1), mixed.DOMAIN),
+    "cql without": (cql, cql.Settings(**QUICKLY, alpha=0.0), mixed.DOMAIN),
+    "qr_dqn": (qr_dqn, qr_dqn.Settings(**QUICKLY, quantiles=8), COVERED),
+    "rem": (rem, rem.Settings(**QUICKLY, q_heads=8), COVERED),
 }  # fmt: skip
-STEPS = 600
-
-
-def trained(name, architecture="leapjax", past=0):
-    """As `_trained`: the same arguments, however they are given, are trained once."""
-    return _trained(name, architecture, past)
 
 
 @functools.cache
-def _trained(name, architecture, past):
+def trained(case):
     """An agent after a moment of training on walks that go wrong more often than right."""
-    model = ModelConfig(architecture, layers=1, heads=1, width=32, dropout=0.0)
+    module, settings, domain = CASES[case]
+    model = ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0)
     # What MOPO imagines is less sure to settle: at the others' rate one run in eight does not.
-    rate = 2e-3 if name == "mopo" else 3e-3
     learn = TrainingConfig(
-        STEPS, batch=128, warmup=10, learning_rate=rate, final_fraction=0.0, weight_decay=0.0,
-        windows="step",
+        300 if case == "cql" else 600, batch=128, warmup=10, final_fraction=0.0, weight_decay=0.0,
+        learning_rate=2e-3 if case == "mopo" else 3e-3, windows="step",
     )  # fmt: skip
-    setup = Setup(mixed.DOMAIN, past, 1, model, learn, SETTINGS[name])
-    agent = MODULES[name].make_agent(setup)
-    return agent, *toy.learn(agent, mixed.steps(), STEPS)
+    agent = module.make_agent(Setup(domain, 0, 1, model, learn, settings))
+    return agent, *toy.learn(agent, mixed.steps(), learn.steps)
 
 
-def acts(agent, params, past=0):
-    """What it does first, from each place."""
-    planner = batching.compile_planner(agent.energy, GibbsConfig(1, 1, temperature=0.0))
-    keys = jax.random.split(jax.random.key(0), len(mixed.PLACES))
-    return np.asarray(planner(params, keys, mixed.contexts(past)).actions[:, 0])
+@functools.cache
+def scores(case):
+    """What a method says of each action and the end, at each place."""
+    agent, state, _ = trained(case)
+
+    @quick_jit
+    @jax.vmap
+    def of_place(context):
+        memory, first = agent.energy.encode(state.params, context), jnp.zeros(1, jnp.int32)
+        return -agent.energy.conditional(state.params, memory, first, first)[0]
+
+    return np.asarray(of_place(mixed.contexts(0)))
 
 
-def memories(agent, params):
-    return quick_jit(jax.vmap(agent.energy.encode, (None, 0)))(params, mixed.contexts(0))
+@pytest.mark.parametrize(
+    "case",
+    ["cql", *(pytest.param(x, marks=only_long) for x in ("bcq", "iql", "mopo", "qr_dqn", "rem"))],
+)
+def test_the_best_policy_is_found(case):
+    found = scores(case)
+    np.testing.assert_array_equal(found.argmax(axis=1), mixed.best_actions())
+    assert np.isneginf(found[:, -1]).all()  # the end is never chosen
+    if case == "cql":  # it keeps low what the data do not hold
+        assert (found[:, WAIT] < found[:, [LEFT, RIGHT]].min(axis=1) - 1).all()
+    assert all(np.isfinite(list(entry.values())).all() for entry in trained(case)[2])
 
 
 @only_long
 def test_cloning_does_what_was_done_most_often():
-    agent, state, _ = trained("bc")
-    actions = acts(agent, state.params)
     inner = np.abs(mixed.PLACES) < toy.FARTHEST
-    assert (actions != mixed.best_actions())[inner].all()
+    assert (scores("bc").argmax(axis=1) != mixed.best_actions())[inner].all()
 
 
 @only_long
-@pytest.mark.parametrize(
-    ("name", "architecture", "past"),
-    [("bcq", "leapjax", 0), ("iql", "leapjax", 0), ("mopo", "leapjax", 0), ("bcq", "paper", 2)],
-)
-def test_the_best_policy_is_found(name, architecture, past):
-    agent, state, metrics = trained(name, architecture, past)
-    np.testing.assert_array_equal(acts(agent, state.params, past), mixed.best_actions())
-    assert all(np.isfinite(list(entry.values())).all() for entry in metrics)
-
-
-def test_bcq_values_are_those_of_value_iteration():
-    agent, state, _ = trained("bcq")
-    q = memories(agent, state.params)["q"][:, -1]  # [10, 3]
-    best = mixed.best_actions()
-    rows = np.arange(len(best))
-    away = np.where(best == LEFT, RIGHT, LEFT)
-    found = np.stack([q[rows, best], q[rows, away]], axis=1)
+@pytest.mark.parametrize("case", ["bcq", "cql without", "qr_dqn", "rem"])
+def test_values_are_those_of_value_iteration(case):
+    best, rows = mixed.best_actions(), np.arange(len(mixed.PLACES))
+    agent, state, _ = trained(case)
+    q = scores(case)
+    if case == "bcq":  # which scores likely actions alone
+        encode = quick_jit(jax.vmap(agent.energy.encode, (None, 0)))
+        q = encode(state.params, mixed.contexts(0))["q"][:, -1]
+        assert np.isneginf(scores(case)[:, WAIT]).all()
+    found = np.stack([q[rows, best], q[rows, np.where(best == LEFT, RIGHT, LEFT)]], axis=1)
     np.testing.assert_allclose(found, mixed.best_values(0.9), atol=0.1)
 
 
@@ -97,137 +108,84 @@ def test_bcq_never_does_what_the_data_do_not_hold():
         "behaviour": jnp.log(jnp.array([[0.6, 0.3, 0.1], [0.5, 0.5, 0.0]])),
         "q": jnp.array([[1.0, 2.0, 9.0], [3.0, 4.0, 9.0]]),
     }
-    np.testing.assert_array_equal(bcq.likely_values(said, 0.3), [[1, 2, -np.inf], [3, 4, -np.inf]])
-    np.testing.assert_array_equal(bcq.likely_values(said, 0.0), said["q"])
-    np.testing.assert_array_equal(
-        bcq.likely_values(said, 1.0), [[1, -np.inf, -np.inf], [3, 4, -np.inf]]
-    )
-    agent, state, _ = trained("bcq")
-    memory = memories(agent, state.params)
-    energies = jax.vmap(agent.energy.conditional, (None, 0, None, None))(
-        state.params, memory, jnp.zeros(1, jnp.int32), jnp.zeros(1, jnp.int32)
-    )
-    assert np.isposinf(energies[:, 0, [toy.WAIT, toy.END]]).all()
+    for threshold, expected in {
+        0.0: said["q"],
+        0.3: [[1, 2, -np.inf], [3, 4, -np.inf]],
+        1.0: [[1, -np.inf, -np.inf], [3, 4, -np.inf]],
+    }.items():
+        np.testing.assert_array_equal(bcq.likely_values(said, threshold), expected)
 
 
-def test_iql_values_lie_between_what_the_data_do_and_what_is_best():
-    _, state, _ = trained("iql")
-    critic = {"params": state.params["params"]["critic"]}
-    setup = Setup(
-        mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
-        TrainingConfig(), SETTINGS["iql"],
-    )  # fmt: skip
-    module = setup.make_policy(("value", 1), ("q1", 3), ("q2", 3))
-    said = quick_jit(jax.vmap(module.apply, (None, 0)))(critic, mixed.contexts(0))
-    best = mixed.best_values(0.9)
-    value = np.asarray(said["value"])[:, 0, 0]
-    assert (value < best.max(axis=1) + 0.05).all() and (value > best.min(axis=1) - 0.15).all()
-    # Nearer to the middle is better, from both sides.
-    assert (np.diff(value[:5]) > 0).all() and (np.diff(value[5:]) < 0).all()
-
-
-@only_long  # what it minimises is checked by hand
-def test_the_ensemble_of_mopo_knows_the_steps_of_the_data_and_disagrees_about_others():
-    """Nobody waits in the data."""
-    _, state, metrics = trained("mopo")
-    setup = Setup(
-        mixed.DOMAIN, 0, 1, ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0),
-        TrainingConfig(), SETTINGS["mopo"],
-    )  # fmt: skip
-    module = mopo.Networks(setup.make_policy(("features", 32)), 3, SETTINGS["mopo"].members)
-
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, None))
-    def predict(context, action):
-        features = module.apply(state.extra, context, method="features")
-        predicted = module.apply(state.params, features, action[None], method="predict")
-        return predicted.reward.mean(axis=0)[0], mopo.disagreement(predicted)[0]
-
-    found = {action: predict(mixed.contexts(0), jnp.int32(action)) for action in range(3)}
-    unseen = found[toy.WAIT][1]
-    for action in (LEFT, RIGHT):
-        rewards, disagreement = found[action]
-        assert (disagreement < unseen).all()
-        ends = 1 if action == LEFT else -1  # from where such a step leads to the middle
-        assert mixed.PLACES[np.argmax(rewards)] == ends and rewards.max() > 0.3
-    assert metrics[-1]["ensemble"] < metrics[0]["ensemble"]
-
-
-@only_long
-def test_the_target_network_follows_slowly():
-    agent, state, _ = trained("iql")
-    batch = quick_jit(agent.batch)(jax.random.key(5), mixed.steps())
-    after, _ = quick_jit(agent.update)(state, batch, jax.random.key(6))
-    online = {"params": after.params["params"]["critic"]}
-    expected = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, state.extra, online)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), after.extra, expected
-    )
-    fresh = quick_jit(agent.init)(jax.random.key(0))
-    begun = {"params": fresh.params["params"]["critic"]}
-    jax.tree.map(np.testing.assert_array_equal, fresh.extra, begun)
+def test_mixtures_are_random_and_convex():
+    weights = jax.vmap(rem.mixture, (0, None))(jax.random.split(jax.random.key(0), 500), 8)
+    assert (weights >= 0).all() and weights.shape == (500, 8)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(weights.mean(axis=0), 1 / 8, atol=0.01)
+    assert (weights.std(axis=0) > 0.04).all()
 
 
 @pytest.mark.parametrize(
-    ("module", "settings"),
+    ("module", "settings", "steps"),
     [
-        pytest.param(dt, dt.Settings, marks=only_long),
-        (leap, functools.partial(leap.Settings, masking="random", end=False, returns=True)),
+        pytest.param(dt, dt.Settings, 600, marks=only_long),
+        (leap, functools.partial(leap.Settings, masking="random", end=False, returns=True), 400),
     ],
     ids=["dt", "leap"],
 )
-def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings):
+def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings, steps):
     """Of walks that end well and walks that never do, it follows those that gave as much."""
     model = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
     learn = TrainingConfig(
-        600, batch=64, warmup=30, learning_rate=3e-3, weight_decay=0.0, windows="step"
+        steps, batch=64, warmup=30, learning_rate=3e-3, weight_decay=0.0, windows="step"
     )
     rng = np.random.default_rng(0)
     walks = [mixed.walk(rng, int(x), share, 6) for x in mixed.PLACES for share in (0.0, 1.0)]
-    data = mixed.windows.concatenate(walks)
-    agents = {
-        target: module.make_agent(
-            Setup(mixed.DOMAIN, 2, 1, model, learn, settings(target_return=target))
-        )
+    good, bad = (
+        module.make_agent(Setup(mixed.DOMAIN, 2, 1, model, learn, settings(target_return=target)))
         for target in (1.0, 0.0)
-    }
-    state, _ = toy.learn(agents[1.0], data, learn.steps)
-    good, bad = (acts(agents[target], state.params, 2) for target in (1.0, 0.0))
-    np.testing.assert_array_equal(good, mixed.best_actions())
-    np.testing.assert_array_equal(bad, np.where(good == LEFT, RIGHT, LEFT))
+    )
+    state, _ = toy.learn(good, mixed.windows.concatenate(walks), learn.steps)
+    keys, best = jax.random.split(jax.random.key(0), len(mixed.PLACES)), mixed.best_actions()
+    for agent, expected in ((good, best), (bad, np.where(best == LEFT, RIGHT, LEFT))):
+        planner = batching.compile_planner(agent.energy, GibbsConfig(1, 1), (len(keys),))
+        found = planner(state.params, keys, mixed.contexts(2)).actions[:, 0]
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_the_return_that_is_wanted_is_less_by_what_was_given():
     """In units that do not saturate; where a demonstration tells the rest, that is taken."""
-    given = mixed.contexts(3)._replace(rewards=jnp.array([1.0, 2.0, 4.0]))
-    np.testing.assert_array_equal(returns.returns_to_go(given, jnp.float32(10)), [17, 16, 14, 10])
-    domain = mixed.DOMAIN._replace(return_scale=4.0)
+    domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
     settings = dt.Settings(target_return=10.0)
     compute = returns.condition_on_target(
         Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings)
     )
-    context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 1.0]), return_so_far=2.0)
-    np.testing.assert_allclose(compute(context), np.array([10, 9, 8]) / 4)
-    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([7, 6, 5]) / 4)
+    context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 2.0]), return_so_far=3.0)
+    np.testing.assert_allclose(compute(context), np.array([10, 9, 7]) / 4)
+    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([8, 7, 5]) / 4)
 
 
-@pytest.mark.parametrize("name", list(MODULES))
+@pytest.mark.parametrize("name", ["bc", "dt", "bcq", "iql", "mopo", "cql", "qr_dqn", "rem"])
 def test_longer_plans_are_refused(name):
-    setup = Setup(mixed.DOMAIN, 0, 5, ModelConfig(), TrainingConfig(), SETTINGS[name])
+    module, settings, domain = CASES[name]
+    setup = Setup(domain, 0, 5, ModelConfig(), TrainingConfig(), settings)
     with pytest.raises(UserError, match="a horizon of 5: .* one action at a time"):
-        MODULES[name].make_agent(setup)
+        module.make_agent(setup)
 
 
 @pytest.mark.parametrize(
-    ("settings", "options"),
+    ("settings", "name", "value"),
     [
-        (bcq.Settings, {"threshold": -0.1}), (bcq.Settings, {"target_rate": float("nan")}),
-        (iql.Settings, {"expectile": 2.0}), (iql.Settings, {"largest_weight": float("inf")}),
-        (mopo.Settings, {"members": 1}), (mopo.Settings, {"real_share": 1.5}),
-        (dt.Settings, {"target_return": float("nan")}),
+        (bcq.Settings, "threshold", -0.1),
+        (iql.Settings, "expectile", 2.0),
+        (iql.Settings, "largest_weight", float("inf")),
+        (mopo.Settings, "members", 1),
+        (dt.Settings, "target_return", float("nan")),
+        (cql.Settings, "alpha", -0.1),
+        (cql.Settings, "discount", 1.1),
+        (qr_dqn.Settings, "quantiles", 0),
+        (rem.Settings, "target_rate", float("nan")),
     ],
-)  # fmt: skip
-def test_settings_that_cannot_be_are_refused(settings, options):
-    (name,) = options
-    with pytest.raises(ValueError, match=name):
-        settings(**options)
+)
+def test_settings_that_cannot_be_are_refused(settings, name, value):
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        settings(**{name: value})

@@ -13,7 +13,8 @@ from leapjax.agents import bc, cql, leap
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.agents.batches import run_batches
 from leapjax.data import windows
-from leapjax.domains.babyai import encoders as babyai
+from leapjax.domain import Augmentations
+from leapjax.domains.babyai.encoders import state_tokens as babyai
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
 from leapjax.models.trajectory import ModelConfig
@@ -56,7 +57,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def runs(data):
-    return quick_jit(run_batches(setup(domain=DOMAIN._replace(augmentations=()))))(
+    return quick_jit(run_batches(setup(domain=DOMAIN._replace(augmentations=Augmentations()))))(
         jax.random.key(0), data
     )
 
@@ -116,7 +117,7 @@ def test_a_run_is_augmented_as_a_whole(data):
     def turn(key, window):
         return window._replace(return_to_go=jax.random.uniform(key))
 
-    domain = DOMAIN._replace(augmentations=(turn,))
+    domain = DOMAIN._replace(augmentations=Augmentations([turn]))
     drawn = quick_jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
     marks = np.asarray(drawn.return_to_go)
     assert (marks == marks[:, :1]).all() and len(np.unique(marks)) == len(marks)

@@ -26,13 +26,7 @@ counts = st.integers(1, 100_000).flatmap(lambda n: st.tuples(st.integers(0, n), 
 
 @pytest.mark.parametrize(
     ("successes", "episodes", "low", "high"),
-    [
-        (0, 10, 0.0, 0.2775),
-        (10, 10, 0.7225, 1.0),
-        (5, 10, 0.2366, 0.7634),
-        (190, 200, 0.9104, 0.9726),
-        (1, 1, 0.2065, 1.0),
-    ],
+    [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (1, 1, 0.2065, 1.0)],
 )
 def test_known_intervals(successes, episodes, low, high):
     assert wilson_interval(successes, episodes) == pytest.approx((low, high), abs=1e-4)
@@ -50,17 +44,6 @@ def test_bounds_are_the_rates_that_the_score_test_just_accepts(case, z):
         assert distance == pytest.approx(z * math.sqrt(bound * (1 - bound) / episodes), abs=1e-7)
 
 
-NO_COUNTS = [2.0, 2.5, True, "2", None, math.nan, [2]]
-
-
-def test_one_seed_has_the_interval_of_its_episodes():
-    for successes in (0, 3, 100, 190, 200):
-        expected = wilson_interval(successes, 200)
-        assert interval_over_seeds([successes], [200]) == pytest.approx(expected, abs=0.01)
-    low, high = interval_over_seeds([200, 200, 200], [200, 200, 200])
-    assert 0.98 < low < high == 1.0
-
-
 def test_seeds_that_differ_widen_the_interval():
     def width(*successes, **correlation):
         low, high = interval_over_seeds(successes, [500] * len(successes), **correlation)
@@ -73,13 +56,6 @@ def test_seeds_that_differ_widen_the_interval():
         low, high = wilson_interval(round(0.9 * count), round(count))
         assert alike == pytest.approx(high - low, rel=0.05)
         assert width(400, 450, 500, correlation=correlation) > 3 * alike
-
-
-def test_where_episodes_are_many_it_is_students_interval_of_the_seeds():
-    rates = np.array([0.52, 0.55, 0.56])
-    found = interval_over_seeds((rates * 10**9).astype(int), [10**9] * 3)
-    expected = stats.t.interval(0.95, 2, rates.mean(), stats.sem(rates))
-    assert found == pytest.approx(expected, abs=5e-3)
 
 
 def test_a_planner_without_failures_may_fail():
@@ -135,40 +111,27 @@ def test_the_default_correlation_is_that_of_the_recorded_episodes():
     assert levels / (levels + rest) == pytest.approx(default, abs=0.05)
 
 
-COUNTS = [(0, 0), (-1, 5), (6, 5), *((each, 5) for each in NO_COUNTS)]
-SEEDS = [
-    ([], []), ([1], [0]), ([3, 6], [5, 5]), ([5], [10, 20]), (5, [10]), ([[5]], [[10]]),
-    (np.array([True]), [10]), ("5", "9"), *(([1, 1], [5, each]) for each in NO_COUNTS),
-]  # fmt: skip
+WRONG = [(2, 1), (-1, 5), (0, 0), (2.0, 5), (True, 5), ("2", 5), (1, None), (1, math.nan)]
+SEEDS = [([], []), ([5], [10, 20]), (5, [10]), ("5", "9"), *(([s], [e]) for s, e in WRONG)]
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "wrong", "message"),
     [
-        *((lambda c=c: wilson_interval(*c), "(successes|episodes) must be") for c in COUNTS),
-        *((lambda z=z: wilson_interval(1, 2, z), "z must be") for z in (-1.0, math.nan, "2")),
-        *((lambda s=s: interval_over_seeds(*s), "successes|episodes") for s in SEEDS),
-        *((lambda s=s: aggregate([([1], [2]), s]), "successes|episodes") for s in SEEDS),
-        *(
-            (lambda x=level: interval_over_seeds([1], [2], x), "level must be")
-            for level in (0, 1, 95, math.nan, "0.9")
-        ),
-        (lambda: aggregate([([1], [2])], None), "level must be"),
-        (lambda: aggregate([]), "no tasks"),
-        *(
-            (lambda x=solved: interval_of_episodes(x), "outcomes must be an array")
-            for solved in (np.ones(3, bool), np.ones((2, 3)), np.ones((2, 0), bool), 1)
-        ),
-        *(
-            (lambda x=each: interval_over_seeds([1], [2], correlation=x), "correlation must be")
-            for each in (-0.1, 1.1, math.nan, "1")
-        ),
-        (lambda: aggregate([([1], [1]), ([2], [1])]), "successes of"),
+        (lambda x: wilson_interval(*x), WRONG, "(successes|episodes) must be"),
+        (lambda x: wilson_interval(1, 2, x), [-1.0, math.nan, "2"], "z must be"),
+        (lambda x: interval_over_seeds(*x), SEEDS, "successes|episodes"),
+        (lambda x: aggregate([([1], [2]), x]), SEEDS, "successes|episodes"),
+        (lambda x: interval_over_seeds([1], [2], x), [0, 1, 95, math.nan, "0.9"], "level must be"),
+        (lambda x: interval_over_seeds([1], [2], correlation=x), [-0.1, 1.1], "correlation must"),
+        (interval_of_episodes, [np.ones(3, bool), np.ones((2, 3)), 1], "outcomes must be an array"),
+        (aggregate, [[]], "no tasks"),
     ],
 )
-def test_impossible_counts_and_levels_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_impossible_counts_and_levels_are_refused(call, wrong, message):
+    for each in wrong:
+        with pytest.raises(ValueError, match=message):
+            call(each)
 
 
 def test_the_interquartile_mean_is_scipys_and_rliables():
@@ -185,10 +148,9 @@ def test_an_aggregate_is_stratified_by_level():
     assert middle == pytest.approx((0.55 + 0.8) / 2)  # the best and the worst do not count
     assert low < middle < high
     # With many episodes only the seeds of the first level differ.
-    certain = [([g * 10**7 for g in good], [c * 10**7 for c in of]) for good, of in levels]
+    certain = [tuple([n * 10**7 for n in part] for part in level) for level in levels]
     low, high = interval_over_seeds(*certain[0])
     assert aggregate(certain)[1] == pytest.approx(((low + 0.8) / 2, (0.9 + 0.8) / 2), abs=0.01)
-    one = aggregate([([190], [200])])
-    assert one == (0.95, interval_over_seeds([190], [200]))
+    assert aggregate([([190], [200])]) == (0.95, interval_over_seeds([190], [200]))
     solved = np.arange(200)[None] < 190
     assert aggregate([solved]) == (0.95, interval_of_episodes(solved))

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from experiments import babyai
 from leapjax import batching, planners, rollouts, sharding, training
 from leapjax.agents import leap
 from leapjax.agents.base import Setup, TrainingConfig
@@ -18,58 +16,43 @@ from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
 from leapjax.models.trajectory import ModelConfig
 from leapjax.running import results
-from tests.programs import TOY, only_long
+from tests.programs import only_long, toy_row
 
-CYCLES, RUNS = 300, 20
+CYCLES = 300
 DOMAIN = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
-
-
-def open_files():
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def resident_mebibytes():
-    gc.collect()
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 class Watch:
     """What a process holds, again and again; what it compiled in between."""
 
     def __init__(self):
-        self.files, self.memory, self.compiled = [], [], []
-        self._compilations = 0
+        self.files, self.memory, self.compiled, self._count = [], [], [], 0
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
     def _listen(self, name, seconds, **_):
-        self._compilations += name == "/jax/core/compile/backend_compile_duration"
+        self._count += name == "/jax/core/compile/backend_compile_duration"
 
     def look(self):
-        self.files.append(open_files())
-        self.memory.append(resident_mebibytes())
-        self.compiled.append(self._compilations)
-        self._compilations = 0
-
-    def report(self):
-        warm = self.memory[len(self.memory) // 5]
-        return (
-            f"{len(self.files)} rounds: {warm:.0f} MiB after a fifth, {self.memory[-1]:.0f} at the "
-            f"end; {self.files[1]} open files in round 2, {self.files[-1]} at the end; "
-            f"{self.compiled[0]} compilations in round 1, {sum(self.compiled[1:])} later"
-        )
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        self.files.append(len(list(Path("/proc/self/fd").iterdir())))
+        self.memory.append(pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+        self.compiled.append(self._count)
+        self._count = 0
 
 
 @only_long
-def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
+def test_train_plan_evaluate_over_and_over(tmp_path):
     model, learning = ModelConfig(layers=1, heads=2, width=16), TrainingConfig(steps=10, batch=4)
     mesh = sharding.make_mesh(learning.batch)
     agent = leap.make_agent(Setup(DOMAIN, 1, 4, model, learning, leap.Settings()), mesh)
     begin = training.make_begin(agent, mesh)
     step = training.make_train_step(agent, mesh)
     plan = batching.compile_planner(agent.energy, planners.GibbsConfig(4, 4))
-    demonstrations = DOMAIN.collect(5, 0, lambda done: None).demonstrations
-    data = sharding.replicate(windows.concatenate(demonstrations, DOMAIN.extras), mesh)
+    demonstrations = DOMAIN.demonstrations.collect(5, 0, lambda done: None).demonstrations
+    data = sharding.replicate(
+        windows.concatenate(demonstrations, DOMAIN.augmentations.extras), mesh
+    )
     watch = Watch()
     for cycle in range(CYCLES):
         state, key = begin(cycle)
@@ -84,14 +67,8 @@ def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
             context=1, seed=cycle, progress=lambda over, good: None,
         )  # fmt: skip
         assert len(episodes.successes) == 3
-        row = {
-            **{name: "x" if kind is str else 1 for name, kind in results.FIELDS.items()},
-            "hash": str(cycle % 7), "successes": int(episodes.successes.sum()), "episodes": 3,
-        }  # fmt: skip
-        results.record(tmp_path / "rows.jsonl", row)
+        results.record(tmp_path / "rows.jsonl", toy_row(hash=str(cycle % 7)))
         watch.look()
-    with capsys.disabled():
-        print("\nsoak, library:", watch.report())
     # Episodes leave a batch one by one, so a chunk of another size may still be compiled; what
     # that takes is no leak, so memory counts from where nothing is compiled any more.
     settled = CYCLES // 4
@@ -100,18 +77,3 @@ def test_train_plan_evaluate_over_and_over(tmp_path, capsys):
     # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing.
     assert watch.memory[-1] < watch.memory[settled] + 10 + 0.3 * (CYCLES - settled)
     assert len(results.read(tmp_path / "rows.jsonl")) == min(CYCLES, 7)
-
-
-@only_long
-def test_one_run_after_another(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    watch = Watch()
-    for seed in range(RUNS):
-        assert babyai.main([*TOY, "--steps", "4", "--seeds", str(seed)]) == 0
-        watch.look()
-    with capsys.disabled():
-        print("\nsoak, program:", watch.report())
-    # Every run is a program of its own and compiles it; what it leaves behind is bounded.
-    assert max(watch.files[1:]) <= watch.files[1] + 2
-    assert np.ptp(watch.compiled[1:]) <= 2
-    assert watch.memory[-1] < watch.memory[RUNS // 5] + 40 * (RUNS - RUNS // 5)

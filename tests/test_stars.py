@@ -82,7 +82,11 @@ def test_the_path_is_rewarded_and_any_other_step_is_the_last():
 
 
 def collected(count=4, seed=0):
-    return make("Star3x4", Settings()).collect(count, seed, lambda done: None).demonstrations
+    return (
+        make("Star3x4", Settings())
+        .demonstrations.collect(count, seed, lambda done: None)
+        .demonstrations
+    )
 
 
 def test_demonstrations_are_the_way():
@@ -206,9 +210,9 @@ def test_presets_and_data_that_there_are_not(capsys):
     assert "no encoder for architecture 'paper': expected one of leapjax" in capsys.readouterr().err
     domain = make("Star3x4", Settings())
     states = collected()[0].observations
-    domain.check(states, "here")
+    domain.demonstrations.check(states, "here")
     with pytest.raises(UserError, match="here: goal run from 50 to 50, expected 0 to 49"):
-        domain.check(states._replace(goal=np.full(5, 50)), "here")
+        domain.demonstrations.check(states._replace(goal=np.full(5, 50)), "here")
 
 
 @pytest.mark.parametrize("horizon", [2, 5])

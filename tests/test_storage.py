@@ -110,7 +110,7 @@ def domain_of(blank) -> Domain:
     def nothing(*arguments):
         raise NotImplementedError
 
-    return Domain("Own", nothing, nothing, ("left", "right", "end"), 9, blank, {})
+    return Domain("Own", nothing, ("left", "right", "end"), 9, blank, {})
 
 
 ARRAY = np.zeros(4, np.float32)

@@ -95,8 +95,8 @@ def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
 def transformed(size):
     """The window at a cell of a demonstration, with another board: compiled once."""
     domain = make(f"Sudoku{size.side}x{size.clues}", Settings())
-    data = domain.collect(2, 0, lambda done: None).demonstrations
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.extras))
+    data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
 
     @jax.jit
     def draw(key, index):
@@ -272,9 +272,9 @@ def test_unknown_levels_are_one_line(name, message):
 
 def test_data_that_solve_no_board_are_refused():
     domain = make("Sudoku4x6", Settings())
-    (demonstration,) = domain.collect(1, 0, lambda done: None).demonstrations
+    (demonstration,) = domain.demonstrations.collect(1, 0, lambda done: None).demonstrations
     states = demonstration.observations
-    domain.check(states, "here")
+    domain.demonstrations.check(states, "here")
     for wrong, message in (
         (
             states._replace(digits=states.digits + 1),
@@ -284,7 +284,7 @@ def test_data_that_solve_no_board_are_refused():
         (states._replace(cell=states.cell[::-1]), "one after the other"),
     ):
         with pytest.raises(UserError, match=message):
-            domain.check(wrong, "here")
+            domain.demonstrations.check(wrong, "here")
 
 
 @pytest.fixture

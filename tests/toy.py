@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax import training
-from leapjax.domain import Domain
+from leapjax.domain import Augmentations, Domain
 from leapjax.models.encoder import Encoder
 from leapjax.types import Demonstration
 from tests.quick import quick_jit
@@ -55,12 +55,11 @@ def nothing(*arguments):
 DOMAIN = Domain(
     level="Line",
     make_adapter=nothing,
-    collect=nothing,
     actions=("left", "right", "wait", "end"),
     max_steps=FARTHEST,
     blank=np.zeros(3, np.float32),
     encoders={"leapjax": lambda model, context: Token(model.width)},
-    augmentations=(mirror,),
+    augmentations=Augmentations([mirror]),
 )
 
 

@@ -3,14 +3,20 @@
 from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
-from experiments.common.cases import Analysis, Case, rows_of_way
-from experiments.tables.cells import mean_length, mean_rate, milliseconds, minutes, rate, table
+from experiments.common.cases import Analysis, rows_of_way
+from experiments.tables.cells import milliseconds, rate, table
 from leapjax.running.results import Row
 
 ANALYSES = {
     program.ANALYSIS.name: program.ANALYSIS
     for program in (properties, stochastic, suboptimal, ablation)
 }
+PRESETS = ("paper", "leapjax")
+# One fixed way a method: LEAP executes whole plans, DT and IQL choose single actions.
+AS_THE_PAPER = ("whole plan", "leap", "sum", "dt", "iql")
+OF_THE_PAPER = ("adaptation", "generalization", "composition")
+EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))
+ERRANDS = ("constraints-errand", "constraints-detour")
 
 
 def uses(row: Row) -> bool:
@@ -21,98 +27,43 @@ def uses(row: Row) -> bool:
     )
 
 
-def analysed(of: Analysis, rows: Sequence[Row], kind: str = "") -> str:
-    """Every way to plan of every case, beside the paper's number; the best of a case in bold.
+def compared(
+    of: Analysis, rows: Sequence[Row], ways: Sequence[str] = (), cases: Sequence[str] = ()
+) -> str:
+    """Success of some ways to plan, of both presets, beside the paper's number.
 
-    Of a kind of cases alone, if one is given: those whose names begin with it.
+    Args:
+        of: the analysis.
+        rows: its rows.
+        ways: names of ways; all if empty.
+        cases: beginnings of the names of cases; all if empty.
     """
-    cases = [case for case in of.cases if case.name.startswith(kind)]
-    names = {case.name for case in cases}
-    watched = any(row["violations"] is not None for row in rows if row["case"] in names)
-    lines = []
-    for case in cases:
-        found = [
-            (way, preset, mine)
-            for way in case.ways
-            for preset in ("paper", "leapjax")
-            if (mine := rows_of_way(of, rows, case, way, preset))
-        ]
-        best = max((mean_rate(mine) for _, _, mine in found), default=None)
-        for way, preset, mine in found:
-            success = f"**{rate(mine)}**" if mean_rate(mine) == best else rate(mine)
-            first = [row["first_pass_successes"] for row in mine]
-            episodes = sum(row["episodes"] for row in mine)
-            cells = [
-                case.name,
-                way.name if way.name.startswith(way.method) else f"{way.method}: {way.name}",
-                f"`{preset}`",
-                "-" if way.paper is None else f"{way.paper:.1f}%",
-                "-" if None in first else f"{100 * sum(first) / episodes:.1f}%",
-                success,
-                mean_length(mine),
-            ]
-            if of.timed:
-                cells.append(f"{milliseconds(mine):.2f}")
-            if watched:
-                known = all(row["violations"] is not None for row in mine)
-                cells.append(f"{_violations(mine):.2f}" if known else "-")
-            lines.append([*cells, minutes(mine)])
-    header = "case | planner | preset | paper | N = 1 | success | steps"
-    header += " | ms per plan" if of.timed else ""
-    header += " | violations" if watched else ""
-    return table(f"{header} | minutes", lines)
-
-
-def compared(of: Analysis, rows: Sequence[Row]) -> str:
-    """Every case at a glance: LEAP's best way to plan beside the best choice of single actions.
-
-    Of each preset, and apart from them with a penalty on coming back. The better of a pair is in
-    bold. What is best was seen on the levels that it is of; what breaks a constraint more than
-    once in twenty episodes is not.
-    """
-
-    def best(case: Case, preset: str, plans: bool, explores: bool) -> float | None:
-        found = (
-            rows_of_way(of, rows, case, way, preset)
-            for way in case.ways
-            if (way.method == "leap") == plans and way.explores == explores
-        )
-        kept = (mine for mine in found if mine and _violations(mine) <= 1 / 20)
-        return max(map(mean_rate, kept), default=None)
-
-    def papers(case: Case, plans: bool) -> float | None:
-        known = (way.paper for way in case.ways if (way.method == "leap") == plans)
-        return max((each for each in known if each is not None), default=None)
-
     lines = []
     for case in of.cases:
-        cells = [case.name, *_pair(papers(case, True), papers(case, False))]
-        for explores in (False, True):
-            for preset in ("paper", "leapjax"):
-                cells += _pair(*(best(case, preset, plans, explores) for plans in (True, False)))
-        lines.append(cells)
-    sources = (
-        "in the paper", "preset `paper`", "preset `leapjax`",
-        "`paper`, exploring", "`leapjax`, exploring",
-    )  # fmt: skip
-    return table(" | ".join(["case", *(f"LEAP, {each} | DT or IQL" for each in sources)]), lines)
+        if cases and not case.name.startswith(tuple(cases)):
+            continue
+        for way in case.ways:
+            found = [rows_of_way(of, rows, case, way, preset) for preset in PRESETS]
+            if any(found) and (not ways or way.name in ways):
+                planner = way.name
+                if not way.name.startswith(way.method):
+                    planner = f"{way.method}: {way.name}"
+                paper = "-" if way.paper is None else f"{way.paper:.1f}%"
+                lines.append([case.name, planner, paper, *(_cell(of, mine) for mine in found)])
+    return table(
+        " | ".join(["case", "planner", "paper", *(f"`{each}`" for each in PRESETS)]), lines
+    )
 
 
-def _violations(rows: Sequence[Row]) -> float:
-    """Of constraints, in an episode."""
-    return sum(row["violations"] or 0 for row in rows) / sum(row["episodes"] for row in rows)
-
-
-def _pair(one: float | None, other: float | None) -> list[str]:
-    """Two success rates in percent, the better in bold, both if they are alike."""
-    known = [each for each in (one, other) if each is not None]
-
-    def said(each: float | None) -> str:
-        if each is None:
-            return "-"
-        return f"**{each:.1f}%**" if len(known) == 2 and each == max(known) else f"{each:.1f}%"
-
-    return [said(one), said(other)]
+def _cell(of: Analysis, rows: Sequence[Row]) -> str:
+    """Success of rows, one for each seed; what a plan costs, and violations if there are any."""
+    cell = rate(rows)
+    if rows and of.timed:
+        cell += f", {milliseconds(rows):.1f} ms"
+    violations = sum(row["violations"] or 0 for row in rows)
+    if violations:
+        cell += f", {violations / sum(row['episodes'] for row in rows):.2f} violations"
+    return cell
 
 
 def landscape(found: Sequence[Row]) -> str:

@@ -1,29 +1,28 @@
 """The BabyAI tables: every setting of LEAP, and every method."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from experiments.paper import paper_success
-from experiments.tables.cells import mean_length, mean_rate, outcomes, rate, table, with_interval
+from experiments.tables.cells import mean_rate, outcomes, rate, table, with_interval
 from experiments.tables.settings import Setting, select
 from leapjax import scores
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
+PRESETS = {"preset `paper`": PAPER, "preset `leapjax`": OURS}
 SETTINGS = {
     "random": Setting("leapjax", "random"),
-    "preset `paper`": PAPER,
-    "preset `leapjax`": OURS,
-    # Chosen on validation levels: docs/tried.md.
+    **PRESETS,
+    # Chosen on validation levels: docs/lessons.md.
     "`leapjax`, `--executed 3`": Setting("leapjax", changes={"executed": 3}),
 }
 # The methods of the paper's table, beside the floor, with both presets.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
-# How methods of preset `paper` act, drawn: chosen on validation levels (docs/tried.md). LEAP gains
-# nothing by noise.
+# Noise of methods with preset `paper`, chosen on validation levels. LEAP gains nothing by it.
 NOISE = {
     **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
     "plate": {"beams": 1, "temperature": 4.0},
@@ -58,31 +57,28 @@ def uses(row: Row) -> bool:
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
-def success(rows: Sequence[Row]) -> str:
-    """Success rates per level: the paper's, and those of every setting; their middle.
+def success(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> str:
+    """Success of the paper's LEAP and of some settings, by level, and the interquartile mean.
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
+
+    Args:
+        rows: of BabyAI.
+        settings: a column for each, by title.
     """
-    found = select(rows, LEVELS, SETTINGS)
+    found = select(rows, LEVELS, settings)
     lines = [
         [
             level,
             f"{paper_success(level)['leap']:.1f}%",
-            *(rate(found[level, title]) for title in SETTINGS),
+            *(rate(found[level, title]) for title in settings),
         ]
         for level in LEVELS
     ]
-    middles = [middle(rows, setting) for setting in SETTINGS.values()]
+    middles = [middle(rows, setting) for setting in settings.values()]
     cells = ["-" if each is None else with_interval(*each) for each in middles]
     lines.append(["interquartile mean", f"{middle_of_paper():.1f}%", *cells])
-    return table(" | ".join(["level", "paper", *SETTINGS]), lines)
-
-
-def steps(rows: Sequence[Row]) -> str:
-    """Steps per episode, failed episodes included, of every setting."""
-    found = select(rows, LEVELS, SETTINGS)
-    lines = [[level, *(mean_length(found[level, title]) for title in SETTINGS)] for level in LEVELS]
-    return table(" | ".join(["level", *SETTINGS]), lines)
+    return table(" | ".join(["level", "paper", *settings]), lines)
 
 
 def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
@@ -185,16 +181,6 @@ def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, floa
     }
 
 
-def acting(rows: Sequence[Row]) -> str:
-    """Steps of an episode, and plans where they are fewer, with preset `leapjax`, seed 0."""
-
-    def cell(row: Row) -> str:
-        steps, plans = row["mean_length"], row["plans"] / row["episodes"]
-        return f"{steps:.1f}" if round(steps - plans, 1) == 0 else f"{steps:.1f} ({plans:.1f})"
-
-    return _by_acting_method(rows, cell)
-
-
 def price(rows: Sequence[Row], measured: Sequence[Row]) -> str:
     """Milliseconds of planning for each action, with preset `leapjax`.
 
@@ -208,14 +194,10 @@ def price(rows: Sequence[Row], measured: Sequence[Row]) -> str:
         plans = row["plans"] / (row["mean_length"] * row["episodes"])
         return f"{1e3 * plans / speeds[row['level'], row['method']]:.3f}"
 
-    return _by_acting_method([r for r in rows if (r["level"], r["method"]) in speeds], cell)
-
-
-def _by_acting_method(rows: Sequence[Row], cell: Callable[[Row], str]) -> str:
-    """A line for each level, a cell for each method: of preset `leapjax` and training seed 0."""
+    known = [row for row in rows if row["seed"] == 0 and (row["level"], row["method"]) in speeds]
     methods = [name for name in COMPARED if name != "random"]
     lines = []
-    for level, by_preset in rows_by_method([row for row in rows if row["seed"] == 0]).items():
+    for level, by_preset in rows_by_method(known).items():
         first = {name: cell(row) for name, (row,) in by_preset["preset leapjax"].items()}
         lines.append([level, *(first.get(name, "-") for name in methods)])
     return table("level | " + " | ".join(methods), lines)

@@ -43,31 +43,10 @@ def mean_rate(rows: Sequence[Row]) -> float:
     return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
 
 
-def mean_length(rows: Sequence[Row]) -> str:
-    """Mean length of the episodes of some rows."""
-    episodes = sum(row["episodes"] for row in rows)
-    total = sum(row["mean_length"] * row["episodes"] for row in rows)
-    return f"{total / episodes:.1f}" if rows else "-"
-
-
 def milliseconds(rows: Sequence[Row]) -> float:
     """What a plan costs, hundreds at once."""
     plans = sum(row["plans"] for row in rows)
     return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
-
-
-def minutes(rows: Sequence[Row]) -> str:
-    """What a row takes: training, shared with all rows of the same models, and the episodes.
-
-    The mean over seeds; with a star where any was made on a GPU, nothing where it is not known
-    how long the training took (rows did not always say that of a model that was there already).
-    """
-    if any(row["train_seconds"] == 0 for row in rows):
-        return "-"
-    kinds = ("train_seconds", "compile_seconds", "eval_seconds")
-    seconds = sum(row[kind] for row in rows for kind in kinds)
-    gpu = any("NVIDIA" in row["versions"]["machine"] for row in rows)
-    return f"{seconds / len(rows) / 60:.1f}{'*' if gpu else ''}"
 
 
 def listed(rows: Sequence[Row], columns: Columns) -> str:

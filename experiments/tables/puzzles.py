@@ -15,6 +15,11 @@ MINIMISED = {
     ", learned and rules": Setting("leapjax", changes={"rules": 1.0}),
 }
 ONE_ACTION = {(f"`--method {name}`", "T"): Setting("leapjax", name) for name in ("bc", "dt")}
+PAYS_ON = ("Star3x5, learned", "Star5x10, learned", "Sudoku9x36, learned", "Sudoku9x26, rules")
+PAYING = (
+    ("all at once", "1"), ("left to right", "T"), ("Gibbs sampling, random order", "2 T"),
+    ("most certain first", "T"), ("most certain first, best of 16", "16 T"),
+)  # fmt: skip
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
 
 
@@ -25,14 +30,15 @@ def uses(row: Row) -> bool:
     )
 
 
-def searches(rows: Sequence[Row]) -> str:
-    """Success of every way to search with the same trained energy, beside methods of one action."""
+def searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> str:
+    """Success of a few ways to search with one energy, by level and energy."""
     found = rows_by_search(rows)
     lines = []
-    for each in zip(*found.values(), strict=True):  # one search, on every level
+    for each in zip(*(found[column] for column in columns), strict=True):
         name, passes, _ = each[0]
-        lines.append([name, passes, *(rate(of) for _, _, of in each)])
-    return table(" | ".join(["planner", "passes", *found]), lines)
+        if (name, passes) in PAYING:
+            lines.append([name, passes, *(rate(of) for _, _, of in each)])
+    return table(" | ".join(["search", "passes", *columns]), lines)
 
 
 def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:

@@ -48,7 +48,7 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
         return windows.window(steps, index, setup.context, setup.horizon, domain.num_actions - 1)
 
     def batch(key: jax.Array, steps: Steps) -> Window:
-        step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+        step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
         count = training.batch // training.run
         starts = windows.sample_steps(step_key, steps, count, training.windows)
         ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
@@ -80,7 +80,7 @@ def make_blank_steps(domain: Domain) -> Steps:
     states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
     actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
     blank = Demonstration(states, actions, rewards, True, False, 0)
-    return windows.concatenate([blank], domain.extras)
+    return windows.concatenate([blank], domain.augmentations.extras)
 
 
 def _check_no_runs(setup: Setup) -> None:
@@ -98,7 +98,7 @@ def _draw(
 ) -> tuple[Window, jax.Array]:
     """Draws augmented windows `[B, ...]`; also returns the indices `[B]` of their steps."""
     domain, training = setup.domain, setup.training
-    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations))
+    step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
     indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
     drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
     return _augment(domain, keys, drawn), indices
@@ -119,6 +119,6 @@ def _augment(
         lift: turns an augmentation of a window into one of an example.
     """
     count = examples.actions.shape[0]
-    for augment, key in reversed(list(zip(domain.augmentations, keys, strict=True))):
+    for augment, key in reversed(list(zip(domain.augmentations.functions, keys, strict=True))):
         examples = jax.vmap(lift(augment))(jax.random.split(key, count), examples)
     return examples

@@ -22,7 +22,7 @@ def condition_on_target(setup: Setup) -> ComputeReturns:
     def compute(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
         if return_to_go is None:
             return_to_go = setup.settings.target_return - context.return_so_far
-        return compute_returns_to_go(context, return_to_go) / setup.domain.return_scale
+        return compute_returns_to_go(context, return_to_go) / setup.domain.scaling.returns
 
     return compute
 

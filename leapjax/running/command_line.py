@@ -1,10 +1,11 @@
 """Makes the configurations that a command line asks for."""
 
-import argparse
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from leapjax import pretrained
 from leapjax.configuration import AnyConfig, Config, change
@@ -15,8 +16,30 @@ from leapjax.errors import UserError
 from leapjax.methods import METHODS, find_method
 from leapjax.presets import find_preset
 from leapjax.pretrained import GROUPS, Specification
-from leapjax.running import shell, startup
+from leapjax.running import shell
 from leapjax.running.limits import check
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """The options of a command line that decide the defaults of all others, and of --help.
+
+    Attributes:
+        level: name or id of a level, or "all"; None if the command line names none. All fields
+            below are None in the same way.
+        method: names of methods.
+        preset: name of a preset.
+        checkpoint: folder of a trained planner.
+        demonstrations: id of a data set.
+        pretrained: whether to play the planners that come with the library.
+    """
+
+    level: str | None = None
+    method: tuple[str, ...] | None = None
+    preset: str | None = None
+    checkpoint: Path | None = None
+    demonstrations: str | None = None
+    pretrained: bool = False
 
 
 def parse(
@@ -25,108 +48,174 @@ def parse(
     kind: type[AnyConfig] = Config,
     module: str = "experiments",
 ) -> list[AnyConfig]:
-    """One configuration per level and method from a command line; exits with 2 if it is bad.
+    """Returns one configuration for each level and method; exits with 2 if an option is wrong.
 
     Args:
-        domain: by name.
-        arguments: of the command line.
+        domain: name of the domain.
+        arguments: command line.
         kind: `Config`, or a subclass with the program's own names of options.
-        module: of the program, for usage lines.
+        module: module of the program, for usage lines.
 
     Raises:
-        UserError: an unknown level, method or preset, or options that cannot be.
+        UserError: an unknown level, method or preset, or a configuration that cannot work.
     """
     shell.check_values(arguments)
-    # These come first: they decide the defaults of all the rest, and of --help.
-    command = startup.command(module)
-    several = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
-    several.add_argument("--method", nargs="*")
-    named, others = several.parse_known_args(list(arguments))
-    first = argparse.ArgumentParser(command, add_help=False, allow_abbrev=False)
-    for field in ("level", "preset", "checkpoint", "demonstrations", "demos"):
-        first.add_argument(kind.flag(field), dest=field)
-    first.add_argument("--pretrained", action="store_true")
-    chosen, _ = first.parse_known_args(others)
-    folder = None if chosen.checkpoint is None else Path(chosen.checkpoint)
-    if folder is not None and chosen.pretrained:
-        raise UserError("--checkpoint and --pretrained: give one of them")
-    trained = None if folder is None else pretrained.read_specification(folder)
-    levels = find_domain(domain).levels
-    data = storage.described(chosen.demonstrations) if chosen.demonstrations else Described()
-    level = chosen.level or (trained.level if trained else data.level or levels[0])
-    if not chosen.level:
-        check_imported(level, str(folder or chosen.demonstrations))
-    methods = None if named.method is None else find_methods(named.method)
-    if methods and len(methods) > 1 and (folder is not None or chosen.pretrained):
-        raise UserError(
-            f"--method {' '.join(named.method)}: a planner that is trained already is of one method"
-        )
+    choice, others = choose(kind, arguments)
+    data = storage.described(choice.demonstrations) if choice.demonstrations else Described()
+    methods = choose_methods(choice)
     configs = []
-    for each in levels if level == "all" else [level]:
-        if chosen.pretrained:
-            folder = pretrained.published(each)
-            trained = pretrained.read_specification(folder)
-        name = chosen.preset or (trained.origin.preset if trained else Config.preset)
+    for level in choose_levels(domain, choice, data):
+        folder = pretrained.published(level) if choice.pretrained else choice.checkpoint
+        trained = pretrained.read_specification(folder) if folder else None
         for method in methods or [trained.method if trained else Config.method]:
-            default = as_kind(kind, find_preset(domain, each, method, name))
-            if data.episodes is not None and chosen.demos is None:  # as many as there are
-                default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
-            if trained and (trained.domain, trained.method) == (domain, method):
-                default = _as_trained(default, trained)
-            # Which options there are depends on the method: usage lines name it.
+            default = make_default(kind, domain, level, method, choice, data, trained)
+            default = dataclasses.replace(default, checkpoint=folder)
+            # Methods have different options: usage lines name the method.
             shown = f"{module} --method {method}" if methods else module
-            given = _parse(["--method", method, *others], default, shown)
+            config = override(default, others, shown)
             if methods and len(methods) > 1 and not default.training.steps:
-                # --steps is for those that learn.
-                given = change(given, training={"steps": 0})
-            config = dataclasses.replace(given, level=each, method=method, checkpoint=folder)
+                config = change(config, training={"steps": 0})  # --steps is for those that learn
             check(config)
             configs.append(config)
     return configs
 
 
-def as_kind(kind: type[AnyConfig], config: AnyConfig) -> AnyConfig:
-    """Returns the same configuration as a program's own subclass of `Config`."""
-    return kind(**{each.name: getattr(config, each.name) for each in dataclasses.fields(config)})
-
-
-def find_methods(names: Sequence[str]) -> list[str]:
-    """The methods that a command line names, each once.
+def choose(kind: type[AnyConfig], arguments: Sequence[str]) -> tuple[Choice, list[str]]:
+    """Reads the choice from a command line; returns it with the arguments that are left.
 
     Args:
-        names: of methods; "all" stands for those that fit every domain.
+        kind: `Config`, or a subclass with the program's own names of options.
+        arguments: command line.
 
     Raises:
-        UserError: an unknown method, or none.
+        UserError: a checkpoint and a published planner are asked for.
     """
-    every = [name for name in METHODS if METHODS[name].everywhere]
-    if not names:
+    fields = [
+        (each.name, Annotated[each.type, tyro.conf.arg(name=kind.flag(each.name)[2:])], each)
+        for each in dataclasses.fields(Choice)
+    ]
+    spelled = dataclasses.make_dataclass("Choice", fields, bases=(Choice,), frozen=True)
+    choice: Choice
+    choice, others = tyro.cli(
+        spelled, args=list(arguments), return_unknown_args=True, add_help=False
+    )
+    if choice.checkpoint is not None and choice.pretrained:
+        raise UserError("--checkpoint and --pretrained: give one of them")
+    return choice, others
+
+
+def choose_levels(domain: str, choice: Choice, data: Described) -> Sequence[str]:
+    """Returns the levels to run: the named ones, or that of the checkpoint or the data set.
+
+    Args:
+        domain: name of the domain; its first level is the default.
+        choice: options of the command line.
+        data: metadata of the data set that the command line names.
+
+    Raises:
+        UserError: an unknown domain, a checkpoint that cannot be read, or a level whose module
+            only a file names.
+    """
+    levels = find_domain(domain).levels
+    if choice.level is not None:
+        return levels if choice.level == "all" else [choice.level]
+    level = data.level or levels[0]
+    if choice.checkpoint is not None:
+        level = pretrained.read_specification(choice.checkpoint).level
+    check_imported(level, str(choice.checkpoint or choice.demonstrations))
+    return [level]
+
+
+def choose_methods(choice: Choice) -> list[str] | None:
+    """Returns the methods that a command line names, each once; None if it names none.
+
+    "all" stands for the methods that fit every domain.
+
+    Raises:
+        UserError: an unknown method, an empty list, or several methods for a trained planner.
+    """
+    if choice.method is None:
+        return None
+    if not choice.method:
         raise UserError(f"--method needs a name: some of {', '.join(METHODS)}, or all")
-    for name in names:
+    for name in choice.method:
         if name != "all":
             find_method(name)
-    found = [each for name in names for each in (every if name == "all" else [name])]
-    return list(dict.fromkeys(found))
+    every = [name for name in METHODS if METHODS[name].everywhere]
+    found = [each for name in choice.method for each in (every if name == "all" else [name])]
+    methods = list(dict.fromkeys(found))
+    if len(methods) > 1 and (choice.checkpoint is not None or choice.pretrained):
+        raise UserError(
+            f"--method {' '.join(choice.method)}: a planner that is trained already is of one "
+            "method"
+        )
+    return methods
 
 
-def _as_trained(default: AnyConfig, trained: Specification) -> AnyConfig:
-    """Defaults that are what an earlier run has."""
+def make_default(
+    kind: type[AnyConfig],
+    domain: str,
+    level: str,
+    method: str,
+    choice: Choice,
+    data: Described,
+    trained: Specification | None,
+) -> AnyConfig:
+    """Returns the defaults of all options for one level and method.
+
+    Args:
+        kind: `Config`, or a subclass with the program's own names of options.
+        domain: name of the domain.
+        level: name or id of the level.
+        method: name of the method.
+        choice: options of the command line.
+        data: metadata of the data set that the command line names.
+        trained: specification of the trained planner, if there is one: the defaults are its
+            settings.
+
+    Raises:
+        UserError: an unknown level, method or preset.
+    """
+    name = choice.preset or (trained.origin.preset if trained else Config.preset)
+    preset = find_preset(domain, level, method, name)
+    default = kind(**{each.name: getattr(preset, each.name) for each in dataclasses.fields(preset)})
+    if data.episodes is not None:
+        default = dataclasses.replace(default, demos=min(default.demos, data.episodes))
+    if trained and (trained.domain, trained.method) == (domain, method):
+        default = dataclasses.replace(
+            default,
+            **{group: getattr(trained, group) for group in GROUPS},
+            context=trained.context,
+            seeds=(trained.origin.seed,),
+            demos=trained.origin.demos,
+            demonstrations=trained.origin.demonstrations,
+        )
     return dataclasses.replace(
         default,
-        **{group: getattr(trained, group) for group in GROUPS},
-        context=trained.context,
-        seeds=(trained.origin.seed,),
-        demos=trained.origin.demos,
-        demonstrations=trained.origin.demonstrations,
+        level=level,
+        method=method,
+        preset=name,
+        demonstrations=choice.demonstrations or default.demonstrations,
+        pretrained=choice.pretrained,
     )
 
 
-def _parse(arguments: Sequence[str], default: AnyConfig, module: str) -> AnyConfig:
-    # Which options there are depends on the method and the domain.
+def override(default: AnyConfig, arguments: Sequence[str], module: str) -> AnyConfig:
+    """Returns a configuration with the options of a command line in place of the defaults.
+
+    Args:
+        default: configuration without these options.
+        arguments: command line without the choice.
+        module: module of the program, for usage lines.
+
+    Raises:
+        UserError: a value is out of its range.
+    """
+    # The types of these fields, and so the options, depend on the method and the domain.
     groups = ("method_settings", "domain_settings", "planner")
     settings = tuple(type(getattr(default, group)) for group in groups)
     generic: Any = type(default)
     try:
         return shell.parse(generic[settings], module, arguments, default=default)
-    except ValueError as error:  # the dataclasses refuse values that cannot be
+    except ValueError as error:  # a dataclass refuses a value
         raise UserError(str(error)) from None

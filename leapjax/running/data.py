@@ -34,11 +34,11 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     config = run.config
     if not config.demos:
         return []
-    source = run.domain.source or storage.source(run.domain, config.demos, run.seed)
+    source = storage.find_source(run.domain, config.demos, run.seed)
     name = config.demonstrations or source.default
     begun = time.perf_counter()
     if config.demonstrations is None and processes.first_does(lambda: not source.exists(name)):
-        if run.domain.encoders_for is None:  # the network needs to know nothing of the data
+        if run.domain.scaling.measure is None:  # the network needs to know nothing of the data
             run.programs.begin(run)
         processes.first_does(lambda: _make(run, source, name))
     # Each process reads for itself: the data need not be on one shared disk.
@@ -69,7 +69,7 @@ def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] 
 
     None where the environment has a measure of its own, which demonstrations do not keep.
     """
-    criterion = domain.criterion
+    criterion = domain.demonstrations.criterion
     if criterion is None or not data:
         return None
     totals = [float(np.sum(d.rewards, dtype=np.float64)) for d in data]

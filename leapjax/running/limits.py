@@ -57,15 +57,14 @@ def check(config: AnyConfig) -> None:
         )
     domain = make_domain(config)
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
-    if made and domain.collect is None and domain.source is None:
+    if made and domain.demonstrations.collect is None and domain.demonstrations.source is None:
         raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
-    limit = domain.shortest_limit
-    if limit is not None and config.planner.horizon > limit:
+    if config.planner.horizon > domain.max_steps:
         raise UserError(
-            f"--horizon {config.planner.horizon} is longer than an episode of {config.level} "
-            f"may last: its step limit is {limit}"
+            f"--horizon {config.planner.horizon} is longer than any episode of {config.level}: at "
+            f"most {domain.max_steps} actions are executed"
         )
     if config.checkpoint is None and config.context > domain.max_steps:
         raise UserError(
@@ -145,7 +144,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         together = min(training.batch, training.microbatch or training.batch)
         activations = together * copies * model.layers * layer
         needs["--batch, --context, --horizon"] = training.batch * context + activations
-        source = domain.source
+        source = domain.demonstrations.source
         # A demonstration has two states at least.
         states = 2 * config.demos if source is None else source.amount
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation

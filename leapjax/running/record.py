@@ -88,7 +88,7 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
 
 def describe_success(run: Run) -> dict[str, Any]:
     """What success means in a row, and how well the data do by it, where that is not plain."""
-    config, criterion = run.config, run.domain.criterion
+    config, criterion = run.config, run.domain.demonstrations.criterion
     if criterion is None:
         return {}
     same = config.play in (None, config.level)

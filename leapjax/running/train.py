@@ -13,7 +13,7 @@ import jax
 from leapjax import files, pretrained, processes, sharding, training
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.domain import apply_statistics
+from leapjax.domain import apply_statistics, measure_statistics
 from leapjax.pretrained import Pretrained
 from leapjax.running.data import check_data, judge_data
 from leapjax.running.metrics import Metrics, read_metrics, write_metrics
@@ -42,7 +42,9 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     processes.first_does(lambda: run.opened.enter_context(files.only_process_in(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
-    steps: Any = windows.concatenate(data, run.domain.extras, padded=True) if data else ()
+    steps: Any = (
+        windows.concatenate(data, run.domain.augmentations.extras, padded=True) if data else ()
+    )
     named = windows.fingerprint(windows.unpadded(steps) if data else ())
     check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = run.programs.take(run)
@@ -102,7 +104,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
 
 def learn_statistics(run: Run, data: Sequence[Demonstration]) -> Run:
     """Returns a run whose network knows the statistics of what it learns from, if it needs any."""
-    statistics = run.domain.measure(data)
+    statistics = measure_statistics(run.domain, data)
     return dataclasses.replace(
         run,
         domain=apply_statistics(run.domain, statistics),

@@ -15,7 +15,7 @@ from leapjax.data.storage.datasets import (
 )
 from leapjax.data.storage.episodes import check_demonstration
 from leapjax.data.storage.reading import load, reasons
-from leapjax.data.storage.sources import no_demonstrator, source
+from leapjax.data.storage.sources import find_source, no_demonstrator
 from leapjax.data.storage.spaces import observation_space
 from leapjax.data.storage.writing import save
 from leapjax.domain import Described
@@ -28,10 +28,10 @@ __all__ = [
     "datasets_folder",
     "described",
     "exists",
+    "find_source",
     "load",
     "no_demonstrator",
     "observation_space",
     "reasons",
     "save",
-    "source",
 ]

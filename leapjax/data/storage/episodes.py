@@ -35,7 +35,7 @@ def check_outline(outline: PyTree, domain: Domain, where: str) -> None:
             )
     stored = outline["observations"]
     # A domain with `replay` plays episodes with other observations again.
-    if domain.replay is None or _holds_fields(domain.blank, stored):
+    if domain.demonstrations.replay is None or _holds_fields(domain.blank, stored):
         observations = _arrange_like(domain.blank, stored, where)
         _check_shapes(observations, domain, steps[0] + 1, where)
 
@@ -64,7 +64,7 @@ def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Dem
         raise UserError(f"{where}: rewards of shape {rewards.shape}, actions of {actions.shape}")
     observations = _arrange_like(domain.blank, given.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
-    domain.check(observations, where)
+    domain.demonstrations.check(observations, where)
 
     def narrowed(path: Any, values: np.ndarray, like: np.ndarray) -> np.ndarray:
         name = jax.tree_util.keystr(path, simple=True) or "observations"

@@ -1,6 +1,5 @@
-"""Whether a data set was recorded in the environment in which its domain is played."""
+"""Plays an episode of a data set again, to compare the environment with the recorded one."""
 
-import json
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -11,31 +10,9 @@ import numpy as np
 from leapjax.data.storage.datasets import UNKNOWN_SEED, find_version
 from leapjax.domain import Described, Domain
 from leapjax.environments import Adapter, closing
-from leapjax.errors import UserError
 from leapjax.types import Demonstration, PyTree
 
 COMPARED = 100  # steps to play again, at most
-
-
-def check_arguments(name: str, recorded: Described, domain: Domain) -> None:
-    """Checks that the environment of a data set was made with the arguments of a domain's.
-
-    Raises:
-        UserError: it was not; says how to play with the arguments of the data.
-    """
-    if domain.arguments is None or recorded.arguments is None:
-        return
-    # The way of rendering does not change an environment.
-    recorded_with, played_with = (
-        {key: value for key, value in arguments.items() if key != "render_mode"}
-        for arguments in (recorded.arguments, domain.arguments)
-    )
-    if recorded_with != played_with:
-        raise UserError(
-            f"{name} was recorded in {domain.level} with other arguments than it is played with: "
-            f"give it {json.dumps(recorded_with)}",
-            "arguments",
-        )
 
 
 def compare_with_play(
@@ -47,7 +24,7 @@ def compare_with_play(
     a function as argument. This plays `COMPARED` steps of the first episode with a known seed.
     """
     made_here = find_version(name) is not None
-    if made_here or domain.replay is not None:  # `replay` plays all episodes again
+    if made_here or domain.demonstrations.replay is not None:  # `replay` plays all episodes again
         return
     known = next((each for each in found if each.seed != UNKNOWN_SEED), None)
     problem = None

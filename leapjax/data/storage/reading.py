@@ -30,7 +30,7 @@ from leapjax.data.storage.episodes import (
     read_mark,
 )
 from leapjax.data.storage.inspection import inspect_dataset, read_metadata
-from leapjax.data.storage.provenance import check_arguments, compare_with_play
+from leapjax.data.storage.provenance import compare_with_play
 from leapjax.data.storage.spaces import read_spaces
 from leapjax.domain import Collection, Domain, Recording
 from leapjax.errors import UserError, first_line
@@ -67,9 +67,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
         metadata = read_metadata(folder)
         outlines = inspect_dataset(folder, metadata)
         recorded = described(name)._replace(spaces=read_spaces(metadata, domain))
-    check_arguments(name, recorded, domain)
-    with _explain_damage(name):
-        domain.check_recorded(recorded, f"the Minari data set {name!r}")
+        domain.demonstrations.check_environment(recorded, f"the Minari data set {name!r}")
     for index, outline in enumerate(outlines):
         check_outline(outline, domain, _name_episode(index, name))
     with _explain_damage(name):
@@ -145,8 +143,8 @@ def _make_demonstration(
     terminated, truncated = (
         read_mark(getattr(episode, marks), f"{where}: {marks}") for marks in STEPWISE[2:]
     )
-    if domain.replay is not None:
-        again = domain.replay(
+    if domain.demonstrations.replay is not None:
+        again = domain.demonstrations.replay(
             Recording(episode.observations, actions.astype(np.int64), rewards, seed)
         )
         if again is not None:

@@ -1,4 +1,4 @@
-"""The source of a domain's demonstrations: its demonstrator makes them, Minari keeps them."""
+"""Finds the source of a domain's demonstrations, which makes the missing ones."""
 
 from collections.abc import Callable
 
@@ -9,17 +9,25 @@ from leapjax.domain import Collection, Domain, Source
 from leapjax.errors import UserError
 
 
-def source(domain: Domain, count: int, seed: int) -> Source:
-    """Returns a source of `count` demonstrations of a domain for a training seed.
+def find_source(domain: Domain, count: int, seed: int) -> Source:
+    """Returns the source of a domain's demonstrations.
 
-    The domain's demonstrator makes them once; a Minari data set keeps them.
+    A domain has its own, or its demonstrator makes them once and a Minari data set stores them.
+
+    Args:
+        domain: the level.
+        count: number of demonstrations; the settings of a source of the domain's own count more.
+        seed: of the training run.
     """
+    if domain.demonstrations.source is not None:
+        return domain.demonstrations.source
+    collect = domain.demonstrations.collect
 
     def make(name: str, progress: Callable[[int], None]) -> str:
         check_writable()
-        if domain.collect is None:
+        if collect is None:
             raise UserError(no_demonstrator(domain))
-        collection = domain.collect(count, seed, progress)
+        collection = collect(count, seed, progress)
         dropped = reasons(collection)
         summary = f"{count} demonstrations of {domain.level}"
         summary += f"; dropped: {dropped}" if dropped else ""

@@ -9,7 +9,15 @@ import numpy as np
 
 from leapjax.checks import check_at_least, check_types, check_within
 from leapjax.data.seeds import MAX_TRAINING_SEED
-from leapjax.domain import Collection, Domain, DomainType, Source
+from leapjax.domain import (
+    Augmentations,
+    Collection,
+    Demonstrations,
+    Domain,
+    DomainType,
+    Scaling,
+    Source,
+)
 from leapjax.domains.atari import replay
 from leapjax.domains.atari.augmentation import mirrored, shifted
 from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
@@ -87,20 +95,19 @@ def make(name: str, settings: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        collect=None,  # by transitions, not by episodes: see `source`
         actions=(*game.actions, "end"),
         max_steps=settings.max_steps,
         blank=np.zeros((HEIGHT, WIDTH), np.uint8),
         encoders={"paper": state_tokens, "leapjax": current_tokens},
-        augmentations=[mirror] * settings.mirror + [shift] * (settings.shift > 0),
-        source=source(game, settings),
-        return_scale=game.return_scale,
+        demonstrations=Demonstrations(source=make_source(game, settings)),
+        augmentations=Augmentations([mirror] * settings.mirror + [shift] * (settings.shift > 0)),
+        scaling=Scaling(returns=game.return_scale),
         signature={"actions": list(game.actions)},
     )
 
 
-def source(game: Game, settings: Settings) -> Source:
-    """Where the trajectories of a game come from."""
+def make_source(game: Game, settings: Settings) -> Source:
+    """Makes the source of a game's trajectories, counted in transitions."""
     count, run = settings.transitions, settings.replay_run
 
     def load(where: str, seed: int) -> Collection:

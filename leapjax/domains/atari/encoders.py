@@ -34,7 +34,7 @@ def changes(stacks: jax.Array) -> jax.Array:
     """Stacks `[n, 84, 84, 4]` as the last frame and what changed before it: `[n, 42, 42, 4]`.
 
     What moves is a few pixels of thousands: a network that is not shown it learns hardly anything
-    for a thousand steps (docs/tried.md). Averages over two by two pixels.
+    for a thousand steps (docs/lessons.md). Averages over two by two pixels.
     """
     x = stacks.astype(jnp.float32) / 255
     x = jnp.concatenate([x[..., -1:], CHANGES * jnp.diff(x, axis=-1)], axis=-1)
@@ -57,7 +57,7 @@ class Features(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:  # noqa: D102
         for index, (side, stride, times) in enumerate(self.layers):
-            # XLA's own is faster here than a product over shifted copies (docs/tried.md).
+            # XLA's own is faster here than a product over shifted copies (docs/lessons.md).
             convolution = nn.Conv(
                 times * self.features, (side, side), stride, "VALID", dtype=self.dtype,
                 kernel_init=nn.initializers.he_normal(), name=f"convolution_{index}",
@@ -116,7 +116,7 @@ class CurrentTokens(Encoder):
         read = Features(HALVED, self.features, self.dtype, name="features")
         features = read(changes(stacked(frames[known], 1)))
         # Wide, not small, and normalised: what is shown to the transformer must be about positions
-        # already (docs/tried.md).
+        # already (docs/lessons.md).
         hidden = nn.Dense(
             HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
         )

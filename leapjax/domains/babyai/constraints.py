@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from leapjax.domains.babyai import vocabulary
 from leapjax.domains.babyai.adapter import END, TURNS
 from leapjax.domains.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, faced, roll, steps_to
-from leapjax.domains.babyai.encoders import one_cell
+from leapjax.domains.babyai.encoders.cells import mark_cell
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
 from leapjax.types import Array, Context
@@ -151,7 +151,7 @@ def in_half(grid: Array, goal: Array, part: int) -> jax.Array:
     """Where in a grid `[S, S, 3]` the obstacles of part 0 or 1 are: `[S, S]` bool."""
     kinds = jnp.asarray(grid)[..., 0]
     objects = (kinds >= INTERCHANGEABLE[0]) & (kinds <= INTERCHANGEABLE[-1])
-    obstacles = objects & (one_cell(jnp.asarray(goal), kinds.shape[0]) == 0)
+    obstacles = objects & (mark_cell(jnp.asarray(goal), kinds.shape[0]) == 0)
     count = jnp.cumsum(obstacles.reshape(-1)).reshape(obstacles.shape)
     return obstacles & (count % 2 == part)
 

@@ -5,17 +5,20 @@ import functools
 
 import numpy as np
 
-from leapjax.domain import Domain, DomainType
+from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.babyai import (
     augmentation,
     demonstrations,
-    encoders,
     levels,
     observations,
     replay,
     vocabulary,
 )
 from leapjax.domains.babyai.adapter import ACTIONS, BabyAIAdapter
+from leapjax.domains.babyai.encoders.cells import COLOURS, DIRECTIONS, OBJECTS, STATES
+from leapjax.domains.babyai.encoders.context_tokens import ContextTokens
+from leapjax.domains.babyai.encoders.convolutions import NORM_GROUPS
+from leapjax.domains.babyai.encoders.state_tokens import StateTokens
 from leapjax.domains.babyai.levels import Level
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
@@ -33,39 +36,41 @@ def make(name: str, options: Settings) -> Domain:
     level = levels.find_level(name)
     with contextlib.closing(levels.make_environment(level)) as env:
         side = max(env.width, env.height)
-        longest, shortest = levels.longest_episode(level, env), levels.shortest_limit(env)
+        longest = levels.longest_episode(level, env)
 
     def state_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
-        if model.width % encoders.NORM_GROUPS:
+        if model.width % NORM_GROUPS:
             raise UserError(
-                f"width {model.width} is not a multiple of {encoders.NORM_GROUPS}, the groups of "
+                f"width {model.width} is not a multiple of {NORM_GROUPS}, the groups of "
                 "channels that the paper's encoder normalises"
             )
-        return encoders.StateTokens(side, model.width, model.dtype)
+        return StateTokens(side, model.width, model.dtype)
 
     def context_tokens(model: ModelConfig, context: int) -> Encoder:
         del context
-        return encoders.ContextTokens(options, model.width, model.dtype)
+        return ContextTokens(options, model.width, model.dtype)
 
     return Domain(
         level=level.name,
         make_adapter=lambda: BabyAIAdapter(level),
-        collect=functools.partial(demonstrations.collect, level),
         actions=ACTIONS,
         max_steps=longest,
         blank=observations.blank(side, level.words),
         encoders={"paper": state_tokens, "leapjax": context_tokens},
-        augmentations=augmentation.choose_augmentations(options),
-        extras=augmentation.mark_needed_cells,
-        check=functools.partial(check, level=level),
-        replay=functools.partial(replay.replay, level=level),
-        shortest_limit=shortest,
+        demonstrations=Demonstrations(
+            functools.partial(demonstrations.collect, level),
+            check=functools.partial(check_states, level=level),
+            replay=functools.partial(replay.replay, level=level),
+        ),
+        augmentations=Augmentations(
+            augmentation.choose_augmentations(options), augmentation.mark_needed_cells
+        ),
         signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
     )
 
 
-def check(states: Observation, where: str, level: Level) -> None:
+def check_states(states: Observation, where: str, level: Level) -> None:
     """Refuses observations whose numbers mean nothing in this world.
 
     Args:
@@ -78,15 +83,15 @@ def check(states: Observation, where: str, level: Level) -> None:
     """
     side = states.grid.shape[1]
     ranges: dict[str, tuple[np.ndarray, int, int]] = {
-        "grid objects": (states.grid[..., 0], 0, encoders.OBJECTS - 1),
-        "grid colours": (states.grid[..., 1], 0, encoders.COLOURS - 1),
-        "grid states": (states.grid[..., 2], 0, encoders.STATES - 1),
+        "grid objects": (states.grid[..., 0], 0, OBJECTS - 1),
+        "grid colours": (states.grid[..., 1], 0, COLOURS - 1),
+        "grid states": (states.grid[..., 2], 0, STATES - 1),
         "positions": (states.pose[:, :2], 0, side - 1),
-        "directions": (states.pose[:, 2], 0, encoders.DIRECTIONS - 1),
+        "directions": (states.pose[:, 2], 0, DIRECTIONS - 1),
         "goals": (states.goal, -1, side - 1),
         "instruction": (states.instruction, 0, vocabulary.SIZE - 1),
-        "carried objects": (states.carried[:, 0], 0, encoders.OBJECTS - 1),
-        "carried colours": (states.carried[:, 1], 0, encoders.COLOURS - 1),
+        "carried objects": (states.carried[:, 0], 0, OBJECTS - 1),
+        "carried colours": (states.carried[:, 1], 0, COLOURS - 1),
     }
     for field, (values, low, high) in ranges.items():
         if values.min() < low or values.max() > high:

@@ -171,8 +171,3 @@ def longest_episode(level: Level, env: RoomGridLevel) -> int:
     navigations = 8 if level.sequence else 1
     grows = navigations * env.room_size**2 * env.num_rows * env.num_cols
     return max(env.max_steps or 0, grows)  # where the limit is not said beforehand it is 0
-
-
-def shortest_limit(env: RoomGridLevel) -> int:
-    """The step limit of the level's simplest instruction."""
-    return env.max_steps or env.room_size**2 * env.num_rows * env.num_cols

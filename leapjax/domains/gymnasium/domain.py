@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from leapjax.checks import check_at_least, check_fits, check_types
-from leapjax.domain import Domain, DomainType, EncoderMaker, Statistics
+from leapjax.domain import Demonstrations, Domain, DomainType, Encoders, Scaling, Statistics
 from leapjax.domains.gymnasium.observations import (
     StateTokens,
     blank_of,
@@ -22,7 +22,7 @@ from leapjax.domains.gymnasium.observations import (
     measure_parts,
     parts_of,
 )
-from leapjax.domains.gymnasium.recorded import check_recorded, describe_environment
+from leapjax.domains.gymnasium.recorded import check_environment, describe_environment
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
 from leapjax.models.encoder import Encoder
@@ -162,14 +162,6 @@ def _longest(env: gym.Env) -> int | None:
     return env.spec.max_episode_steps if env.spec is not None else None
 
 
-def _arguments(env: gym.Env) -> Mapping[str, Any] | None:
-    """What an environment was made with, as data sets say it; None: it cannot be said."""
-    try:
-        return json.loads(env.spec.to_json())["kwargs"] if env.spec is not None else None
-    except Exception:  # noqa: BLE001  (arguments that are not JSON raise many kinds)
-        return None
-
-
 def make(name: str, options: Settings) -> Domain:
     """An environment by its id; it is made once, to look at it.
 
@@ -199,7 +191,7 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
         check_choices(space, observations, where)
         check_precision(space, observations, where)
 
-    def encoders(statistics: Statistics) -> dict[str, EncoderMaker]:
+    def make_encoders(statistics: Statistics) -> Encoders:
         def tokens(num_actions: int, model: ModelConfig, context: int) -> Encoder:
             del context
             return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
@@ -209,26 +201,25 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
             "leapjax": functools.partial(tokens, int(actions.n) + 1),
         }
 
-    def encoders_for(statistics: Statistics) -> dict[str, EncoderMaker]:
+    def scale_encoders(statistics: Statistics) -> Encoders:
         check_statistics(statistics, parts, blank)
-        return encoders(statistics)
+        return make_encoders(statistics)
 
     return Domain(
         level=name,
         make_adapter=lambda: CheckedAdapter(
             make_environment(name, options), name, blank, options.success_return
         ),
-        collect=None,
         actions=(*(str(action) for action in range(actions.n)), "end"),
         max_steps=_longest(env) or 0,
         blank=blank,
-        check=check,
-        arguments=_arguments(env),
-        check_recorded=functools.partial(check_recorded, played=played),
-        criterion=find_criterion(env, options.success_return),
-        encoders=encoders(()),
-        measure=functools.partial(measure_parts, parts),
-        encoders_for=encoders_for,
+        encoders=make_encoders(()),
+        demonstrations=Demonstrations(
+            check=check,
+            check_environment=functools.partial(check_environment, played=played),
+            criterion=find_criterion(env, options.success_return),
+        ),
+        scaling=Scaling(measure=functools.partial(measure_parts, parts), encoders=scale_encoders),
         signature={"parts": [list(part) for part in parts]},
     )
 

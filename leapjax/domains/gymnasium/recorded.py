@@ -21,12 +21,13 @@ WATCHING = frozenset(
 
 
 def describe_environment(env: gym.Env) -> Described:
-    """Says of an environment what data sets say of the one that they were recorded in."""
+    """Describes an environment as the metadata of a data set describe theirs."""
     spaces = {"observation": env.observation_space, "action": env.action_space}
     if env.spec is None:
         return Described(spaces=spaces)
     return Described(
         level=env.spec.id,
+        arguments=_read_arguments(env.spec),
         wrappers=[
             {"name": each.name, "entry_point": each.entry_point, "kwargs": _as_json(each.kwargs)}
             for each in env.spec.additional_wrappers
@@ -36,20 +37,29 @@ def describe_environment(env: gym.Env) -> Described:
     )
 
 
-def check_recorded(recorded: Described, where: str, played: Described) -> None:
-    """Refuses data of another environment than the one that is played.
+def _read_arguments(spec: gym.envs.registration.EnvSpec) -> Mapping[str, Any] | None:
+    """Reads an environment's arguments as a data set stores them; None if they are not JSON."""
+    try:
+        return json.loads(spec.to_json())["kwargs"]
+    except Exception:  # noqa: BLE001  (arguments that are not JSON raise many kinds)
+        return None
 
-    Wrappers are not rebuilt: data would then choose which code is imported.
+
+def check_environment(recorded: Described, where: str, played: Described) -> None:
+    """Checks that a data set was recorded in the environment that is played.
+
+    Wrappers are not rebuilt: a data set could then choose which code is imported.
 
     Args:
-        recorded: what the data say of their environment.
-        where: they are from.
-        played: the environment; `max_steps` is None where the user has chosen it.
+        recorded: description of the data set's environment.
+        where: name of the data set, for the message.
+        played: the environment; `max_steps` is None if the user has chosen it.
 
     Raises:
-        UserError: names the wrappers, the limit of steps or the space that differs.
+        UserError: names the arguments, wrappers, step limit or space that differs.
     """
     level = played.level
+    _check_arguments(recorded, where, played)
     if recorded.wrappers is not None and played.wrappers is not None:
         theirs, ours = _select_changing(recorded.wrappers), _select_changing(played.wrappers)
         if theirs != ours:
@@ -68,6 +78,26 @@ def check_recorded(recorded: Described, where: str, played: Described) -> None:
     for part, space in played.spaces.items():
         if part in recorded.spaces:
             _check_space(recorded.spaces[part], space, part, where, level)
+
+
+def _check_arguments(recorded: Described, where: str, played: Described) -> None:
+    """Checks that both environments have the same arguments; `render_mode` may differ.
+
+    Raises:
+        UserError: they differ; says how to play with the arguments of the data.
+    """
+    if recorded.arguments is None or played.arguments is None:
+        return
+    theirs, ours = (
+        {key: value for key, value in each.items() if key != "render_mode"}
+        for each in (recorded.arguments, played.arguments)
+    )
+    if theirs != ours:
+        raise UserError(
+            f"{where} was recorded in {played.level} with other arguments than it is played with: "
+            f"give it {json.dumps(theirs)}",
+            "arguments",
+        )
 
 
 def _select_changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:

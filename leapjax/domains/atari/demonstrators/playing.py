@@ -17,7 +17,7 @@ Demonstrator = Callable[[Emulator, np.random.Generator], int]
 
 # Probabilities of a random action, so that returns vary and demonstrations show how to recover. A
 # paddle that is always in the right place does not teach how to return there: its clone misses a
-# ball and stays where it is (docs/tried.md).
+# ball and stays where it is (docs/lessons.md).
 NOISES = (0.1, 0.3, 0.5)
 # With more noise in Seaquest the demonstrator scores less, but agents that learn from it do not.
 MORE_NOISE = {"Seaquest": (0.3, 0.5, 0.7)}

@@ -81,7 +81,7 @@ def play_seaquest(emulator: Emulator, random: np.random.Generator) -> int:
     """Plays Seaquest: moves to and fro in a lane, and fires all the time.
 
     The submarine collects six divers and surfaces with them, or rises as its air runs out. It
-    never waits: agents that learn from a demonstrator that waits do nothing else (docs/tried.md).
+    never waits: agents that learn from a demonstrator that waits do nothing else (docs/lessons.md).
     """
     del random
     scene = read_scene(emulator.ram())

@@ -11,7 +11,7 @@ from flax.typing import Dtype
 
 from leapjax.checks import check_range, check_types
 from leapjax.data.solved import collect_solved
-from leapjax.domain import Augmentation, Domain, DomainType
+from leapjax.domain import Augmentation, Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
 from leapjax.models.encoder import Encoder
@@ -85,18 +85,20 @@ def make(name: str, settings: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        collect=functools.partial(collect_solved, make_adapter, lambda adapter: adapter.path),
         actions=(*(str(label) for label in range(labels)), "end"),
         max_steps=star.length,
         blank=blank,
         encoders={"leapjax": tokens},
-        augmentations=augmentations,
-        check=functools.partial(check, labels=labels),
+        demonstrations=Demonstrations(
+            functools.partial(collect_solved, make_adapter, lambda adapter: adapter.path),
+            check=functools.partial(check_labels, labels=labels),
+        ),
+        augmentations=Augmentations(augmentations),
         signature={"length": star.length, "labels": labels},  # any number of arms
     )
 
 
-def check(states: Graph, where: str, labels: int) -> None:
+def check_labels(states: Graph, where: str, labels: int) -> None:
     """Checks that the labels of nodes are in range.
 
     Raises:

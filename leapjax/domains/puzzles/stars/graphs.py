@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
-from leapjax.domain import level_numbers
+from leapjax.domains.puzzles.names import read_numbers
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Window
@@ -54,7 +54,7 @@ def find_level(name: str) -> Star:
         UserError: it is none.
     """
     pattern, expected = r"Star([1-9]\d{0,3})x([1-9]\d{0,3})", "Star<arms>x<edges of an arm>"
-    star = Star(*level_numbers(name, pattern, expected, LEVELS))
+    star = Star(*read_numbers(name, pattern, expected, LEVELS))
     if star.nodes > MOST_NODES:
         raise UserError(f"level {name} has {star.nodes} nodes: at most {MOST_NODES} are possible")
     return star

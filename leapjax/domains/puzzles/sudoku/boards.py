@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
-from leapjax.domain import level_numbers
+from leapjax.domains.puzzles.names import read_numbers
 from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration, Window, pad_token
@@ -48,7 +48,7 @@ def find_level(name: str) -> Size:
         UserError: it is none.
     """
     pattern, expected = r"Sudoku(4|9)x([1-9]\d?)", "Sudoku<4 or 9>x<clues>"
-    size = Size(*level_numbers(name, pattern, expected, LEVELS))
+    size = Size(*read_numbers(name, pattern, expected, LEVELS))
     fewest, most = FEWEST_CLUES[size.side], size.cells
     if not fewest <= size.clues <= most:
         raise UserError(f"level {name}: clues must be in {fewest} .. {most}, got {size.clues}")

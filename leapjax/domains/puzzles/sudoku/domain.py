@@ -9,7 +9,7 @@ import numpy as np
 
 from leapjax.checks import check_range, check_types
 from leapjax.data.solved import collect_solved
-from leapjax.domain import Domain, DomainType
+from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.rules import rules
@@ -85,20 +85,21 @@ def make(name: str, settings: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        collect=functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
         actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
         max_steps=size.cells,
         blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
         encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
-        augmentations=[turn] if settings.augment else [],
-        extras=boards.puzzles,
+        demonstrations=Demonstrations(
+            functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
+            check=functools.partial(check_boards, side=size.side),
+        ),
+        augmentations=Augmentations([turn] if settings.augment else [], boards.puzzles),
         rules=rules(size.side),
-        check=functools.partial(check, side=size.side),
         signature={"side": size.side, "clues": size.clues},
     )
 
 
-def check(states: Board, where: str, side: int) -> None:
+def check_boards(states: Board, where: str, side: int) -> None:
     """Checks that an episode fills a board cell by cell with digits in range.
 
     Raises:

@@ -1,4 +1,7 @@
-"""Functions of states that stay the same for some steps: one call for each run of equal states."""
+"""Maps a function over sequences whose elements often repeat: one call for each repeated element.
+
+States of an episode stay equal for several steps, for example while it has not begun.
+"""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +12,7 @@ import jax.numpy as jnp
 from leapjax.types import PyTree
 
 
-def map_runs(
+def map_repeats(
     function: Callable[[PyTree, jax.Array], jax.Array],
     sequences: PyTree,
     rows: jax.Array,
@@ -17,20 +20,20 @@ def map_runs(
 ) -> jax.Array:
     """Applies a function to B sequences of n elements: `[B, n, ...]`.
 
-    Of equal consecutive elements of a sequence it computes one. How many there are depends on the
-    data, so a loop ends when all are computed. JAX differentiates no such loop: its gradient is
-    written here.
+    It calls the function once for equal consecutive elements of a sequence. The number of calls
+    depends on the data, so a loop ends when all are done. JAX cannot differentiate such a loop;
+    its gradient is written here.
 
     Args:
         function: (element, row of its sequence) -> array; it may capture arrays of floating-point
             numbers, such as parameters.
-        sequences: leaves `[B, n, ...]` of any type, n > 0, by which no gradient is taken.
-        rows: floating-point numbers `[B, ...]`.
-        size: elements that are computed at a time. The gradient computes them again: to store
-            what it needs costs more.
+        sequences: leaves `[B, n, ...]` of any type, n > 0; they get no gradient.
+        rows: floating-point numbers `[B, ...]`, one row a sequence.
+        size: elements of a call. The gradient computes them again, as storing the intermediate
+            values costs more.
     """
-    first, total, which = _find_runs(sequences)
-    # Room for all elements; beyond the last run stands the first element.
+    first, total, which = _find_repeats(sequences)
+    # There is room for all elements; the rest after the last repeat is filled with the first.
     first = jnp.pad(first, (0, -len(first) % size)).reshape(-1, size)
     things = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], sequences)
     rows = rows[first // which.shape[1]]
@@ -39,12 +42,12 @@ def map_runs(
     return found.reshape(-1, *found.shape[2:])[which]
 
 
-def _find_runs(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Finds runs of equal consecutive elements along axis 1.
+def _find_repeats(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds groups of equal consecutive elements along axis 1.
 
     Returns:
-        `[B * n]` the first element of each run, of all B * n, then zeros; `[]` how many runs there
-        are; `[B, n]` the run that each element is of.
+        `[B * n]` index of the first element of each group among all B * n, then zeros; `[]` number
+        of groups; `[B, n]` group of each element.
     """
 
     def differs(leaf: jax.Array) -> jax.Array:
@@ -60,7 +63,7 @@ def _find_runs(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
 def _map_parts(
     each: Callable[..., jax.Array], things: PyTree, count: jax.Array, rows: PyTree, captured: list
 ) -> jax.Array:
-    """`each` of the first `count []` of P parts, `[P, ...]`; then zeros."""
+    """Applies `each` to the first `count []` of P parts: `[P, ...]`, zeros for the others."""
 
     def step(part: jax.Array, found: jax.Array) -> jax.Array:
         return _put(found, each(*_at((things, rows), part), *captured), part)

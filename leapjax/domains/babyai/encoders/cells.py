@@ -1,0 +1,60 @@
+"""Cells of the grid as vectors, and features of the grid at a position."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from leapjax.domains.babyai import symmetries
+from leapjax.domains.babyai.observations import Observation
+
+# MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
+OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
+DIRECTIONS = 4
+
+
+class CellEmbedding(nn.Module):
+    """Embeds the content of each cell, from one-hot codes of its object, colour and state."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> jax.Array:
+        """Computes `[S, S, channels]`; marks the cells of the agent and the goal."""
+        grid = observation.grid
+        side = grid.shape[0]
+        # One-hot and a matrix product: the gradient of a table look-up is a slow scatter.
+        kinds = [
+            jax.nn.one_hot(grid[..., part], size)
+            for part, size in enumerate((OBJECTS, COLOURS, STATES))
+        ]
+        marks = [
+            mark_cell(observation.pose[:2], side)[..., None],
+            mark_cell(observation.goal, side)[..., None],
+        ]
+        features = jnp.concatenate([*kinds, *marks], axis=-1)
+        init = nn.initializers.normal(1.0)
+        return nn.Dense(self.channels, use_bias=False, kernel_init=init)(features)
+
+
+def mark_cell(position: jax.Array, side: int) -> jax.Array:
+    """Makes `[S, S]` float32: 1 at a position `[2]`; zeros if the position is outside the grid."""
+    axis = jnp.arange(side)
+    hit = (axis == position[0])[:, None] & (axis == position[1])[None, :]
+    return hit.astype(jnp.float32)
+
+
+def read_neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Array:
+    """Reads the `(2 r + 1)^2 * C` features around a position; zeros beyond the border."""
+    padded = jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)))
+    size = 2 * radius + 1
+    start = (
+        position[0],
+        position[1],
+        jnp.zeros_like(position[0]),
+    )  # of one type, also with 64 bits
+    return jax.lax.dynamic_slice(padded, start, (size, size, image.shape[-1])).reshape(-1)
+
+
+def read_cell(image: jax.Array, position: jax.Array) -> jax.Array:
+    """Reads the features `[C]` of a cell; zeros if the position is (-1, -1), not observed."""
+    return jnp.einsum("xyc,xy->c", image, mark_cell(position, image.shape[0]))

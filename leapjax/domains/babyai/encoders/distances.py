@@ -1,0 +1,154 @@
+"""Distance fields on a grid: value iteration in sweeps, and convolutions that read them.
+
+The fields are value iteration in the min-plus sense (Tamar et al., 2016, "Value Iteration
+Networks").
+"""
+
+import functools
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.typing import Dtype
+
+from leapjax.domains.babyai.encoders.cells import mark_cell, read_cell
+
+FAR = 64.0  # the distance of a cell that no way leads to, in steps
+BARRIER = 8.0  # cost in steps of each nat of -log P(free)
+_OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
+
+
+class GridEncoder(nn.Module):
+    """Features of cells: learned distances, then local convolutions.
+
+    Each field learns from the demonstrations which cells can be entered: it is not told that
+    walls block the way. Half of the fields measure from the goal if it is observed, the others
+    from places that they learn. A sweep carries a distance one cell further and has no matrix
+    product, so the dozens of sweeps that mazes need cost little.
+
+    Attributes:
+        channels: features of a cell.
+        fields: number of distance fields; 0 for convolutions alone.
+        sweeps: rounds of value iteration, the length in cells of the longest way.
+        rounds: rounds of convolutions, which share their weights.
+        dtype: of the convolutions; distances are float32.
+    """
+
+    channels: int
+    fields: int
+    sweeps: int
+    rounds: int
+    dtype: Dtype = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self, cells: jax.Array, agent: jax.Array, goal: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Computes features `[S, S, channels]` and the agent's distances `[fields]`.
+
+        Args:
+            cells: `[S, S, C]` features of each cell's content.
+            agent: `[2]` the agent's cell.
+            goal: `[2]` the goal's cell; (-1, -1) if it is not observed.
+        """
+        distance = jnp.zeros((*cells.shape[:2], 0))
+        if self.fields:
+            distance = self._compute_fields(cells, goal)
+        # A convolution needs differences only: distances relative to the agent's, squashed.
+        here = read_cell(distance, agent)
+        relative = jnp.tanh((distance - here) / 4)
+        both = jnp.concatenate([cells, relative], axis=-1)
+        source = _make_convolution(self.channels, "source", self.dtype)(both)
+        step = _make_convolution(self.channels, "step", self.dtype)
+        h = nn.relu(source)
+        for _ in range(self.rounds):
+            h = nn.relu(step(h) + source)
+        return h, jnp.tanh(here / 16)
+
+    def _compute_fields(self, cells: jax.Array, goal: jax.Array) -> jax.Array:
+        """Computes the distance fields `[S, S, fields]`."""
+        local = nn.relu(_make_convolution(self.channels, "local", self.dtype)(cells))
+        free = nn.initializers.constant(-3.0)
+        cost = compute_entering_cost(nn.Dense(self.fields, bias_init=free, name="blocked")(local))
+        from_goal = (1 - mark_cell(goal, cells.shape[0]))[..., None] * FAR
+        far = nn.initializers.constant(10.0)
+        learned = nn.softplus(
+            nn.Dense(self.fields - self.fields // 2, bias_init=far, name="start")(local)
+        )
+        start = jnp.concatenate(
+            [jnp.broadcast_to(from_goal, (*cells.shape[:2], self.fields // 2)), learned], axis=-1
+        )
+        return jnp.minimum(find_distances(start, cost, self.sweeps), FAR)
+
+
+def _make_convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:
+    """Makes XLA's 3x3 convolution with padding."""
+    init = nn.initializers.he_normal()
+    return nn.Conv(features, (3, 3), dtype=dtype, kernel_init=init, name=name)
+
+
+def compute_entering_cost(blocked: jax.Array) -> jax.Array:
+    """Computes the cost of entering a cell, in steps, from the log-odds that it is blocked.
+
+    The cost is one step, and `BARRIER` for each nat of -log P(free). Distances then prefer ways
+    that are likely to be free, however long. Demonstrations alone would teach a lower cost: just
+    enough to explain their own detours, which are short.
+
+    Args:
+        blocked: `[...]` log-odds.
+    """
+    return 1 + BARRIER * nn.softplus(blocked)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def find_distances(start: jax.Array, cost: jax.Array, sweeps: int) -> jax.Array:
+    """Finds distances `[S, S, F]`: d(c) = min(start(c), cost(c) + min over 4 neighbours of d).
+
+    The gradient is the fixed point's: it flows back along the shortest ways and stores no sweep.
+    It is exact if no shortest way has more than `sweeps` cells.
+
+    Args:
+        start: `[S, S, F]` distance of a way that ends in the cell.
+        cost: `[S, S, F]` of entering the cell.
+        sweeps: number of rounds; finds ways of at most so many cells.
+    """
+
+    def sweep(_: int, distance: jax.Array) -> jax.Array:
+        return jnp.minimum(start, cost + _stack_neighbours(distance, FAR).min(axis=0))
+
+    return jax.lax.fori_loop(0, sweeps, sweep, start)
+
+
+def _find_forward(
+    start: jax.Array, cost: jax.Array, sweeps: int
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
+    distance = find_distances(start, cost, sweeps)
+    return distance, (start, cost, distance)
+
+
+def _find_backward(
+    sweeps: int, saved: tuple[jax.Array, jax.Array, jax.Array], gradient: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    start, cost, distance = saved
+    near = _stack_neighbours(distance, FAR)  # [4, S, S, F]
+    through = start > cost + near.min(axis=0)  # the way goes on, to the first nearest neighbour
+    onward = jax.nn.one_hot(near.argmin(axis=0), 4, axis=0) * through
+
+    def sweep(_: int, flow: jax.Array) -> jax.Array:
+        """Adds each cell's gradient to the flow from neighbours whose way leads through it."""
+        sent = onward * flow
+        return gradient + sum(
+            _stack_neighbours(sent[direction], 0.0)[_OPPOSITE[direction]] for direction in range(4)
+        )
+
+    flow = jax.lax.fori_loop(0, sweeps, sweep, gradient)
+    return jnp.where(through, 0, flow), jnp.where(through, flow, 0)
+
+
+find_distances.defvjp(_find_forward, _find_backward)
+
+
+def _stack_neighbours(image: jax.Array, outside: float) -> jax.Array:
+    """Stacks the neighbours at x - 1, x + 1, y - 1 and y + 1 of every cell: `[4, S, S, F]`."""
+    padded = jnp.pad(image, ((1, 1), (1, 1), (0, 0)), constant_values=outside)
+    return jnp.stack([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]])

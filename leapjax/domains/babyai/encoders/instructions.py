@@ -1,0 +1,73 @@
+"""Encodes the instruction: its words, the whole, and which words speak of which cell."""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.typing import Initializer
+
+# How embeddings start: as in PyTorch, which the authors use, and as in Flax.
+LARGE = nn.initializers.normal(1.0)
+SMALL = nn.initializers.variance_scaling(1.0, "fan_in", "normal", out_axis=0)
+
+
+class Instruction(NamedTuple):
+    """An encoded instruction.
+
+    Attributes:
+        words: `[L, width]` each word in the context of the words before it.
+        given: `[L]` bool, False for padding.
+        whole: `[width]` the state after the last word.
+    """
+
+    words: jax.Array
+    given: jax.Array
+    whole: jax.Array
+
+
+class InstructionEncoder(nn.Module):
+    """Word embeddings and a GRU (paper, appendix, network details)."""
+
+    vocabulary: int
+    width: int
+    embedding_init: Initializer = SMALL
+
+    @nn.compact
+    def __call__(self, instruction: jax.Array) -> Instruction:
+        """Encodes token ids `[L]`, 0 for padding."""
+        table = nn.Embed(self.vocabulary, self.width, embedding_init=self.embedding_init)
+        words = table(instruction)
+        given = instruction > 0
+        recurrence = nn.RNN(nn.GRUCell(self.width), return_carry=True)
+        whole, states = recurrence(words, seq_lengths=jnp.sum(given))
+        return Instruction(words + states, given, whole)
+
+
+class WordAttention(nn.Module):
+    """Attention from cells to the words of an instruction.
+
+    In 'go to the red ball and the key, then ...' a single vector would have to hold, for every
+    object, whether and when it is meant. Here the cell of an object finds the words that name it.
+
+    Attributes:
+        heads: number of heads.
+        features: of each head.
+    """
+
+    heads: int
+    features: int = 16
+
+    @nn.compact
+    def __call__(self, cells: jax.Array, instruction: Instruction) -> jax.Array:
+        """Computes the words' part `[S, S, C]` in the features of cells `[S, S, C]`."""
+
+        def heads(x: jax.Array, name: str) -> jax.Array:
+            return nn.DenseGeneral((self.heads, self.features), name=name)(x)
+
+        words = instruction.words
+        queries, keys, values = heads(cells, "query"), heads(words, "key"), heads(words, "value")
+        scores = jnp.einsum("xyhd,lhd->xyhl", queries, keys) / self.features**0.5
+        weights = jax.nn.softmax(jnp.where(instruction.given, scores, -1e30), axis=-1)
+        attended = jnp.einsum("xyhl,lhd->xyhd", weights, values)
+        return nn.DenseGeneral(cells.shape[-1], axis=(-2, -1), name="output")(attended)
