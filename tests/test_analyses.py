@@ -145,7 +145,7 @@ def test_rows_are_named_by_all_that_matters():
     assert changed(minimise=same) == name()
 
 
-def test_options_of_a_method_are_for_it_alone_and_for_ours():
+def test_runs_with_the_augmentation_of_this_experiment_have_other_names():
     model = case_of("generalization-easy").models[0]
 
     def settings(method, preset="leapjax"):

@@ -511,51 +511,32 @@ def test_a_cache_is_passed_on_within_an_episode_after_plans_of_one_action(execut
 
 # Environments of Gymnasium.
 
-
-class Line(gym.Env):
-    """Gymnasium's view of a corridor: the first action stays, 1 goes on, the last gives up."""
-
-    observation_space = gym.spaces.Box(0, 10, (1,), np.float32)
-
-    def __init__(self, action_space: gym.Space | None = None) -> None:
-        self.action_space = action_space or gym.spaces.Discrete(3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position = int(self.np_random.integers(0, 3))
-        self.taken = []
-        return np.array([self.position], np.float32), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        self.taken.append(action)
-        self.position += action == 1
-        arrived = self.position == 4
-        reward = 2.0 if arrived else -1.0
-        over = bool(arrived or action == 2)
-        return np.array([self.position], np.float32), reward, over, len(self.taken) >= 9, {}
+DOWN, WALK = 1, [1, 1, 2, 2, 1, 2]  # of FrozenLake: the way to the goal
+ONE = gym.make("FrozenLake-v1", is_slippery=False)
 
 
 def test_any_gymnasium_environment_with_discrete_actions():
-    adapter = GymnasiumAdapter(Line())
-    assert adapter.num_actions == 4  # the end action is ours
-    assert_equal(adapter.reset(3), adapter.reset(3))
-    assert {float(adapter.reset(seed)[0]) for seed in range(20)} == {0.0, 1.0, 2.0}
-    adapter.env.position = 3
-    assert adapter.step(0)[:5] == (np.array([3]), -1.0, False, False, False)
-    assert adapter.step(1)[:5] == (np.array([4]), 2.0, True, False, True)
-    adapter.reset(0)
-    assert adapter.step(2)[2:5] == (True, False, False)  # given up
-    adapter.reset(0)
-    assert [adapter.step(0) for _ in range(9)][-1][2:5] == (False, True, False)
-    shifted = GymnasiumAdapter(Line(gym.spaces.Discrete(2, start=1)))
-    shifted.reset(0)
-    assert [shifted.step(0), shifted.step(1)] and shifted.env.taken == [1, 2]
+    adapter = GymnasiumAdapter(ONE)
+    assert adapter.num_actions == 5  # the end action is ours
+
+    def last(actions):
+        assert adapter.reset(3) == 0
+        return [adapter.step(action) for action in actions][-1][:5]
+
+    assert last([DOWN]) == (4, 0.0, False, False, False)
+    assert last(WALK) == (15, 1.0, True, False, True)
+    assert last([DOWN, DOWN, DOWN]) == (12, 0.0, True, False, False)  # a hole
+    assert last([0] * 100) == (0, 0.0, False, True, False)
+    shifted = types.SimpleNamespace(
+        action_space=gym.spaces.Discrete(2, start=1), spec=None,
+        step=lambda action: (action, 0.0, False, False, {}),
+    )  # fmt: skip
+    assert GymnasiumAdapter(shifted).step(0).observation == 1
 
 
 def answering(**answers):
     """An adapter of an environment that answers as it is told."""
-    adapter = GymnasiumAdapter(Line())
+    adapter = GymnasiumAdapter(ONE)
     adapter.env = types.SimpleNamespace(**{n: lambda *_, a=a, **__: a for n, a in answers.items()})
     return adapter
 
@@ -563,7 +544,7 @@ def answering(**answers):
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: GymnasiumAdapter(Line(gym.spaces.Box(-1, 1, (2,)))), "Discrete action space"),
+        (lambda: GymnasiumAdapter(gym.make("Pendulum-v1")), "Discrete action space"),
         (lambda: GymnasiumAdapter("CartPole-v1"), "expected a Gymnasium environment"),
         (lambda: answering(reset=np.zeros(1)).reset(0), "old interface"),
         (lambda: answering(step=(0, 1.0, True, {})).step(0), "4 values"),
@@ -575,36 +556,26 @@ def test_other_environments_are_refused(call, says):
         call()
 
 
-# What episodes share.
-
-ONE = Line()
-
-
 class Wrapped:
     """An adapter inside another."""
 
     __slots__ = ("inner", "reset", "step")
-    num_actions = 4
+    num_actions = 5
 
     def __init__(self, inner: GymnasiumAdapter) -> None:
         self.inner = inner
         self.reset, self.step = inner.reset, inner.step
 
 
-@functools.cache
-def stayer() -> leap.CompiledPlanner:
-    """Stays where it is, in a `Line`."""
-    return compiled(lambda p, m, actions: actions.sum().astype(jnp.float32), num_actions=4)
-
-
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: GymnasiumAdapter(gym.wrappers.OrderEnforcing(gym.wrappers.TimeLimit(ONE, 5))),
+        lambda: GymnasiumAdapter(gym.wrappers.TimeLimit(ONE, 5)),
         lambda: Wrapped(GymnasiumAdapter(ONE)),
     ],
 )
 def test_one_environment_in_two_adapters_is_found(make):
+    left = compiled(lambda p, m, actions: actions.sum().astype(jnp.float32), num_actions=5)
     with pytest.raises(UserError, match="same environment twice"):
-        leap.evaluate(make, [0, 1], stayer(), None, context=0)
-    assert leap.evaluate(make, [0], stayer(), None, context=0, max_steps=4).lengths == [4]
+        leap.evaluate(make, [0, 1], left, None, context=0)
+    assert leap.evaluate(make, [0], left, None, context=0, max_steps=4).lengths == [4]

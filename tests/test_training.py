@@ -10,15 +10,14 @@ import optax
 import pytest
 
 from leapjax import schedules, sharding, training
-from leapjax.agents import leap, learning
-from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents import leap
+from leapjax.agents.base import Setup, TrainingConfig
+from leapjax.agents.batches import make_blank_steps, window_batches
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import make_update
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import Augmentations, blank_context
-from leapjax.domains.babyai.domain import BABYAI
-from leapjax.domains.babyai.settings import Settings
-from leapjax.errors import UserError
 from leapjax.models.trajectory import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
@@ -172,11 +171,9 @@ def test_the_loss_is_the_energy_of_what_is_masked(masking, end, data, monkeypatc
 def test_without_an_end_action_no_plan_ends():
     made = setup()._replace(settings=leap.Settings("each", end=False))
     energy, params = leap.make_agent(made).energy, tiny()[0].init(jax.random.key(0)).params
-    memory = quick_jit(energy.encode)(params, blank_context(toy.DOMAIN, 0))
-    mask = np.full(4, toy.DOMAIN.num_actions)
-    energies = np.asarray(quick_jit(energy.conditional)(params, memory, mask, np.arange(4)))
-    assert (energies[:, toy.END] == np.inf).all()
-    assert np.isfinite(energies[:, : toy.END]).all()
+    memory = energy.encode(params, blank_context(toy.DOMAIN, 0))
+    energies = energy.conditional(params, memory, np.full(4, toy.END + 1), np.arange(4))
+    assert np.isinf(energies).tolist() == [[False, False, False, True]] * 4
 
 
 def run(losses, report_every=20, begin=0, loss=np.float32, **options):
@@ -237,7 +234,7 @@ def test_a_loss_that_is_not_finite_names_its_step(bad, step):
 
 def test_weight_decay_leaves_embeddings_norms_and_biases():
     config = TrainingConfig(steps=100, warmup=0, learning_rate=0.5, weight_decay=0.1)
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {
         "dense": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)},
         "norm": {"scale": jnp.ones(2)},
@@ -251,7 +248,7 @@ def test_weight_decay_leaves_embeddings_norms_and_biases():
 
 def learning_rates(config: TrainingConfig) -> np.ndarray:
     """What each step really moves: Adam's update of a constant gradient is the rate itself."""
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {"bias": jnp.zeros(())}
 
     def step(state, _):
@@ -281,31 +278,11 @@ def test_a_short_run_warms_up_for_a_tenth_of_it_at_most(steps):
 def test_gradients_are_clipped_by_their_global_norm():
     # Adam forgets the scale of a gradient, so look at what it remembers of the first.
     config = TrainingConfig(steps=10, warmup=0, clip=1.0)
-    optimizer, params = learning.make_optimizer(config), {"bias": jnp.zeros(2)}
+    optimizer, params = make_optimizer(config), {"bias": jnp.zeros(2)}
     for gradient, clipped in ([0.3, 0.4], [0.3, 0.4]), ([30.0, 40.0], [0.6, 0.8]):
         _, state = optimizer.update({"bias": jnp.array(gradient)}, optimizer.init(params), params)
         moment = optax.tree.get(state, "mu")["bias"] / (1 - config.betas[0])
         np.testing.assert_allclose(moment, clipped, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("kind", "setting", "says"),
-    [
-        (TrainingConfig, {"steps": -1}, "steps must be at least 0"),
-        (TrainingConfig, {"clip": 0.0}, "clip must be positive, got 0"),
-        (TrainingConfig, {"windows": "window"}, "unknown windows 'window'"),
-        (leap.Settings, {"masking": "none"}, "unknown masking 'none'"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(kind, setting, says):
-    with pytest.raises(ValueError, match=says):
-        kind(**setting)
-
-
-def test_an_architecture_that_the_domain_has_no_encoder_for_is_refused():
-    paper = dataclasses.replace(MODEL, architecture="paper")
-    with pytest.raises(UserError, match="Line has no encoder for architecture 'paper': .*leapjax"):
-        leap.make_agent(setup(model=paper))
 
 
 # Batches that are split over devices.
@@ -337,7 +314,7 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     assert mesh.size == 8
     data = sharding.replicate(data, mesh)
     agent = leap.make_agent(setup(), mesh)
-    begin, step = training.compile_ahead(agent, mesh, learning.blank_steps(toy.DOMAIN))
+    begin, step = training.compile_ahead(agent, mesh, make_blank_steps(toy.DOMAIN))
     state, key = begin(0)
     rows = step.draw(key, state.step, data)
     assert_identical(rows, drawn)
@@ -358,26 +335,6 @@ def test_a_step_in_parts_is_the_step_of_the_whole_batch(microbatch, data):
     in_parts = dataclasses.replace(TRAINING, microbatch=microbatch)
     step = training.make_train_step(leap.make_agent(setup(training=in_parts)))
     assert_same_step(moments_and_metrics(*step(agent.init(key), data, key)), expected)
-
-
-@only_long
-def test_a_step_of_the_papers_network_in_parts_is_that_of_all(local_demonstrations):
-    level = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
-    data = jax.tree.map(jnp.asarray, windows.concatenate(local_demonstrations, level.extras))
-    settings = leap.Settings(masking="each", repeat_state=False)
-    model, key = dataclasses.replace(MODEL, architecture="paper"), jax.random.key(0)
-
-    def gradient(microbatch, mesh=None):
-        parts = dataclasses.replace(TRAINING, batch=8, microbatch=microbatch)
-        agent = leap.make_agent(Setup(level, 0, 3, model, parts, settings), mesh)
-        state, batch = quick_jit(agent.init)(key), quick_jit(agent.batch)(key, data)
-        if mesh is not None:
-            state = sharding.place(state, sharding.parameter_shardings(state, mesh))
-        return moments_and_metrics(*quick_jit(agent.update)(state, batch, key))
-
-    whole = gradient(0)
-    assert_same_step(gradient(3), whole)
-    assert_same_step(gradient(2, sharding.make_mesh(8, jax.devices()[:2])), whole)
 
 
 def test_a_mesh_has_as_many_devices_as_split_the_batch():
@@ -431,7 +388,7 @@ def average_agent(mesh) -> Agent:
         extra = {"average": jnp.ones((SIZE, SIZE))}
         return TrainState(params, optimizer.init(params), jnp.int32(0), extra)
 
-    update = learning.make_update(loss, optimizer, mesh, next_extra)
+    update = make_update(loss, optimizer, mesh, next_extra)
     return Agent(init, lambda key, data: data, update, None)
 
 

@@ -47,7 +47,8 @@ def make(level: str, options: Settings) -> Domain:
     Raises:
         UserError: an unknown level.
     """
-    return domain.make(level, options)._replace(augmentations=choose(options))
+    plain = domain.make(level, options)
+    return plain._replace(augmentations=plain.augmentations._replace(functions=choose(options)))
 
 
 def choose(options: Settings) -> list[Augmentation]:
