@@ -151,25 +151,6 @@ def test_a_last_row_is_never_used(tmp_path):
     assert dropped == {CUT_AFTER: 1}
 
 
-def test_black_frames_of_a_game_are_kept(tmp_path):
-    (e,) = episodes([9])
-    for part in e:
-        part[:5] = 0  # nothing tells these from padding but that padding is three rows
-    put(tmp_path, stale(rows_of([e])))
-    assert_are(read(tmp_path).demonstrations, [e])
-
-
-def test_data_without_padding_loses_no_frame(tmp_path):
-    some = episodes([2, 3, 4, 9, 1])
-    some[3].frames[:2] = 0
-    some[3].actions[:2] = 0
-    some[3].rewards[:2] = 0
-    put(tmp_path, stale(rows_of(some, padding=0)))
-    demonstrations, dropped = read(tmp_path)
-    assert_are(demonstrations, some[1:])  # of the first nobody knows whether it is whole
-    assert dropped == {CUT_BEFORE: 1}
-
-
 def test_sampling_stops_at_enough(three_shards):
     folder, originals = three_shards
     names = {e.frames.tobytes() for e in originals}
@@ -283,14 +264,6 @@ def test_frames_are_never_all_in_memory(tmp_path):
     assert len(demonstrations) == 2
     assert peak < unpacked / 10
     assert peak < trajectory / 2  # not even one of the two was in memory as a whole
-
-
-def test_only_what_is_needed_is_unpacked(tmp_path):
-    logs = put(tmp_path, stale(rows_of(episodes([50] * 40))))
-    path = logs / f"{OBSERVATION}_ckpt.0.gz"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert len(read(tmp_path, 60).demonstrations) == 2
-    assert "ended before" in refused(tmp_path)
 
 
 def test_no_such_folder_game_run_or_shard(tmp_path, monkeypatch):
@@ -463,17 +436,3 @@ def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, killed_a
     with pytest.raises(KeyboardInterrupt):
         replay.write_shard(tmp_path, 0, episodes([5, 6]))
     assert not replay.has_shard(tmp_path, 0)
-
-
-def test_episodes_that_are_none(tmp_path):
-    (e,) = episodes([4])
-    for wrong in (
-        [], [e._replace(rewards=e.rewards[1:])], [e._replace(frames=e.frames[:, 1:])],
-        [Episode(*(part[:0] for part in e))],
-    ):  # fmt: skip
-        with pytest.raises(ValueError, match="episode"):
-            replay.write_shard(tmp_path, 0, wrong)
-    assert not list(tmp_path.iterdir())
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UserError, match="cannot write"):
-        replay.write_shard(tmp_path / "file" / "replay_logs", 0, [e])
