@@ -25,7 +25,7 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from leapjax import pretrained, sharding, training
-from leapjax.agents import learning
+from leapjax.agents.optimizer import make_optimizer
 from leapjax.configuration import AnyConfig, change, make_domain, specify
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
@@ -117,7 +117,7 @@ class Stepper:
         contexts, tokens = jax.device_put((contexts, tokens), split)
         encode = sharding.split_batches(lambda _, *given: self._encode(*given), mesh)
         memory = encode(None, params, contexts)
-        optimizer = learning.make_optimizer(config.training)
+        optimizer = make_optimizer(config.training)
         optimize = jax.jit(
             lambda state: optimizer.update(state.params, state.optimizer, state.params)
         )

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax import compilation, pretrained, sharding
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows

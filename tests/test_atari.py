@@ -19,7 +19,7 @@ import pytest
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
 from experiments.tables.atari import ENCODED, played
-from leapjax.configuration import configuration_hash
+from leapjax.configuration import hash_config
 from leapjax.data import windows
 from leapjax.domains.atari import augmentation, domain, encoders, replay
 from leapjax.domains.atari.adapter import AtariAdapter
@@ -402,17 +402,17 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
     assert collect.find_shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
 
 
-@pytest.mark.parametrize(("game", "run"), [("Pong", 1)])
-def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
+@pytest.mark.parametrize(("game", "number"), [("Pong", 1)])
+def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, number):
     folder, arguments = collected
-    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
-    where = ["--folder", str(tmp_path), "--game", game, "--replay-run", str(run)]
+    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(number))
+    where = ["--folder", str(tmp_path), "--game", game, "--dqn-seed", str(number)]
     assert atari.main([*arguments, *where]) == 2
     error = capsys.readouterr().err
-    assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
+    assert f"holds games of Breakout, seed 1, not of {game}, seed {number}" in error
     assert error.count("\n") == 1
-    settings = domain.Settings(transitions=100, replay_run=run)
-    with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
+    settings = domain.Settings(transitions=100, dqn_seed=number)
+    with pytest.raises(UserError, match=f"of Breakout, seed 1, not of {game}, seed {number}"):
         domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
 
 
@@ -466,7 +466,7 @@ def test_every_way_to_learn_trains_and_plays(
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "did you mean Pong"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
-        (["collect", "--game", "Pong", "--replay-run", "0"], "--replay-run must be at least 1"),
+        (["collect", "--game", "Pong", "--dqn-seed", "0"], "--dqn-seed must be at least 1"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -482,24 +482,24 @@ def test_the_table_has_normalised_scores():
         "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
         "configuration": {"planner": {"temperature": 0.1}},
     }  # fmt: skip
-    name = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
     # Its checkpoint played again is no other seed.
     again = dataclasses.replace(
         find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
     )
-    rows += [{**rows[0], "train_steps": 0, "hash": configuration_hash(again, 0)}]
+    rows += [{**rows[0], "train_steps": 0, "hash": hash_config(again, 0)}]
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
-    second = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
+    second = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
     assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows, {})
     # Who always takes the best action plays four games, however often.
-    name = configuration_hash(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
     table = played([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table

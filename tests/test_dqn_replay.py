@@ -62,9 +62,9 @@ def stale(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([x, np.asarray(last[name], x.dtype)]) for name, x in rows.items()}
 
 
-def put(folder: Path, rows: dict[str, np.ndarray], number: int = 0, run: int = 1) -> Path:
+def put(folder: Path, rows: dict[str, np.ndarray], number: int = 0, dqn_seed: int = 1) -> Path:
     """Writes a shard with NumPy and gzip alone."""
-    logs = folder / "Pong" / str(run) / "replay_logs"
+    logs = folder / "Pong" / str(dqn_seed) / "replay_logs"
     logs.mkdir(parents=True, exist_ok=True)
     count = len(rows["action"]) - 1
     arrays = {f"$store$_{name}": x for name, x in rows.items()}
@@ -270,18 +270,16 @@ def test_no_such_folder_game_run_or_shard(tmp_path, monkeypatch):
     message = refused(tmp_path / "absent")
     assert f"no folder {tmp_path / 'absent'}" in message
     assert "Pong/1/replay_logs" in message and "gs://atari-replay-datasets" in message
-    assert "`python -m experiments.atari collect --game Pong`" in message
-    put(tmp_path, stale(rows_of(episodes([5]))), run=2)
+    put(tmp_path, stale(rows_of(episodes([5]))), dqn_seed=2)
     message = refused(tmp_path, GAMES["Breakout"])
     assert f"no data of Breakout in {tmp_path}, only of Pong" in message
-    assert "no run 1 of Pong" in refused(tmp_path) and "only 2" in refused(tmp_path)
-    assert "collect --game Pong --replay-run 3`" in refused(tmp_path, run=3)
-    assert "at least 1, got 0" in refused(tmp_path, run=2, transitions=0)
+    assert "no DQN of seed 1 of Pong" in refused(tmp_path) and "only 2" in refused(tmp_path)
+    assert "at least 1, got 0" in refused(tmp_path, dqn_seed=2, transitions=0)
     logs = replay.replay_logs(tmp_path, PONG, 1)
     logs.mkdir(parents=True)
     assert f"no shards in {logs}" in refused(tmp_path)
     monkeypatch.setattr(files, "SPARE", 2**60)
-    assert "make room" in refused(tmp_path, run=2)
+    assert "make room" in refused(tmp_path, dqn_seed=2)
 
 
 def claims(raw):

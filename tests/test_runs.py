@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from leapjax.agents import bc, cql, leap
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.agents.batches import run_batches
-from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.domain import Augmentations
 from leapjax.domains.babyai.encoders import state_tokens as babyai

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.configuration import AnyConfig, configuration_hash
+from leapjax.configuration import AnyConfig, hash_config
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -41,7 +41,7 @@ from leapjax.running.programs import PLANS_TOGETHER
 from leapjax.running.results import Row
 from leapjax.running.run import Experiment, find_folder, open_run
 from leapjax.running.train import train
-from leapjax.serialization import differences
+from leapjax.serialization import find_differences
 from leapjax.types import Energy
 
 Change = Callable[[AnyConfig], AnyConfig]
@@ -291,7 +291,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
             "experiment": analysis.name,
             "hash": name,
             "domain": analysis.domain,
-            "trained": [configuration_hash(each, seed) for each in settings],
+            "trained": [hash_config(each, seed) for each in settings],
             "train_seconds": round(seconds, 3),
             "versions": work.versions,
             **said,
@@ -319,7 +319,7 @@ def row_name(
     setting that is added later changes no name.
     """
     search = way.search(settings[0].planner)
-    planner = differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
+    planner = find_differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
     asked = {
         "minimise": described(way.minimise), "remembers": way.remembers,
         "adapter": described(case.adapter),
@@ -330,8 +330,8 @@ def row_name(
         "level": case.level, "seed": seed, "executed": way.executed,
         "episodes": options.episodes, "first": options.played[0],
         "planner": {"kind": type(search).__name__, **planner},
-        "trained": [configuration_hash(each, seed) for each in settings],
-        **differences(asked, plain),
+        "trained": [hash_config(each, seed) for each in settings],
+        **find_differences(asked, plain),
     }  # fmt: skip
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
 
