@@ -227,7 +227,7 @@ def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path)
     planner = SimpleNamespace(energy=energy, params=(), specification=SimpleNamespace(context=0))
     star_animation.animate(planner, run, [0], tmp_path / "plan.gif")
     with Image.open(tmp_path / "plan.gif") as animation:
-        assert animation.width == star_animation.side_of(star)  # one planner
+        assert animation.width == star_animation.choose_side(star)  # one planner
 
 
 @only_long
