@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import tyro
 
 from leapjax import pretrained, serialization
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain

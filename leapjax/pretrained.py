@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from leapjax import domains, rollouts, serialization, weights
-from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
+from leapjax.agents.base import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics, blank_context

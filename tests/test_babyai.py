@@ -17,7 +17,6 @@ from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import GibbsConfig
-from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.running.command_line import parse
 from leapjax.running.data import find_demonstrated
@@ -158,17 +157,6 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
     error = capsys.readouterr().err
     assert f"does not fit: {message}" in error and error.count("\n") == 1
     assert not (tmp_path / "runs").exists()
-
-
-def test_the_random_method_has_a_row_and_plans_uniformly(workplace):
-    assert babyai.main([*RANDOM, "--runs", "random"]) == 0
-    (row,) = results.read(workplace / "random" / "babyai.jsonl")
-    assert (row["method"], row["demos"], row["train_steps"]) == ("random", 0, 0)
-    assert (row["params"], row["horizon"]) == (0, 1)
-    plan = plans(load(only_folder(workplace / "random")), 1200)
-    counts = np.bincount(plan.actions[:, 0], minlength=7)
-    assert counts[6] == 0  # the end
-    assert counts[:6].min() > 150 and counts[:6].max() < 250  # four standard deviations
 
 
 def plans(planner, count):
@@ -346,12 +334,3 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
     assert played == [list(seeds.validation_seeds(0, 3))] * 2
     assert plot.stat().st_size > 1000
-
-
-def test_every_search_setting_can_be_made():
-    for level in LEVELS.values():
-        for name in ("paper", "leapjax"):
-            config = find_preset("babyai", level.name, "leap", name)
-            variants = quality.variants(config.planner, level.iterations)
-            assert len(variants) > 10
-            assert max(config.iterations for config in variants.values()) == level.iterations

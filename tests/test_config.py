@@ -13,7 +13,7 @@ import pytest
 import experiments.__main__ as programs
 from experiments.common.searches import list_searches
 from leapjax import domains, files, pretrained, serialization
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import hash_config, list_settings, make_domain, specify
 from leapjax.domains import DOMAINS, find_domain
 from leapjax.domains.babyai.domain import BABYAI

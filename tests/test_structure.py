@@ -13,7 +13,7 @@ import pytest
 import leapjax
 from experiments import report
 from leapjax import types
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.models.trajectory import ModelConfig
 from leapjax.running import jax_setup, results
 from tests.programs import LONG, ROOT

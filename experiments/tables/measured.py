@@ -24,9 +24,9 @@ from leapjax.running.schema import (
 
 PART = {"part": str, "ms": POSITIVE, "gflop": AMOUNT}
 TRAINING = {
-    "level": str, "preset": str, "run": SEVERAL, "steps": COUNT, "steps_per_second": POSITIVE,
-    "flops_per_step": AMOUNT, "gflops": AMOUNT, "fraction_of_peak": AMOUNT,
-    "training_seconds": AMOUNT, "parts": Each(PART),
+    "level": str, "preset": str, "consecutive": SEVERAL, "steps": COUNT,
+    "steps_per_second": POSITIVE, "flops_per_step": AMOUNT, "gflops": AMOUNT,
+    "fraction_of_peak": AMOUNT, "training_seconds": AMOUNT, "parts": Each(PART),
 }  # fmt: skip
 PLANNING = {
     "preset": str, "horizon": SEVERAL, "iterations": SEVERAL, "batch": SEVERAL,
