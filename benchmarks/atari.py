@@ -24,7 +24,7 @@ from benchmarks import training
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
-from experiments.tables.atari import encoding
+from experiments.tables.atari import describe_encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.configuration import AnyConfig, change, make_domain, specify
@@ -185,7 +185,7 @@ def tables(rows: Sequence[Row]) -> tuple[Table, Table]:
         spent = (whole, *(row[f"{part}_seconds"] for part in ("planning", "encoding", "playing")))
         milliseconds = (f"{1e3 * seconds:.1f}" for seconds in spent)
         taken.add_row(*name, *milliseconds, f"{row['batch'] / whole:.0f}")
-        encoded.add_row(*name, f"{1e3 * row['anew_seconds']:.1f}", *encoding(row))
+        encoded.add_row(*name, f"{1e3 * row['anew_seconds']:.1f}", *describe_encoding(row))
     return taken, encoded
 
 

@@ -18,7 +18,7 @@ import pytest
 
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
-from experiments.tables.atari import ENCODED, played
+from experiments.tables.atari import ENCODED, compare_scores
 from leapjax.configuration import hash_config
 from leapjax.data import windows
 from leapjax.domains.atari import augmentation, domain, encoders, replay
@@ -489,7 +489,7 @@ def test_the_table_has_normalised_scores():
         find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
     )
     rows += [{**rows[0], "train_steps": 0, "hash": hash_config(again, 0)}]
-    table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
+    table = compare_scores(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
@@ -497,11 +497,11 @@ def test_the_table_has_normalised_scores():
     assert f"| Breakout | paper | {paper} | - | - |" in table
     second = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
-    assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows, {})
+    assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in compare_scores(rows, {})
     # Who always takes the best action plays four games, however often.
     name = hash_config(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
-    table = played([{**rows[0], **greedy}], {})
+    table = compare_scores([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
 
 

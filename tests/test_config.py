@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 import experiments.__main__ as programs
-from experiments.common.searches import searches
+from experiments.common.searches import list_searches
 from leapjax import domains, files, pretrained, serialization
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import hash_config, list_settings, make_domain, specify
@@ -133,9 +133,9 @@ def test_the_classifier_can_search_where_presets_fill_plans_action_by_action(dom
     found = {name: command_line.parse(domain, ["--method", name])[0]
              for name in ("leap", "classifier")}  # fmt: skip
     assert found["leap"].planner.fill == "confident"
-    ways = searches(found["classifier"])
+    ways = list_searches(found["classifier"])
     assert {way.planner.fill for way in ways} == {"together"}
-    assert len(searches(found["leap"])) > len(ways) > 5
+    assert len(list_searches(found["leap"])) > len(ways) > 5
 
 
 def test_every_program_is_known_by_name(capsys):

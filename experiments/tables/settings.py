@@ -38,11 +38,13 @@ class Setting:
         if (row["method"], row["preset"]) != (self.method, self.preset):
             return False
         of = row["domain"], row["level"], self.method, self.preset
-        return row["hash"] in _hashes(*of, json.dumps(self.changes, sort_keys=True), row["seed"])
+        return row["hash"] in _hash_setting(
+            *of, json.dumps(self.changes, sort_keys=True), row["seed"]
+        )
 
 
 @functools.cache  # many rows are asked whether they are of the same settings
-def _hashes(
+def _hash_setting(
     domain: str, level: str, method: str, preset: str, changes: str, seed: int
 ) -> tuple[str, str]:
     """Returns the hashes of a configuration: of its training, and of its checkpoint played again.
