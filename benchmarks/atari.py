@@ -51,7 +51,7 @@ class Options:
     """Games that are played together."""
     training: bool = True
     """Measure training too."""
-    run: int = 16
+    consecutive: int = 16
     """Windows in a row whose states preset `paper` encodes once; beside windows drawn alone."""
     json: Path | None = None
     """Write the rows of playing here."""
@@ -63,9 +63,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints tables, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.atari", given)
-    return shell.guarded("benchmarks.atari", given, lambda: run(options))
+    return shell.run_program("benchmarks.atari", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -89,9 +89,11 @@ def run(options: Options) -> None:
     ]
     papers = [config for config in configs if config.model.architecture == "paper"]
     try:
-        in_runs = [change(config, training={"run": options.run}) for config in papers]
+        in_sequence = [
+            change(config, training={"consecutive": options.consecutive}) for config in papers
+        ]
     except ValueError as error:
-        raise UserError(f"--run {options.run}: {error}") from None
+        raise UserError(f"--consecutive {options.consecutive}: {error}") from None
     console = Console()
     playing = [
         row for config in configs for row in measure(config, options.batches, options.seconds)
@@ -99,7 +101,7 @@ def run(options: Options) -> None:
     console.print(*tables(playing), sep="\n")
     write_rows(options.json, playing)
     if options.training:
-        trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
+        trained = [training.measure(config, options.seconds) for config in [*configs, *in_sequence]]
         console.print(training.table(trained))
         write_rows(options.training_json, trained)
 

@@ -66,9 +66,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.planning", given)
-    return shell.guarded("benchmarks.planning", given, lambda: run(options))
+    return shell.run_program("benchmarks.planning", given, lambda: run(options))
 
 
 def run(options: Options) -> None:

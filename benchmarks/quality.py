@@ -56,9 +56,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.quality", given)
-    return shell.guarded("benchmarks.quality", given, lambda: run(options))
+    return shell.run_program("benchmarks.quality", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -70,7 +70,7 @@ def run(options: Options) -> None:
     if options.plot is not None:
         plots.check_figure(options.plot)
     check_writable(options.json)
-    folders = [pretrained.find(path) for path in options.runs]
+    folders = [pretrained.find_folder(path) for path in options.runs]
     searches = {}
     for folder in folders:
         specification = pretrained.read_specification(folder)

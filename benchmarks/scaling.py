@@ -53,9 +53,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures every setting, prints a table, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.scaling", given)
-    return shell.guarded("benchmarks.scaling", given, lambda: run(options, given))
+    return shell.run_program("benchmarks.scaling", given, lambda: run(options, given))
 
 
 def run(options: Options, arguments: list[str]) -> None:

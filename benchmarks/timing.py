@@ -76,5 +76,5 @@ def check_writable(*paths: Path | None) -> None:
 def write_rows(path: Path | None, rows: Sequence[Row]) -> None:
     """Writes the rows where `--json` asked for them, with what they were made with."""
     if path is not None:
-        made = {"date": results.today(), "versions": results.versions()}
+        made = {"date": results.format_date(), "versions": results.find_versions()}
         files.write_text(path, json.dumps([{**row, **made} for row in rows], indent=1) + "\n")

@@ -57,9 +57,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints a table, and writes what was asked for."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.training", given)
-    return shell.guarded("benchmarks.training", given, lambda: run(options))
+    return shell.run_program("benchmarks.training", given, lambda: run(options))
 
 
 def run(options: Options) -> None:
@@ -184,7 +184,7 @@ def _is_float(leaf: jax.Array) -> bool:
 
 def measure(config: AnyConfig, seconds: float) -> Row:
     """One preset on one level."""
-    batch, windows = config.training.batch, config.training.run
+    batch, windows = config.training.batch, config.training.consecutive
     mesh = sharding.make_mesh(batch // windows)
     step = Stepper(config, mesh)
     taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
@@ -197,7 +197,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
         "horizon": config.planner.horizon,
         "context": config.context,
         "batch": batch,
-        "run": windows,
+        "consecutive": windows,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
         "parts": step.parts(mesh, seconds) if windows == 1 else [],  # those of runs are shared
@@ -230,7 +230,8 @@ def table(rows: Sequence[Row]) -> Table:
     for row in rows:
         result.add_row(
             row["level"],
-            row["preset"] + (f", runs of {row['run']}" if row["run"] > 1 else ""),
+            row["preset"]
+            + (f", {row['consecutive']} consecutive" if row["consecutive"] > 1 else ""),
             f"{row['steps_per_second']:.1f}",
             f"{1e3 / row['steps_per_second']:.1f}",
             f"{row['gflops']:.0f}",

@@ -18,9 +18,9 @@ PROGRAMS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the program that comes first with all that follows it; the exit code."""
-    name, *rest = shell.arguments_of(arguments) or ["--help"]
+    name, *rest = shell.read_arguments(arguments) or ["--help"]
     if name in ("-h", "--help"):
-        command = startup.command("experiments.NAME")
+        command = startup.format_command("experiments.NAME")
         print(f"usage: {command} [OPTIONS]\n")
         print(f"{command} --help lists the options of a program; --version prints the version.\n")
         for each in PROGRAMS:
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     module = f"experiments.{name}"
     # An extra that is missing ends this import.
-    failed = shell.guarded(module, rest, lambda: importlib.import_module(module))
+    failed = shell.run_program(module, rest, lambda: importlib.import_module(module))
     return failed or importlib.import_module(module).main(rest)
 
 

@@ -50,9 +50,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints one table per run; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.accuracy", given)
-    return shell.guarded("experiments.accuracy", given, lambda: report(options))
+    return shell.run_program("experiments.accuracy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:

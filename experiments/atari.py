@@ -42,8 +42,8 @@ class Collect:
         transitions: Transitions to make at least, in whole games; None for as many as preset
             leapjax learns from.
         folder: Folder for the data; if games were begun there, they are continued.
-        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
-            own.
+        dqn_seed: Number of the data, from 1, as DQN-Replay has the games of DQNs of five seeds;
+            each has games of its own.
         longest: Decisions after which a game is cut off, because a ball can fly on for ever.
         workers: Processes; None for one on each core.
         record: Write the scores of the demonstrators to results/, which is committed.
@@ -52,7 +52,7 @@ class Collect:
     game: str
     transitions: int | None = None
     folder: Path = Path(FOLDER)
-    replay_run: int = 1
+    dqn_seed: int = 1
     longest: int = LONGEST
     workers: int | None = None
     record: bool = False
@@ -60,10 +60,12 @@ class Collect:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs every game and seed asked for, or collects data; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     if given[:1] == ["collect"]:
         options = shell.parse(Collect, "experiments.atari collect", given[1:])
-        return shell.stoppable(f"experiments.{EXPERIMENT.name}", given, lambda _: run(options))
+        return shell.run_interruptible_program(
+            f"experiments.{EXPERIMENT.name}", given, lambda _: run(options)
+        )
     return running.main(EXPERIMENT, given)
 
 
@@ -73,14 +75,14 @@ def run(options: Collect) -> None:
     Raises:
         UserError: an unknown game, numbers that cannot be, or data that are not to be recorded.
     """
-    for name in ("transitions", "replay_run", "longest", "workers"):
+    for name in ("transitions", "dqn_seed", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    Settings(replay_run=options.replay_run, max_steps=options.longest)  # raises above their ranges
+    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises above their ranges
     memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
-    if options.record and (options.replay_run, options.longest) != (1, LONGEST):
+    if options.record and (options.dqn_seed, options.longest) != (1, LONGEST):
         raise UserError(
-            f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
+            f"--record is for data that are learned from: --dqn-seed 1, --longest {LONGEST}"
         )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
     from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (ale-py is optional)
@@ -89,7 +91,7 @@ def run(options: Collect) -> None:
     transitions = options.transitions or presets.transitions(options.game)
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
-            options.folder, find_game(options.game), transitions, options.replay_run,
+            options.folder, find_game(options.game), transitions, options.dqn_seed,
             options.longest, options.workers, meter.update,
         )  # fmt: skip
     games = [game for manifest in made for game in manifest["games"]]

@@ -24,7 +24,7 @@ from leapjax.data import windows
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained
 from leapjax.running import jax_setup, memory, results, shell
-from leapjax.running.limits import check_counts, layer_bytes
+from leapjax.running.limits import check_counts, count_layer_bytes
 from leapjax.types import Demonstration
 
 RESULTS = Path("atari-energy.json")
@@ -49,9 +49,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Says how energy and reward are correlated; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.atari_energy", given)
-    return shell.guarded("experiments.atari_energy", given, lambda: report(options))
+    return shell.run_program("experiments.atari_energy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
@@ -67,10 +67,10 @@ def report(options: Options) -> None:
             )
         # Each window is scored with T passes, all of a trajectory at once.
         horizon, model = specification.planner.horizon, specification.model
-        layer = layer_bytes(model, specification.context + horizon)
+        layer = count_layer_bytes(model, specification.context + horizon)
         memory.check({"--windows": options.windows * horizon * layer})
     jax_setup.start()
-    path = results.folder(options.record, options.runs) / RESULTS
+    path = results.choose_folder(options.record, options.runs) / RESULTS
     console = Console(markup=False)
     for checkpoint in options.checkpoint:
         planner = pretrained.load(checkpoint)
@@ -123,8 +123,8 @@ def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -
         "p_value": float(found.pvalue),
         "horizon": horizon,
         "windows": count,
-        "versions": results.versions(),
-        "date": results.today(),
+        "versions": results.find_versions(),
+        "date": results.format_date(),
     }
 
 

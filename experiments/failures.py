@@ -96,9 +96,9 @@ class Recorder(BabyAIAdapter):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plays, counts, draws; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.failures", given)
-    return shell.guarded("experiments.failures", given, lambda: report(options))
+    return shell.run_program("experiments.failures", given, lambda: report(options))
 
 
 def report(options: Options) -> None:

@@ -68,9 +68,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains with each preset and says what was found; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.landscape", given)
-    return shell.stoppable(
+    return shell.run_interruptible_program(
         "experiments.landscape", given, lambda interruption: report(options, interruption)
     )
 
@@ -84,7 +84,7 @@ def report(options: Options, interruption: Interruption) -> None:
         raise UserError("--presets: name at least one, such as leapjax")
     if options.record and options.steps is not None:
         raise UserError("--record: what is recorded is trained for the preset's number of --steps")
-    folder = results.folder(options.record, options.runs)
+    folder = results.choose_folder(options.record, options.runs)
     files.check_writable(folder)
     console = Console(markup=False)
     wanted = []
@@ -146,8 +146,8 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
         "trajectories": count,
         "training": watched,
         "planning": refinement(planner, firsts.context),
-        "versions": results.versions(),
-        "date": results.today(),
+        "versions": results.find_versions(),
+        "date": results.format_date(),
     }
 
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from minigrid.core.world_object import WorldObj
 
+from experiments.augmentation import augment
 from experiments.common import cases
 from experiments.common.cases import Analysis, Case, Model, Way, alone, drawn_at
 from leapjax.configuration import AnyConfig, change
@@ -61,7 +62,7 @@ def with_false_starts(config: AnyConfig) -> AnyConfig:
 
     A plan of one action has no beginning that others could follow.
     """
-    return change(config, domain_settings={"false_starts": 0.6} if config.method == "leap" else {})
+    return augment(config, false_starts=0.6) if config.method == "leap" else config
 
 
 def with_detours(config: AnyConfig) -> AnyConfig:
@@ -69,8 +70,9 @@ def with_detours(config: AnyConfig) -> AnyConfig:
 
     IQL learns from transitions: nobody goes around anything in one step.
     """
-    detours = {"detours": 0.5, "lookalikes": True}
-    return change(config, domain_settings=detours if config.method in ("leap", "dt") else {})
+    if config.method not in ("leap", "dt"):
+        return config
+    return augment(config, detours=0.5, lookalikes=True)
 
 
 def in_room(config: AnyConfig) -> AnyConfig:

@@ -25,9 +25,9 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Publishes every run that is named."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.publish", given)
-    return shell.guarded("experiments.publish", given, lambda: publish(options.runs))
+    return shell.run_program("experiments.publish", given, lambda: publish(options.runs))
 
 
 def publish(runs: Sequence[Path]) -> None:

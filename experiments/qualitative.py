@@ -83,9 +83,9 @@ class Drawn(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draws both figures; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.qualitative", given)
-    return shell.stoppable(
+    return shell.run_interruptible_program(
         "experiments.qualitative", given, lambda interruption: draw(options, interruption)
     )
 
@@ -98,7 +98,7 @@ def draw(options: Options, interruption: Interruption) -> None:
     work = Work(
         properties.ANALYSIS,
         cases.Options(runs=options.runs),
-        results.versions(),
+        results.find_versions(),
         Console(markup=False),
         interruption,
     )

@@ -26,11 +26,11 @@ EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Rewrites every table here; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
-    command = startup.command("experiments.report")
+    command = startup.format_command("experiments.report")
     argparse.ArgumentParser(command, description=about).parse_args(given)
-    return shell.guarded("experiments.report", given, rewrite)
+    return shell.run_program("experiments.report", given, rewrite)
 
 
 def rewrite() -> None:

@@ -135,9 +135,9 @@ if not TYPE_CHECKING:  # a type checker would take every name for one that exist
         """Imports a public name when it is first used (PEP 562)."""
         if name not in _PLACES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from leapjax.extras import missing_explained  # noqa: PLC0415  (only then)
+        from leapjax.extras import report_missing  # noqa: PLC0415  (only then)
 
-        with missing_explained():
+        with report_missing():
             value = getattr(importlib.import_module(_PLACES[name]), name)
         globals()[name] = value
         return value

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from leapjax.running import shell  # noqa: PLC0415
 
     startup.find_modules_here()
-    name, *rest = shell.arguments_of(arguments) or ["--help"]
+    name, *rest = shell.read_arguments(arguments) or ["--help"]
     if name in ("-h", "--help"):
         about = {name: d.about for name, d in DOMAINS.items() if isinstance(d, Place)}
         print(USAGE.format(domains="\n".join(f"  {n:12} {text}" for n, text in about.items())))
@@ -35,7 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: unknown domain {name!r}: {expected}", file=sys.stderr)
         return 2
     # An extra that is missing ends this import.
-    failed = shell.guarded(f"leapjax.{name}", rest, lambda: import_module("leapjax.running.main"))
+    failed = shell.run_program(
+        f"leapjax.{name}", rest, lambda: import_module("leapjax.running.main")
+    )
     return failed or _run(name, rest)
 
 

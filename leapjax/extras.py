@@ -47,7 +47,7 @@ def explain_missing(error: BaseException | None, extra: str = "train") -> str | 
 
 
 @contextlib.contextmanager
-def missing_explained(extra: str = "train") -> Iterator[None]:
+def report_missing(extra: str = "train") -> Iterator[None]:
     """Turns the failing import of an optional module into one line; other errors pass.
 
     Args:

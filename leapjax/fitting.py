@@ -108,7 +108,7 @@ def fit(
         planner = planner or config.planner
         planner = dataclasses.replace(planner, horizon=asked.get("horizon", planner.horizon))
         settings = config.method_settings if settings is None else settings
-        mesh = sharding.make_mesh(training.batch // training.run, jax.local_devices())
+        mesh = sharding.make_mesh(training.batch // training.consecutive, jax.local_devices())
     except ValueError as error:  # the dataclasses refuse values that cannot be
         raise UserError(str(error)) from None
     data = _read(demonstrations, domain, seed)

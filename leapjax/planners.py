@@ -111,9 +111,8 @@ class CrossEntropyConfig:
         horizon: T, planned actions.
         iterations: N, rounds; the first draws uniform plans.
         candidates: Plans in each round.
-        elites: Plans of least energy that are the parents of the next round, each child with one
-            action changed.
-        keep_elites: Elites survive unchanged, so that the least energy never rises.
+        elites: Plans of least energy. They survive, and are the parents of the next round: each
+            child changes one action.
         score: Also return the energy of the plan.
     """
 
@@ -121,7 +120,6 @@ class CrossEntropyConfig:
     iterations: int = 10
     candidates: int = 30
     elites: int = 3
-    keep_elites: bool = True
     score: bool = False
 
     def __post_init__(self) -> None:
@@ -423,8 +421,8 @@ def cross_entropy_method(
 ) -> Plan:
     """Keep the elites, change one token in each child (paper, appendix, ablation).
 
-    The plan returned is the best of the last round, as in the paper; with `keep_elites`
-    that is also the best ever seen.
+    The plan returned is the best of the last round, as in the paper. Elites survive unchanged, so
+    it is also the best ever seen.
     """
     energy = guard_shapes(energy)
     count, horizon = config.candidates, config.horizon
@@ -447,8 +445,7 @@ def cross_entropy_method(
         others = choices[where].at[rows, children[rows, where]].set(lowest)
         changed = jax.random.categorical(action_key, others).astype(jnp.int32)
         children = children.at[rows, where].set(changed)
-        if config.keep_elites:
-            children = children.at[: config.elites].set(parents)
+        children = children.at[: config.elites].set(parents)
         energies = score(children)
         return (children, energies), (children[jnp.argmin(energies)], undefined(energies).any())
 

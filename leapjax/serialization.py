@@ -18,7 +18,7 @@ IDENTITY = "identity"  # the array that says whose parameters are beside it
 T = TypeVar("T")
 
 
-def identity_digest(identity: str) -> np.ndarray:
+def hash_identity(identity: str) -> np.ndarray:
     """The SHA-256 of an identity: `[32]` uint8."""
     return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
 
@@ -91,7 +91,7 @@ def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
 
 
-def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def find_differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """What is not the default, part by part.
 
     Names made from it do not change when a setting is added later, with what was done before
@@ -101,7 +101,7 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
     for name, value in values.items():
         default = defaults.get(name)
         if isinstance(value, dict) and isinstance(default, dict):
-            value, default = differences(value, default), {}
+            value, default = find_differences(value, default), {}
         if value != default:
             found[name] = value
     return found

@@ -145,6 +145,21 @@ def test_rows_are_named_by_all_that_matters():
     assert changed(minimise=same) == name()
 
 
+def test_runs_with_the_augmentation_of_this_experiment_have_other_names():
+    model = case_of("generalization-easy").models[0]
+
+    def settings(method, preset="leapjax"):
+        options = Options(preset=preset)
+        config = cases.training_config(properties.ANALYSIS, model, method, 0, options)
+        found = config.domain_settings
+        folder = cases.run_folder(config, 0).name.partition("-")[0]
+        return folder, *(getattr(found, name, None) for name in ("detours", "false_starts"))
+
+    assert settings("leap") == ("augmented_babyai", 0.5, 0.6)
+    assert settings("dt") == ("augmented_babyai", 0.5, 0.0)
+    assert settings("iql") == settings("leap", "paper") == ("babyai", None, None)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -18,8 +18,8 @@ import pytest
 
 from benchmarks.flops import matmul_flops
 from experiments import atari, atari_energy
-from experiments.tables.atari import ENCODED, data, played
-from leapjax.configuration import configuration_hash
+from experiments.tables.atari import ENCODED, played
+from leapjax.configuration import hash_config
 from leapjax.data import windows
 from leapjax.domains.atari import augmentation, domain, encoders, replay
 from leapjax.domains.atari.adapter import AtariAdapter
@@ -33,7 +33,7 @@ from leapjax.presets import find_preset
 from leapjax.pretrained import Origin
 from leapjax.types import Demonstration, Energy
 from tests.parameters import random_like
-from tests.programs import ROOT, only_long
+from tests.programs import only_long
 
 PONG, BREAKOUT = GAMES["Pong"], GAMES["Breakout"]
 MODEL = ModelConfig(width=16, layers=1, heads=1, dropout=0.0)
@@ -173,33 +173,6 @@ def test_without_a_past_the_whole_frame_has_changed():
     np.testing.assert_array_equal(encode(params, context), encode(params, first))
 
 
-def test_a_shift_moves_all_frames_alike():
-    drawn = window(5)
-    move = jax.jit(functools.partial(augmentation.shifted, most=4))
-    corners = set()
-    for seed in range(12):
-        moved = move(jax.random.key(seed), drawn)
-        both = {"now": (drawn.context.observation[None], moved.context.observation[None])}
-        both["past"] = (drawn.context.past, moved.context.past)
-        found = []
-        for old, new in both.values():
-            wide = np.pad(old, ((0, 0), (4, 4), (4, 4)), mode="edge")
-            found.append(
-                {
-                    (y, x)
-                    for y in range(9)
-                    for x in range(9)
-                    if np.array_equal(wide[:, y : y + 84, x : x + 84], new)
-                }
-            )
-        assert found[0] == found[1] and len(found[0]) == 1
-        corners |= found[0]
-        np.testing.assert_array_equal(moved.actions, drawn.actions)
-    assert len(corners) > 6
-    still = augmentation.shifted(jax.random.key(0), drawn, 0)
-    np.testing.assert_array_equal(still.context.past, drawn.context.past)
-
-
 @pytest.mark.parametrize("name", GAMES)
 def test_every_other_window_is_in_a_mirror(name):
     game, drawn = GAMES[name], window(5)
@@ -269,61 +242,6 @@ def test_in_a_mirror_actions_do_the_opposite(name):
         ours, theirs = way(action), way(other)
         assert ours[0] * theirs[0] < 0
         np.testing.assert_array_equal(ours[1:], theirs[1:])
-
-
-def test_the_mirror_of_breakout_is_in_its_middle():
-    game = GAMES["Breakout"]
-    frame = Emulator(game).frame()  # walls and bricks
-
-    def error(mirror):
-        return np.abs(augmentation.reflect(frame, mirror) * 1.0 - frame).mean()
-
-    first, stop = game.mirror.columns
-    right = error(game.mirror)
-    assert right < error(game.mirror._replace(columns=(first + 1, stop))) / 3
-    assert right < error(game.mirror._replace(columns=(first, stop - 1))) / 3
-
-
-def test_presets_are_the_papers_and_ours():
-    found = [find_preset("atari", name, "leap", "paper") for name in GAMES]
-    assert [each.training.batch for each in found] == [64, 64, 256, 128]
-    searches = [(each.planner.horizon, each.planner.iterations) for each in found]
-    assert searches == [(5, 10), (5, 10), (5, 10), (10, 30)]
-    assert all(each.model.attention == "causal" and each.executed == 1 for each in found)
-    assert not find_preset("atari", "Pong", "leap", "leapjax").method_settings.end
-    ours = find_preset("atari", "Seaquest", "leap", "leapjax")
-    assert ours.domain_settings.transitions == 200_000
-    for method, past in {"bc": 0, "cql": encoders.STACK - 1}.items():
-        assert find_preset("atari", "Seaquest", method, "leapjax").context == past
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"transitions": 0}, {"sticky": 1.5}, {"sticky": float("nan")}, {"shift": -1}, {"shift": 84},
-     {"max_steps": 0}, {"max_steps": 2**29}, {"replay_run": 0}],
-)  # fmt: skip
-def test_settings_that_cannot_be_are_refused(changes):
-    with pytest.raises(ValueError, match=next(iter(changes))):
-        domain.Settings(**changes)
-
-
-@only_long
-def test_without_ale_py_every_command_says_so_in_one_line():
-    program = (
-        "import sys\n"
-        "sys.modules['ale_py'] = None\n"
-        "from experiments import atari\n"
-        "commands = [], ['collect']\n"
-        "sys.exit(any(atari.main([*each, '--game', 'Pong']) != 2 for each in commands))\n"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT
-    )
-    assert ended.returncode == 0
-    first, second = ended.stderr.splitlines()
-    assert first == second and first.startswith(
-        'error: ale_py is not installed: pip install ".[atari]"'
-    )
 
 
 @pytest.fixture(scope="module")
@@ -461,15 +379,6 @@ def test_what_others_have_made_is_not_replaced(collected, tmp_path, capsys):
     assert not list(theirs.glob("manifest*"))
 
 
-def test_games_of_another_length_or_noise_are_not_gone_on_with(collected, monkeypatch, capsys):
-    _, arguments = collected
-    assert atari.main([*arguments, "--longest", "90"]) == 2
-    assert "cut off after 80 decisions, not after 90" in capsys.readouterr().err
-    monkeypatch.setattr(playing, "NOISES", (0.2,))
-    assert atari.main(arguments) == 2
-    assert "other shares of random actions than today's" in capsys.readouterr().err
-
-
 def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypatch, capsys):
     folder, arguments = collected
     shutil.copytree(folder, tmp_path / "copy")
@@ -493,35 +402,18 @@ def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypa
     assert collect.find_shards(tmp_path / "copy", BREAKOUT, 100, 1) == range(1)
 
 
-@pytest.mark.parametrize(("game", "run"), [("Pong", 1)])
-def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, run):
+@pytest.mark.parametrize(("game", "number"), [("Pong", 1)])
+def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, number):
     folder, arguments = collected
-    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(run))
-    where = ["--folder", str(tmp_path), "--game", game, "--replay-run", str(run)]
+    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(number))
+    where = ["--folder", str(tmp_path), "--game", game, "--dqn-seed", str(number)]
     assert atari.main([*arguments, *where]) == 2
     error = capsys.readouterr().err
-    assert f"holds games of Breakout, run 1, not of {game}, run {run}" in error
+    assert f"holds games of Breakout, seed 1, not of {game}, seed {number}" in error
     assert error.count("\n") == 1
-    settings = domain.Settings(transitions=100, replay_run=run)
-    with pytest.raises(UserError, match=f"of Breakout, run 1, not of {game}, run {run}"):
+    settings = domain.Settings(transitions=100, dqn_seed=number)
+    with pytest.raises(UserError, match=f"of Breakout, seed 1, not of {game}, seed {number}"):
         domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
-
-
-def test_what_is_read_does_not_depend_on_what_else_was_made(collected, tmp_path):
-    folder, _ = collected
-    copy = tmp_path / "atari"
-    shutil.copytree(folder, copy)
-    wanted = collect.find_shards(copy, BREAKOUT, 100, 1)
-    assert wanted == range(1) and collect.find_shards(copy, BREAKOUT, 10_000, 1) is None
-    found = domain.make_source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
-    logs = replay.replay_logs(copy, BREAKOUT, 1)
-    shutil.rmtree(logs.parent / "leapjax")  # what was unpacked
-    for path in logs.glob("*_ckpt.0.gz"):  # half a file that nobody asks for
-        if "action" in path.name:
-            shutil.copy(path, logs / path.name.replace(".0.", ".9."))
-    again = domain.make_source(BREAKOUT, domain.Settings(transitions=100)).load(str(copy), 0)
-    lengths = [[len(d.actions) for d in each.demonstrations] for each in (found, again)]
-    assert lengths[0] == lengths[1]
 
 
 def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys, quick_begin):
@@ -551,7 +443,7 @@ WAYS = [f"--method {method}" for method in ("dt", "cql", "bc", "qr_dqn", "rem")]
 
 
 @only_long
-@pytest.mark.parametrize("options", [*WAYS, "--preset paper --run 2 --context 4"])
+@pytest.mark.parametrize("options", [*WAYS, "--preset paper --consecutive 2 --context 4"])
 def test_every_way_to_learn_trains_and_plays(
     collected, tmp_path, monkeypatch, quick_begin, options
 ):
@@ -574,7 +466,7 @@ def test_every_way_to_learn_trains_and_plays(
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "did you mean Pong"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
-        (["collect", "--game", "Pong", "--replay-run", "0"], "--replay-run must be at least 1"),
+        (["collect", "--game", "Pong", "--dqn-seed", "0"], "--dqn-seed must be at least 1"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -590,45 +482,27 @@ def test_the_table_has_normalised_scores():
         "mean_return": 30.5, "return_error": 2.88, "train_steps": 10,
         "configuration": {"planner": {"temperature": 0.1}},
     }  # fmt: skip
-    name = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
     rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
     # Its checkpoint played again is no other seed.
     again = dataclasses.replace(
         find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
     )
-    rows += [{**rows[0], "train_steps": 0, "hash": configuration_hash(again, 0)}]
+    rows += [{**rows[0], "train_steps": 0, "hash": hash_config(again, 0)}]
     table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
-    second = configuration_hash(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
+    second = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
     rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
     assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in played(rows, {})
     # Who always takes the best action plays four games, however often.
-    name = configuration_hash(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
+    name = hash_config(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
     greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
     table = played([{**rows[0], **greedy}], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
-
-
-def test_data_of_another_size_are_recorded_beside_the_usual(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(atari, "RECORDED", tmp_path / "data.json")
-    game = {"score": 3.0, "noise": 0.1, "transitions": 7}
-    monkeypatch.setattr(collect, "collect", lambda *arguments: [{"games": [game]}])
-    record = ["collect", "--game", "Breakout", "--record"]
-    for size in ("500000", "50000"):
-        assert atari.main([*record, "--transitions", size]) == 0
-    assert atari.main(["collect", "--game", "Pong", "--record"]) == 0
-    for other in ("--replay-run", "--longest"):
-        assert atari.main([*record, other, "2"]) == 2
-    assert "--record is for data that are learned from" in capsys.readouterr().err
-    recorded = json.loads((tmp_path / "data.json").read_text())
-    names = ("Breakout", "Breakout, 500,000 transitions", "Pong")
-    assert recorded == {name: [game] for name in names}
-    lines = data(recorded).splitlines()[2:]
-    assert lines == [f"| {name} | 1 | 7 | 3.0 | 3 .. 3 | 3.0 (10%) |" for name in names]
 
 
 def test_a_step_that_was_begun_is_waited_for():

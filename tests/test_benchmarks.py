@@ -93,7 +93,7 @@ def test_the_training_benchmark_measures_every_preset(tmp_path, monkeypatch, qui
     arguments = ["--levels", "GoToLocalS7N5", "--presets", "leapjax", "--seconds", "0.01"]
     assert training.main([*arguments, "--json", str(rows)]) == 0
     (row,) = json.loads(rows.read_text())
-    assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"]) > 0
+    assert row["training_seconds"] == pytest.approx(row["steps"] / row["steps_per_second"])
     assert len(row["parts"]) == 4 and all(part["ms"] > 0 for part in row["parts"])
     # The products of a step are those of encoder and transformer, values and gradients.
     products = 1e9 * sum(part["gflop"] for part in row["parts"])

@@ -136,7 +136,7 @@ def test_tables_end_with_the_mean_over_seeds():
         row(1, "dt"),
         row(2, "dt", configuration=other),
     ]
-    table = results.success_table(rows)
+    table = results.make_success_table(rows)
     columns = {column.header: list(column.cells) for column in table.columns}
     assert columns["seed"] == ["0", "1", "0", "1", "2", "mean of 2", "mean of 2"]
     low, high = scores.interval_over_seeds([5, 7], [10, 10])

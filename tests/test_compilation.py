@@ -58,13 +58,12 @@ def test_what_the_user_has_set_stays(setting, value, no_cache, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("where", ["the environment", "the program"])
-def test_it_can_be_turned_off(where, no_cache, tmp_path, monkeypatch):
-    folder = "off" if where == "the environment" else str(tmp_path)
-    monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", folder)
-    jax_setup.start(cache=where == "the environment")
-    compilation.use_disk_cache()  # as `compile_planner` does
-    assert getattr(jax.config, FOLDER) is None
+def test_it_can_be_turned_off(no_cache, tmp_path, monkeypatch):
+    for folder in ("off", str(tmp_path)):  # by the user, or by the program
+        monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", folder)
+        jax_setup.start(cache=folder == "off")
+        compilation.use_disk_cache()  # as `compile_planner` does
+        assert getattr(jax.config, FOLDER) is None
 
 
 @pytest.mark.parametrize("system", ["linux", "windows"])

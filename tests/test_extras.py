@@ -168,6 +168,6 @@ def test_one_extra_is_named_that_brings_all(monkeypatch, module, asked, named):
     monkeypatch.setitem(sys.modules, module, None)
     with (
         pytest.raises(UserError, match=rf'{module} is not installed: .*"\.\[{named}\]"'),
-        extras.missing_explained(asked),
+        extras.report_missing(asked),
     ):
         importlib.import_module(module)

@@ -17,10 +17,10 @@ import pytest
 from experiments import babyai
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
-from leapjax.files import only_process_in
+from leapjax.files import lock_folder
 from leapjax.running import jax_setup, results
 from leapjax.running import train as running_train
-from leapjax.running.interruption import SIGNALS, Interrupted, interruptible
+from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
 from leapjax.running.metrics import read_metrics
 from leapjax.running.progress import Meter
 from leapjax.types import TrainState
@@ -132,20 +132,20 @@ def test_a_library_has_no_handlers():
 
 
 def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
-    with interruptible() as interruption:
+    with catch_signals() as interruption:
         for look in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
             with pytest.raises(Interrupted, match="SIGTERM"):
                 look()
-        with pytest.raises(Interrupted, match="SIGTERM"), interruption.deferred():
+        with pytest.raises(Interrupted, match="SIGTERM"), interruption.defer_signals():
             pytest.fail("long work began")
 
 
 def test_a_deferred_signal_waits_and_a_second_one_does_not():
     refused = pytest.raises(Interrupted, match="SIGINT")
-    with interruptible() as interruption, refused, interruption.deferred():
+    with catch_signals() as interruption, refused, interruption.defer_signals():
         os.kill(os.getpid(), signal.SIGINT)
         assert interruption.requested == signal.SIGINT
-    with interruptible() as interruption, pytest.raises(Interrupted), interruption.deferred():
+    with catch_signals() as interruption, pytest.raises(Interrupted), interruption.defer_signals():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("the second waited")
@@ -155,15 +155,15 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
 def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
     monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
-    with interruptible(ended.append) as interruption:
-        with pytest.raises(Interrupted), interruption.deferred():
+    with catch_signals(ended.append) as interruption:
+        with pytest.raises(Interrupted), interruption.defer_signals():
             os.kill(os.getpid(), number)
             time.sleep(0.2)
         assert not ended
-    with interruptible(ended.append), pytest.raises(Interrupted):
+    with catch_signals(ended.append), pytest.raises(Interrupted):
         os.kill(os.getpid(), number)
     assert not ended  # it had its effect in time
-    with interruptible(ended.append):
+    with catch_signals(ended.append):
         with pytest.raises(Interrupted):  # and here, as in a compiler, it has none
             os.kill(os.getpid(), number)
         deadline = time.monotonic() + 20
@@ -225,5 +225,5 @@ def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
 
 def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
     refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+    with lock_folder(tmp_path / "run"), refused, lock_folder(tmp_path / "run"):
         pass

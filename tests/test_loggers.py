@@ -81,7 +81,7 @@ def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch
 def test_a_run_that_goes_on_says_where_it_began(tmp_path, sent, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "online")  # asked for
     about = loggers.About(tmp_path, "abc", {}, 40)
-    with loggers.opened(["wandb", "tensorboard"], lambda: about) as log:
+    with loggers.open_loggers(["wandb", "tensorboard"], lambda: about) as log:
         assert not sent.begun  # with the first value, and not before
         log(60, {"training/loss": 0.5})
     assert sent.begun[0]["mode"] == "online" and sent.begun[0]["resume"] == "allow"

@@ -44,8 +44,8 @@ def test_a_process_that_has_joined_others_can_still_be_stopped():
     program = f"""
 import os, signal, time
 from leapjax.running import jax_setup
-from leapjax.running.interruption import Interrupted, interruptible
-with interruptible():
+from leapjax.running.interruption import Interrupted, catch_signals
+with catch_signals():
     jax_setup.connect(jax_setup.Cluster({free_address()!r}, 1, 0))
     try:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -72,23 +72,12 @@ def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
     place.check_same_end("one stopped")
 
 
-@only_long
-def test_what_one_process_refuses_is_refused_by_all_before_any_work(place):
-    runs = start_two(place, "refused", "--batch", "5")
-    errors = [run.communicate(timeout=100)[1] for run in runs]
-    assert [run.returncode for run in runs] == [2, 2]
-    assert all("a batch of 5" in error and "2 process(es)" in error for error in errors)
-    assert not (place.folder / "refused").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"coordinator": "a:1"}, "are given together"),
-        ({"process_id": 0, "num_processes": 2}, "are given together"),
         ({"coordinator": "a:1", "process_id": 2, "num_processes": 2}, "expected 0 to 1"),
         ({"coordinator": "a", "process_id": 0, "num_processes": 2}, "expected host:port"),
-        ({"fsdp": 0}, "fsdp must be at least 1"),
     ],
 )
 def test_processes_that_cannot_be_are_refused(options, message):
@@ -97,14 +86,11 @@ def test_processes_that_cannot_be_are_refused(options, message):
 
 
 def test_alone_a_process_agrees_with_itself():
-    assert processes.is_first()
-    assert processes.gather({"a": 1}) == [{"a": 1}]
-    assert processes.first_does(lambda: 3) == processes.together(lambda: 3) == 3
-
     def refuse():
         raise UserError("no")
 
-    for ask in (processes.first_does, processes.together):
+    for ask in (processes.run_on_first, processes.run_together):
+        assert ask(lambda: 3) == 3
         with pytest.raises(UserError, match="no"):
             ask(refuse)
 

@@ -138,7 +138,6 @@ def tripled(tree):
         (WALK._replace(step=lambda s, a: step(s, a)[1]), r"must return \(state, Transition\)"),
         (WALK._replace(reset=lambda key: reset(key)[1]["at"]), r"return \(state, observation\)"),
         (led(reward=lambda x: x[None]), r"a real number of shape \(\) as reward, got float32\[1\]"),
-        (led(terminated=lambda x: x.astype(int)), "a boolean .* as terminated, got int32"),
         (led(taken=lambda x: 1.0), "an integer .* as taken"),
     ],
 )

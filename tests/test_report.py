@@ -6,7 +6,7 @@ from pathlib import Path
 from experiments import report
 from experiments.common import figures
 from experiments.tables import babyai, puzzles
-from leapjax.configuration import configuration_hash
+from leapjax.configuration import hash_config
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
 from tests.programs import with_options
@@ -24,7 +24,7 @@ def row(
         "first_episode_seed": config.test_seed, "episodes": config.episodes,
         "successes": round(rate * config.episodes), "mean_length": mean_length,
         "train_steps": 0 if played else config.training.steps,
-        "hash": configuration_hash(config, seed),
+        "hash": hash_config(config, seed),
     }  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
         "domain": domain, "level": level, "method": method, "preset": "leapjax", "seed": seed,
         "first_episode_seed": config.test_seed, "episodes": 100, "successes": round(100 * rate),
         "iterations": config.planner.iterations, "train_steps": config.training.steps,
-        "hash": configuration_hash(config, seed),
+        "hash": hash_config(config, seed),
     }  # fmt: skip
 
 

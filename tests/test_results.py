@@ -39,14 +39,14 @@ def commit(folder):
 
 
 def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
-    version = results.code_version(checkout)
+    version = results.find_code_version(checkout)
     (checkout / "rows").write_text("new")
     commit(checkout)
-    assert results.code_version(checkout) == version
+    assert results.find_code_version(checkout) == version
     (checkout / "leapjax" / "code.py").write_text("2")
-    assert results.code_version(checkout) == f"{version}.dirty"
+    assert results.find_code_version(checkout) == f"{version}.dirty"
     latest = commit(checkout)
-    assert results.code_version(checkout) == f"+g{latest}" != version
+    assert results.find_code_version(checkout) == f"+g{latest}" != version
 
 
 ROW = toy_row()

@@ -10,7 +10,7 @@ import pytest
 
 import leapjax as leap
 from leapjax import rollouts
-from leapjax.environments import GymnasiumAdapter, Transition, closing, environments_of
+from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History, join
@@ -22,7 +22,13 @@ NUM_ACTIONS = 3
 HORIZON, ITERATIONS = 4, 5
 PAD = NUM_ACTIONS + 1
 GOAL, LIMIT = 6, 30
-RESULTS = ("seeds", "successes", "lengths", "returns", "plans")
+assert_equal = np.testing.assert_array_equal
+
+
+def assert_same(found, expected):
+    """Of episodes: all but how long they took."""
+    for field in ("seeds", "successes", "lengths", "returns", "plans"):
+        assert_equal(getattr(found, field), getattr(expected, field), field)
 
 
 def start(seed):
@@ -145,14 +151,14 @@ def test_history_against_everything_that_happened(length):
     padding = [np.zeros((2, 2))] * length
     for now, context in enumerate(contexts):
         assert context.step == now and context.return_so_far == sum(rewards[:now])
-        np.testing.assert_array_equal(context.observation["x"], states[now])
+        assert_equal(context.observation["x"], states[now])
         seen = (context.past["x"], context.actions, context.rewards)
         for found, blank, all_of, kind in zip(
             seen, (padding, [PAD] * length, [0] * length), (states, actions, rewards),
             (np.float32, np.int32, np.float32), strict=True,
         ):  # fmt: skip
             expected = [*blank, *all_of[:now]][now:]
-            np.testing.assert_array_equal(found, np.array(expected).reshape(found.shape))
+            assert_equal(found, np.array(expected).reshape(found.shape))
             assert found.dtype == kind and len(found) == length
 
 
@@ -160,10 +166,10 @@ def test_history_against_everything_that_happened(length):
 def test_a_plan_is_executed_up_to_its_end_or_as_far_as_asked(steps, executed):
     seeds = [0, 3, 6, 4]
     episodes = walk(seeds=seeds, steps=steps, executed=executed)
-    np.testing.assert_array_equal(episodes.seeds, seeds)
+    assert_equal(episodes.seeds, seeds)
     assert episodes.successes.all()
-    np.testing.assert_array_equal(episodes.lengths, distances(seeds))
-    np.testing.assert_array_equal(episodes.returns, [sum(c.rewards) for c in Corridor.made])
+    assert_equal(episodes.lengths, distances(seeds))
+    assert_equal(episodes.returns, [sum(c.rewards) for c in Corridor.made])
     # Every plan is good for so many steps, and an episode that is over asks for none.
     assert episodes.plans == np.ceil(distances(seeds) / min(steps, executed or HORIZON)).sum()
     assert 0 < episodes.planning_seconds <= episodes.seconds
@@ -214,20 +220,20 @@ def test_finished_episodes_leave_the_batch():
     for call, contexts in enumerate(recorder.contexts):
         left = np.array(seeds)[distances(seeds) > call]
         positions = np.array([start(seed) + call for seed in left])
-        np.testing.assert_array_equal(contexts.observation["position"], positions)
-        np.testing.assert_array_equal(contexts.step, np.full(len(left), call))
+        assert_equal(contexts.observation["position"], positions)
+        assert_equal(contexts.step, np.full(len(left), call))
         for back in (1, 2):
             known = call >= back
             past = contexts.past["position"][:, -back]
-            np.testing.assert_array_equal(past, positions - back if known else 0 * positions)
+            assert_equal(past, positions - back if known else 0 * positions)
             assert (contexts.actions[:, -back] == (RIGHT if known else PAD)).all()
             reward = (positions - back + 1) / 4 if known else 0 * positions
-            np.testing.assert_array_equal(contexts.rewards[:, -back], reward)
+            assert_equal(contexts.rewards[:, -back], reward)
     over = [int((distances(seeds) <= call).sum()) for call in range(1, GOAL + 1)]
     assert reported == list(zip(over, over, strict=True))
 
 
-class EagerCorridor(Corridor):
+class Eager(Corridor):
     """A corridor that can be told beforehand where to go."""
 
     calls: ClassVar[list[tuple[str, int]]] = []
@@ -241,22 +247,20 @@ class EagerCorridor(Corridor):
 
 
 def test_first_steps_begin_before_any_is_waited_for():
-    EagerCorridor.calls.clear()
-    eager, plain = (walk(make, [4, 5, 6], 2) for make in (EagerCorridor, Corridor))
-    for field in RESULTS:
-        np.testing.assert_array_equal(getattr(eager, field), getattr(plain, field), field)
-    calls = EagerCorridor.calls
-    assert calls[:3] == [("begin", RIGHT)] * 3 and calls[3][0] == "step"
+    eager = walk(Eager, [4, 5, 6], 2)
+    assert_same(eager, walk(Corridor, [4, 5, 6], 2))
     # The first action of each plan begins; the second is taken as ever.
-    assert [kind for kind, _ in calls].count("begin") == eager.plans
-    assert [kind for kind, _ in calls].count("step") == eager.lengths.sum() > eager.plans
+    step = ("step", RIGHT)
+    assert Eager.calls[:7] == [("begin", RIGHT)] * 3 + [step, step, step, step]
+    begun = [kind for kind, _ in Eager.calls].count("begin")
+    assert begun == eager.plans and len(Eager.calls) - begun == eager.lengths.sum()
 
 
 def test_an_episode_is_a_success_only_where_the_environment_says_so():
     fallen = leap.evaluate(Corridor, [2, 5], scripted(lambda p, c: LEFT), None, context=0)
     assert not fallen.successes.any()
-    np.testing.assert_array_equal(fallen.lengths, [2, 5])
-    np.testing.assert_array_equal(fallen.returns, [-0.25, 1.25])  # (0 - 1) / 4, (3+2+1+0-1) / 4
+    assert_equal(fallen.lengths, [2, 5])
+    assert_equal(fallen.returns, [-0.25, 1.25])  # (0 - 1) / 4, (3+2+1+0-1) / 4
     there_and_back = scripted(
         lambda p, context: jnp.where((context.step + jnp.arange(HORIZON)) % 2 == 0, RIGHT, LEFT)
     )
@@ -288,7 +292,7 @@ def test_scores_are_reported_and_rewards_are_seen():
         context=1, executed=1, max_steps=2,
     )  # fmt: skip
     assert Corridor.made[-1].taken == [RIGHT, LEFT]
-    np.testing.assert_array_equal(episodes.returns, [20.0])
+    assert_equal(episodes.returns, [20.0])
 
 
 def play(seeds, **options):
@@ -312,8 +316,7 @@ def test_an_episode_is_a_function_of_its_seeds_alone_or_in_any_batch():
 def test_episodes_that_were_played_side_by_side():
     first, second, whole = (walk(seeds=seeds, steps=2) for seeds in ([0, 3], [6], [0, 3, 6]))
     joined = join([first, second])
-    for field in RESULTS:
-        np.testing.assert_array_equal(getattr(joined, field), getattr(whole, field), field)
+    assert_same(joined, whole)
     assert joined.seconds == max(first.seconds, second.seconds)
 
 
@@ -326,8 +329,8 @@ def test_an_episode_may_be_cut_off(most):
     seeds = np.array([0, 3, 6])
     limits = {"context": np.int8(0), "executed": np.int64(2), "max_steps": np.uint8(most)}
     episodes = walk(seeds=seeds, **limits)
-    np.testing.assert_array_equal(episodes.lengths, np.minimum(distances(seeds), most))
-    np.testing.assert_array_equal(episodes.successes, distances(seeds) <= most)
+    assert_equal(episodes.lengths, np.minimum(distances(seeds), most))
+    assert_equal(episodes.successes, distances(seeds) <= most)
     assert episodes.plans == np.ceil(episodes.lengths / 2).sum()
 
 
@@ -346,15 +349,9 @@ class Growing(Corridor):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"executed": 0}, "executed must be at least 1, got 0"),
-        ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
-        ({"iteration": 0}, "iteration must be"),
         ({"iteration": ITERATIONS + 1}, "iteration"),
-        *(
-            ({name: wrong}, f"{name} must be")
-            for name in ("context", "executed", "iteration", "max_steps")
-            for wrong in (-1, 2.0, True)
-        ),
+        ({"context": -1}, "context must be"),
+        *(({x: 0}, f"{x} must be at least 1") for x in ("executed", "max_steps", "iteration")),
         ({"seeds": []}, "no seeds"),
         ({"seeds": [1, 2**32]}, "level seed must be"),
         ({"seed": -1}, "seed must be"),
@@ -377,25 +374,22 @@ def observed(position, goal=(0.0,)):
     [
         ({"reward": -math.inf}, "reward of -inf"),
         ({"reward": 1e39}, "reward of 1e[+]39"),  # not in the numbers that planners see
+        ({"reward": 3e38}, "return of 6e[+]38"),
         ({"reward": "1"}, "reward of 1 at .*: expected a number"),
-        ({"reward": np.ones(1)}, r"reward of \[1\.\]"),
         ({"score": math.nan}, "score of nan"),
-        ({"score": np.zeros(2)}, "score of "),
         ({"observation": observed(np.float32(np.nan))}, "observation.*pos"),
         ({"observation": observed(0.0, [np.inf])}, "observation.*go"),
         ({"observation": {"position": np.zeros(())}}, "other shapes"),
         ({"taken": NUM_ACTIONS}, "action taken"),
-        ({"taken": 0.5}, "action taken"),
         ({"success": "no"}, "success at .* must be true or false"),
         ({"terminated": None}, "terminated at "),
-        ({"truncated": math.nan}, "truncated at "),
         ({"step": (0, 1.0, True, False, {})}, "step of Corridor returned tuple"),
     ],
 )
 def test_steps_that_no_data_may_have_are_refused(changed, says):
     with pytest.raises(UserError, match=says) as refused:
         walk(lambda: Corridor(**changed), seeds=[7], context=1)
-    assert "step" in changed or "step 1 of level seed 7" in str(refused.value)
+    assert "step" in changed or " of level seed 7" in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -416,15 +410,6 @@ def test_numbers_and_marks_of_any_type_are_taken():
     for one in (np.float16, np.array, jnp.float32, np.uint8):
         found = walk(lambda one=one: Corridor(reward=one(1), score=one(1), truncated=one(0)))
         assert found.successes.all() and found.returns == found.lengths == GOAL - start(3)
-
-
-def test_what_a_history_cannot_hold_is_refused():
-    with pytest.raises(UserError, match="not finite at step 0 of level seed 3"):
-        History((np.zeros(2), np.array([1, np.nan], np.float16)), 0, NUM_ACTIONS, 3)
-    history = History(np.zeros(1), 0, NUM_ACTIONS)
-    history.advance(0, np.zeros(1), 3e38)
-    with pytest.raises(UserError, match="return of 6e[+]38 at step 2:"):
-        history.advance(0, np.zeros(1), 3e38)
 
 
 # What is opened.
@@ -466,8 +451,7 @@ def test_few_environments_are_open_at_once_which_changes_nothing(held):
         for make in (held, Corridor)
     )
     assert held.most == 3 and not held.open
-    for field in RESULTS:
-        np.testing.assert_array_equal(getattr(few, field), getattr(all_at_once, field), field)
+    assert_same(few, all_at_once)
     assert len(set(few.lengths.tolist())) > 2
 
 
@@ -493,8 +477,6 @@ class Unclosable(Corridor):
 
 
 def test_what_goes_wrong_first_is_what_is_told():
-    with pytest.raises(StuckError), closing(Unclosable()):
-        raise StuckError
     with pytest.raises(StuckError):
         walk(Unclosable, steps=1, progress=give_up_after(0))
 
@@ -515,65 +497,46 @@ def test_a_cache_is_passed_on_within_an_episode_after_plans_of_one_action(execut
     recorder = Recorder(leap.compile_planner(energy, config, (1, 4), encode_next=encode_next))
     seeds = [3, 5, 0]  # the second is over first, and the third begins
     episodes = leap.evaluate(Corridor, seeds, recorder, None, context=0, executed=executed)
-    np.testing.assert_array_equal(episodes.lengths, distances(seeds))
+    assert_equal(episodes.lengths, distances(seeds))
     for contexts, cache in zip(recorder.contexts, recorder.caches, strict=True):
         if executed == 2:
             assert cache is None
         elif cache is None:
-            np.testing.assert_array_equal(contexts.step, 0)
+            assert_equal(contexts.step, 0)
         else:
-            np.testing.assert_array_equal(contexts.step, cache["plans"])
+            assert_equal(contexts.step, cache["plans"])
             position = cache["observation"]["position"]
-            np.testing.assert_array_equal(contexts.observation["position"], position + 1)
+            assert_equal(contexts.observation["position"], position + 1)
 
 
 # Environments of Gymnasium.
 
-
-class Line(gym.Env):
-    """Gymnasium's view of a corridor: the first action stays, 1 goes on, the last gives up."""
-
-    observation_space = gym.spaces.Box(0, 10, (1,), np.float32)
-
-    def __init__(self, action_space: gym.Space | None = None) -> None:
-        self.action_space = action_space or gym.spaces.Discrete(3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position = int(self.np_random.integers(0, 3))
-        self.taken = []
-        return np.array([self.position], np.float32), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        self.taken.append(action)
-        self.position += action == 1
-        arrived = self.position == 4
-        reward = 2.0 if arrived else -1.0
-        over = bool(arrived or action == 2)
-        return np.array([self.position], np.float32), reward, over, len(self.taken) >= 9, {}
+DOWN, WALK = 1, [1, 1, 2, 2, 1, 2]  # of FrozenLake: the way to the goal
+ONE = gym.make("FrozenLake-v1", is_slippery=False)
 
 
 def test_any_gymnasium_environment_with_discrete_actions():
-    adapter = GymnasiumAdapter(Line())
-    assert adapter.num_actions == 4  # the end action is ours
-    np.testing.assert_array_equal(adapter.reset(3), adapter.reset(3))
-    assert {float(adapter.reset(seed)[0]) for seed in range(20)} == {0.0, 1.0, 2.0}
-    adapter.env.position = 3
-    assert adapter.step(0)[:5] == (np.array([3]), -1.0, False, False, False)
-    assert adapter.step(1)[:5] == (np.array([4]), 2.0, True, False, True)
-    adapter.reset(0)
-    assert adapter.step(2)[2:5] == (True, False, False)  # given up
-    adapter.reset(0)
-    assert [adapter.step(0) for _ in range(9)][-1][2:5] == (False, True, False)
-    shifted = GymnasiumAdapter(Line(gym.spaces.Discrete(2, start=1)))
-    shifted.reset(0)
-    assert [shifted.step(0), shifted.step(1)] and shifted.env.taken == [1, 2]
+    adapter = GymnasiumAdapter(ONE)
+    assert adapter.num_actions == 5  # the end action is ours
+
+    def last(actions):
+        assert adapter.reset(3) == 0
+        return [adapter.step(action) for action in actions][-1][:5]
+
+    assert last([DOWN]) == (4, 0.0, False, False, False)
+    assert last(WALK) == (15, 1.0, True, False, True)
+    assert last([DOWN, DOWN, DOWN]) == (12, 0.0, True, False, False)  # a hole
+    assert last([0] * 100) == (0, 0.0, False, True, False)
+    shifted = types.SimpleNamespace(
+        action_space=gym.spaces.Discrete(2, start=1), spec=None,
+        step=lambda action: (action, 0.0, False, False, {}),
+    )  # fmt: skip
+    assert GymnasiumAdapter(shifted).step(0).observation == 1
 
 
 def answering(**answers):
     """An adapter of an environment that answers as it is told."""
-    adapter = GymnasiumAdapter(Line())
+    adapter = GymnasiumAdapter(ONE)
     adapter.env = types.SimpleNamespace(**{n: lambda *_, a=a, **__: a for n, a in answers.items()})
     return adapter
 
@@ -581,8 +544,7 @@ def answering(**answers):
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: GymnasiumAdapter(Line(gym.spaces.Box(-1, 1, (2,)))), "Discrete action space"),
-        (lambda: GymnasiumAdapter(Line(gym.spaces.MultiBinary(2))), "Discrete action space"),
+        (lambda: GymnasiumAdapter(gym.make("Pendulum-v1")), "Discrete action space"),
         (lambda: GymnasiumAdapter("CartPole-v1"), "expected a Gymnasium environment"),
         (lambda: answering(reset=np.zeros(1)).reset(0), "old interface"),
         (lambda: answering(step=(0, 1.0, True, {})).step(0), "4 values"),
@@ -594,54 +556,26 @@ def test_other_environments_are_refused(call, says):
         call()
 
 
-# What episodes share.
-
-ONE = Line()
-
-
 class Wrapped:
     """An adapter inside another."""
 
     __slots__ = ("inner", "reset", "step")
-    num_actions = 4
+    num_actions = 5
 
     def __init__(self, inner: GymnasiumAdapter) -> None:
         self.inner = inner
         self.reset, self.step = inner.reset, inner.step
 
 
-class Late(GymnasiumAdapter):
-    """Takes its environment when it is reset."""
-
-    def __init__(self) -> None:
-        super().__init__(Line())
-
-    def reset(self, seed: int):
-        self.env = ONE
-        return super().reset(seed)
-
-
-@functools.cache
-def stayer() -> leap.CompiledPlanner:
-    """Stays where it is, in a `Line`."""
-    return compiled(lambda p, m, actions: actions.sum().astype(jnp.float32), num_actions=4)
-
-
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: GymnasiumAdapter(gym.wrappers.OrderEnforcing(gym.wrappers.TimeLimit(ONE, 5))),
+        lambda: GymnasiumAdapter(gym.wrappers.TimeLimit(ONE, 5)),
         lambda: Wrapped(GymnasiumAdapter(ONE)),
-        Late,
     ],
 )
 def test_one_environment_in_two_adapters_is_found(make):
+    left = compiled(lambda p, m, actions: actions.sum().astype(jnp.float32), num_actions=5)
     with pytest.raises(UserError, match="same environment twice"):
-        leap.evaluate(make, [0, 1], stayer(), None, context=0)
-    assert leap.evaluate(make, [0], stayer(), None, context=0, max_steps=4).lengths == [4]
-
-
-def test_a_list_of_environments_is_not_searched():
-    listed = Corridor()
-    listed.pool = [GymnasiumAdapter(ONE)]
-    assert environments_of(listed) == []
+        leap.evaluate(make, [0, 1], left, None, context=0)
+    assert leap.evaluate(make, [0], left, None, context=0, max_steps=4).lengths == [4]

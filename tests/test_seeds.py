@@ -5,8 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from leapjax.data import seeds
-from leapjax.domains.puzzles.stars import graphs
-from leapjax.domains.puzzles.sudoku import boards
 from leapjax.errors import UserError
 
 TESTS = seeds.VALIDATION_START  # so many test levels
@@ -18,7 +16,7 @@ few = st.integers(1, 5000)
 def training_range(seed: int) -> range:
     """What `training_seeds` runs over, by its first seed and a check that it counts up."""
     first, *more = itertools.islice(seeds.training_seeds(seed), 5)
-    assert more == [first + 1, first + 2, first + 3, first + 4]
+    assert more == [*range(first + 1, first + 5)]
     return range(first, first + seeds.TRAINING_STRIDE)
 
 
@@ -29,14 +27,11 @@ def overlap(a: range, b: range) -> bool:
 @given(st.integers(0, TESTS - 5000), st.integers(0, VALIDATIONS - 5000), few, training, training)
 def test_no_level_seed_serves_two_purposes(test_first, validation_first, count, one, other):
     test = seeds.test_seeds(test_first, count)
-    validation = seeds.validation_seeds(validation_first, count)
-    assert list(test[:2]) == [test_first, test_first + 1][:count]
-    assert len(test) == len(validation) == count
-    demonstrated = training_range(one)
-    assert not overlap(test, validation)
-    assert not overlap(test, demonstrated)
-    assert not overlap(validation, demonstrated)
-    assert one == other or not overlap(demonstrated, training_range(other))
+    assert [*test[:2]] == [test_first, test_first + 1][:count]
+    ranges = [test, seeds.validation_seeds(validation_first, count), training_range(one)]
+    ranges += [training_range(other)] if one != other else []
+    assert len(ranges[0]) == len(ranges[1]) == count
+    assert not any(overlap(*pair) for pair in itertools.combinations(ranges, 2))
 
 
 def test_training_seeds_end_where_the_next_training_seeds_begin():
@@ -51,21 +46,16 @@ def test_training_seeds_end_where_the_next_training_seeds_begin():
 )
 def test_episodes_stay_in_their_range(make, limit):
     assert len(make(limit - 10, 10)) == 10
-    for first, count in [(limit - 10, 11), (0, limit + 1)]:
-        with pytest.raises(UserError, match="leave their range"):
+    for first, count, says in [
+        (limit - 10, 11, "leave their range"), (0, limit + 1, "leave their range"),
+        (limit, 1, r"the first \w+ seed must be"), (-1, 1, r"the first \w+ seed must be"),
+        (0.0, 1, r"the first \w+ seed must be"), (0, 0, r"the number of \w+ episodes must be"),
+    ]:  # fmt: skip
+        with pytest.raises(UserError, match=says):
             make(first, count)
-    for first in (limit, limit * 3, -1, -5, 2**70, 0.0, True):
-        with pytest.raises(UserError, match=r"the first \w+ seed must be"):
-            make(first, 1)
-    for count in (0, -3, 1.0, 2**70):
-        with pytest.raises(UserError, match=r"the number of \w+ episodes must be"):
-            make(0, count)
-
-
-@pytest.mark.parametrize("seed", [-1, seeds.MAX_TRAINING_SEED, 10**9, 1.0, True, 2**64])
-def test_a_training_seed_out_of_range_is_refused(seed):
-    with pytest.raises(UserError, match="training seed"):
-        seeds.training_seeds(seed)
+    for seed in (-1, seeds.MAX_TRAINING_SEED, 1.0, True):
+        with pytest.raises(UserError, match="training seed"):
+            seeds.training_seeds(seed)
 
 
 @given(st.lists(st.integers(0, 60), max_size=8), st.integers(0, 40), st.integers(1, 20))
@@ -78,17 +68,6 @@ def test_check_disjoint_refuses_exactly_what_is_shared(demonstrated, first, coun
         assert any(f"level seed {seed} is both" in str(raised.value) for seed in shared)
     else:
         seeds.check_disjoint(demonstrated, episodes)
-
-
-@pytest.mark.parametrize("wrong", [-1, 2**32, 5.9, True])
-def test_worlds_are_drawn_from_seeds_alone(wrong):
-    boards.draw(boards.find_level("Sudoku4x6"), 1)  # which True would be taken for
-    for draw, level in (
-        (boards.draw, boards.find_level("Sudoku4x6")),
-        (graphs.draw, graphs.find_level("Star3x5")),
-    ):
-        with pytest.raises(UserError, match="seed must be"):
-            draw(level, wrong)
 
 
 def test_seeds_of_64_bits_are_demonstrations_of_no_test_level():

@@ -1,7 +1,5 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +14,6 @@ from leapjax.domain import blank_context
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.domain import Settings, make
 from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
-from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig
@@ -24,7 +21,7 @@ from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
-from tests.programs import only_long, with_options
+from tests.programs import only_long
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -215,21 +212,6 @@ def test_presets_and_data_that_there_are_not(capsys):
         domain.demonstrations.check(states._replace(goal=np.full(5, 50)), "here")
 
 
-@pytest.mark.parametrize("horizon", [2, 5])
-def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
-    """And plans that are shorter or longer than the way are, too."""
-    star = Star(2, 3)
-    other = {"horizon": horizon, "iterations": 2}
-    config = with_options(find_preset("stars", "Star2x3", "classifier", "leapjax"), other)
-    num_actions = StarAdapter(star).num_actions
-    energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
-    run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)
-    planner = SimpleNamespace(energy=energy, params=(), specification=SimpleNamespace(context=0))
-    star_animation.animate(planner, run, [0], tmp_path / "plan.gif")
-    with Image.open(tmp_path / "plan.gif") as animation:
-        assert animation.width == star_animation.side_of(star)  # one planner
-
-
 @only_long
 def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     monkeypatch.chdir(tmp_path)
@@ -243,7 +225,7 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
         assert animation.n_frames == 3 * 2  # graphs, passes
         assert animation.width == 2 * star_animation.SIDE
     rows = results.read(tmp_path / "runs" / "stars.jsonl")
-    found = [(row["train_steps"], row["iterations"], results.planner_name(row)) for row in rows]
+    found = [(row["train_steps"], row["iterations"], results.name_planner(row)) for row in rows]
     assert found == [
         (2, 2, "N = 2, confident"), (0, 1, "N = 1"), (0, 2, "N = 2, confident"),
     ]  # fmt: skip

@@ -257,19 +257,6 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     assert share(both, ((), ()), certain) == share(energy, (), certain)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("Sudoku9", "unknown level 'Sudoku9': expected Sudoku<4 or 9>x<clues>, such as Sudoku4x6"),
-        ("sudoku9x36", "did you mean Sudoku9x36"),
-        ("Sudoku4x17", r"clues must be in 4 \.\. 16"),
-    ],
-)
-def test_unknown_levels_are_one_line(name, message):
-    with pytest.raises(UserError, match=message):
-        boards.find_level(name)
-
-
 def test_data_that_solve_no_board_are_refused():
     domain = make("Sudoku4x6", Settings())
     (demonstration,) = domain.demonstrations.collect(1, 0, lambda done: None).demonstrations
@@ -305,7 +292,7 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_searc
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     assert sudoku.main([*toy, "--method", "rules"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
-    found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
+    found = [(row["method"], row["iterations"], results.name_planner(row)) for row in rows]
     assert found == [
         ("leap", 16, "N = 16, confident"), ("leap", 1, "N = 1"),
         ("leap", 16, "N = 16, confident, rules 1.0"),
@@ -314,18 +301,6 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, one_searc
     # Eight clues leave little open. What two steps have learned is next to nothing.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]
     assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
-
-
-@pytest.mark.parametrize(
-    ("less", "solved"),
-    [pytest.param("", 6, marks=only_long), ("--horizon 5 --iterations 5", 3)],
-)
-def test_rules_go_on_where_the_board_is(less, solved, tmp_path, one_search):
-    """Planned anew after every few digits, and only as far."""
-    toy = "--level Sudoku4x8 --episodes 8 --no-pictures --method rules --executed 4"
-    assert sudoku.main([*toy.split(), *less.split()]) == 0
-    row, _ = results.read(tmp_path / "runs" / "sudoku.jsonl")
-    assert row["successes"] >= solved
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.configuration import AnyConfig, configuration_hash
+from leapjax.configuration import AnyConfig, hash_config
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -41,7 +41,7 @@ from leapjax.running.programs import PLANS_TOGETHER
 from leapjax.running.results import Row
 from leapjax.running.run import Experiment, find_folder, open_run
 from leapjax.running.train import train
-from leapjax.serialization import differences
+from leapjax.serialization import find_differences
 from leapjax.types import Energy
 
 Change = Callable[[AnyConfig], AnyConfig]
@@ -153,12 +153,12 @@ class Options:
 
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing and does every way of every case; the exit code."""
-    given = shell.arguments_of(arguments)
+    given = shell.read_arguments(arguments)
     module = f"experiments.{analysis.name}"
     about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
     about += f"\n\nThe cases: {_names(analysis.cases)}."
     options = shell.parse(Options, module, given, description=about)
-    return shell.stoppable(
+    return shell.run_interruptible_program(
         module,
         given,
         lambda interruption: run_all(analysis, options, interruption),
@@ -177,7 +177,7 @@ class Work(NamedTuple):
     @property
     def rows(self) -> Path:
         """The file of its rows."""
-        folder = results.folder(self.options.record, self.options.runs)
+        folder = results.choose_folder(self.options.record, self.options.runs)
         return folder / f"{self.analysis.name}.jsonl"
 
 
@@ -185,7 +185,7 @@ def run_all(analysis: Analysis, options: Options, interruption: Interruption) ->
     """Every case, method and seed asked for, and their table."""
     wanted = check(analysis, options)
     jax_setup.start()
-    versions = results.versions()
+    versions = results.find_versions()
     work = Work(analysis, options, versions, Console(markup=False), interruption)
     for where in (work.rows.parent, options.runs):  # not after hours of work
         files.check_writable(where)
@@ -290,7 +290,8 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
         row = {
             "experiment": analysis.name,
             "hash": name,
-            "trained": [configuration_hash(each, seed) for each in settings],
+            "domain": analysis.domain,
+            "trained": [hash_config(each, seed) for each in settings],
             "train_seconds": round(seconds, 3),
             "versions": work.versions,
             **said,
@@ -299,7 +300,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
         rows[name] = row
     for name, way in ways.items():
         before = "" if name in missing else ", recorded already"
-        line = f"{case.name}, {way.name}: {results.percent(rows[name])}{before}"
+        line = f"{case.name}, {way.name}: {results.format_rate(rows[name])}{before}"
         work.console.print(line, highlight=False)
     return [rows[name] for name in ways]
 
@@ -318,7 +319,7 @@ def row_name(
     setting that is added later changes no name.
     """
     search = way.search(settings[0].planner)
-    planner = differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
+    planner = find_differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
     asked = {
         "minimise": described(way.minimise), "remembers": way.remembers,
         "adapter": described(case.adapter),
@@ -329,8 +330,8 @@ def row_name(
         "level": case.level, "seed": seed, "executed": way.executed,
         "episodes": options.episodes, "first": options.played[0],
         "planner": {"kind": type(search).__name__, **planner},
-        "trained": [configuration_hash(each, seed) for each in settings],
-        **differences(asked, plain),
+        "trained": [hash_config(each, seed) for each in settings],
+        **find_differences(asked, plain),
     }  # fmt: skip
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
 
@@ -446,7 +447,6 @@ def play(
     violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
     good = found.lengths[found.successes]
     row = {
-        "domain": specification.domain,
         "level": case.level,
         "case": case.name,
         "way": way.name,
@@ -469,7 +469,7 @@ def play(
         "plans": found.plans,
         "plans_per_second": found.plans / found.planning_seconds,
         "paper_success": way.paper,
-        "date": results.today(),
+        "date": results.format_date(),
     }
     return row, found
 
@@ -506,12 +506,12 @@ def table(rows: Sequence[Row]) -> Table:
             *named(row),
             str(row["seed"]),
             "" if first is None else f"{first / row['episodes']:.1%}",
-            results.percent(row),
+            results.format_rate(row),
             f"{1e3 / row['plans_per_second']:.2f}",
             paper(row),
         )
     shown.add_section()
     for group in results.group_seeds(rows, named):
-        mean = results.percent_over_seeds(group)
+        mean = results.format_rate_over_seeds(group)
         shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", paper(group[0]))
     return shown

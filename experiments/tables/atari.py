@@ -26,11 +26,11 @@ COLUMNS = {
     "random": Setting("leapjax", "random"),
 }
 # At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
-RUNS = {"training": {"run": 16}, "domain_settings": {"max_steps": LONGEST}}
+CONSECUTIVE = {"training": {"consecutive": 16}, "domain_settings": {"max_steps": LONGEST}}
 LARGE = {
-    "LEAP": Setting("paper", changes=RUNS),
+    "LEAP": Setting("paper", changes=CONSECUTIVE),
     "LEAP without return": Setting(
-        "paper", changes={**RUNS, "method_settings": {"returns": False}}
+        "paper", changes={**CONSECUTIVE, "method_settings": {"returns": False}}
     ),
 }
 COLD = {title: setting.searching(temperature=0.1) for title, setting in LARGE.items()}

@@ -18,15 +18,15 @@ from leapjax.running.schema import (
     Number,
     OneOf,
     Schema,
-    loads,
-    problem,
+    find_problem,
+    parse_json,
 )
 
 PART = {"part": str, "ms": POSITIVE, "gflop": AMOUNT}
 TRAINING = {
-    "level": str, "preset": str, "run": SEVERAL, "steps": COUNT, "steps_per_second": POSITIVE,
-    "flops_per_step": AMOUNT, "gflops": AMOUNT, "fraction_of_peak": AMOUNT,
-    "training_seconds": AMOUNT, "parts": Each(PART),
+    "level": str, "preset": str, "consecutive": SEVERAL, "steps": COUNT,
+    "steps_per_second": POSITIVE, "flops_per_step": AMOUNT, "gflops": AMOUNT,
+    "fraction_of_peak": AMOUNT, "training_seconds": AMOUNT, "parts": Each(PART),
 }  # fmt: skip
 PLANNING = {
     "preset": str, "horizon": SEVERAL, "iterations": SEVERAL, "batch": SEVERAL,
@@ -73,12 +73,12 @@ def read(path: Path) -> Any:
         UserError: it cannot be read, or tables could not be made from it; names the field.
     """
     try:
-        found = loads(read_text(path))
+        found = parse_json(read_text(path))
     except (ValueError, RecursionError) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
-    wrong = problem(found, MEASURED[path.stem]) or _contradiction(path.stem, found)
+    wrong = find_problem(found, MEASURED[path.stem]) or _contradiction(path.stem, found)
     if wrong:
         raise UserError(f"{path}: {wrong}")
     return found

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leapjax.configuration import change, configuration_hash
+from leapjax.configuration import change, hash_config
 from leapjax.presets import find_preset
 from leapjax.running.results import Row
 
@@ -51,7 +51,7 @@ def _hashes(
     """
     config = change(find_preset(domain, level, method, preset), **json.loads(changes))
     again = dataclasses.replace(config, checkpoint=Path())
-    return configuration_hash(config, seed), configuration_hash(again, seed)
+    return hash_config(config, seed), hash_config(again, seed)
 
 
 def select(

@@ -51,7 +51,8 @@ def training(rows: Sequence[Row]) -> str:
     columns: Columns = {
         "level": "{level}",
         "preset": lambda row: (
-            f"`{row['preset']}`" + (f", `--run {row['run']}`" if row["run"] > 1 else "")
+            f"`{row['preset']}`"
+            + (f", `--consecutive {row['consecutive']}`" if row["consecutive"] > 1 else "")
         ),
         "ms/step": lambda row: f"{1e3 / row['steps_per_second']:.0f}",
         "GFLOP/step": lambda row: f"{row['flops_per_step'] / 1e9:.1f}",

@@ -41,8 +41,8 @@ class TrainingConfig:
         windows: How training windows are drawn: by "episode", each equally often, by "step", each
             equally often, or at the "start" of episodes.
         microbatch: Windows whose loss a device computes at a time; 0 for all of its share.
-        run: Consecutive windows in one training example, in which each state is encoded once; 1
-            draws windows alone.
+        consecutive: Consecutive windows in one training example, in which each state is encoded
+            once; 1 draws windows alone.
     """
 
     steps: int = 1600
@@ -55,12 +55,12 @@ class TrainingConfig:
     clip: float = 1.0
     windows: str = "episode"
     microbatch: int = 0
-    run: int = 1
+    consecutive: int = 1
 
     def __post_init__(self) -> None:
         check_types(self, "clip")
         check_at_least(self, 0, "steps", "microbatch", "warmup")
-        check_at_least(self, 1, "batch", "run")
+        check_at_least(self, 1, "batch", "consecutive")
         check_within(self, 0, 10, "learning_rate")
         check_within(self, 0, 100, "weight_decay")
         check_within(self, 0, 1, "final_fraction")
@@ -68,8 +68,11 @@ class TrainingConfig:
             raise ValueError(f"clip must be positive, got {self.clip}: nothing would be learned")
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"betas must be in [0, 1), got {self.betas}")
-        if self.batch % self.run:
-            raise ValueError(f"a batch of {self.batch} windows is not made of runs of {self.run}")
+        if self.batch % self.consecutive:
+            raise ValueError(
+                f"a batch of {self.batch} windows is not a multiple of {self.consecutive} "
+                "consecutive windows"
+            )
         if self.windows not in windows.SAMPLINGS:
             known = ", ".join(windows.SAMPLINGS)
             raise ValueError(f"unknown windows {self.windows!r}: expected one of {known}")

@@ -49,9 +49,9 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
 
     def batch(key: jax.Array, steps: Steps) -> Window:
         step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
-        count = training.batch // training.run
+        count = training.batch // training.consecutive
         starts = windows.sample_steps(step_key, steps, count, training.windows)
-        ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
+        ahead = jnp.minimum(jnp.arange(training.consecutive), steps.remaining[starts][:, None] - 1)
         each = jax.vmap(window, in_axes=(None, 0))
         runs = jax.vmap(each, in_axes=(None, 0))(steps, starts[:, None] + ahead)
         return _augment(domain, keys, runs, lambda augment: jax.vmap(augment, in_axes=(None, 0)))
@@ -85,11 +85,11 @@ def make_blank_steps(domain: Domain) -> Steps:
 
 def _check_no_runs(setup: Setup) -> None:
     """Checks that windows are drawn alone: other methods gain nothing from runs."""
-    if setup.training.run > 1:
+    if setup.training.consecutive > 1:
         raise UserError(
-            f"runs of {setup.training.run} windows: only LEAP with architecture paper encodes the "
-            "states of windows in a row once",
-            "run",
+            f"{setup.training.consecutive} consecutive windows: only LEAP with architecture paper "
+            "encodes the states of windows in a row once",
+            "consecutive",
         )
 
 

@@ -149,12 +149,12 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.apply(params, jax.vmap(windows.joined)(runs), method="encode_batch")
 
     # To the other architecture, what a state is depends on the window that it is seen in.
-    in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
+    in_runs = setup.training.consecutive > 1 and setup.model.architecture == "paper"
     if in_runs and not setup.settings.repeat_state:
         raise UserError(
-            f"runs of {setup.training.run} windows without repeated states: windows in a row have "
-            "different later states; drop one",
-            "run",
+            f"{setup.training.consecutive} consecutive windows without repeated states: "
+            "windows in a row have different later states; drop one",
+            "consecutive",
             "repeat_state",
         )
     example = (run_loss, encode_runs) if in_runs else (window_loss, make_window_encoder(module))

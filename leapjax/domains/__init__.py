@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from leapjax.checks import check_kind
 from leapjax.domain import Domain, DomainType
 from leapjax.errors import UserError
-from leapjax.extras import missing_explained
+from leapjax.extras import report_missing
 
 
 class Place(NamedTuple):
@@ -59,7 +59,7 @@ def find_domain(name: str) -> DomainType:
         raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
     found = DOMAINS[name]
     if isinstance(found, Place):
-        with missing_explained(found.extra):
+        with report_missing(found.extra):
             found = getattr(importlib.import_module(found.module), found.name)
     return found
 

@@ -21,7 +21,7 @@ class Interrupted(BaseException):
 
 
 class Interruption:
-    """What the two signals do while a program runs: see `interruptible`."""
+    """What the two signals do while a program runs: see `catch_signals`."""
 
     def __init__(self) -> None:
         self._number: int | None = None
@@ -54,7 +54,7 @@ class Interruption:
             raise Interrupted(self._number)
 
     @contextlib.contextmanager
-    def deferred(self) -> Iterator[None]:
+    def defer_signals(self) -> Iterator[None]:
         """Inside, a signal waits: look at `requested`. At the end it is raised."""
         self.check()
         self._deferred = True
@@ -66,7 +66,7 @@ class Interruption:
 
 
 @contextlib.contextmanager
-def interruptible(
+def catch_signals(
     give_up: Callable[[Interrupted], object] = lambda stopped: None,
 ) -> Iterator[Interruption]:
     """Inside, SIGINT and SIGTERM raise `Interrupted`, at once or where they were deferred.

@@ -113,7 +113,7 @@ def check_devices() -> None:
         jax.devices()
     except Exception as error:  # noqa: BLE001  (each platform raises its own)
         raise UserError(
-            f"JAX can use no device{startup.settings_of_jax()} ({first_line(error)}): change "
+            f"JAX can use no device{startup.list_jax_settings()} ({first_line(error)}): change "
             "these settings, or install what they need"
         ) from None
 
@@ -124,7 +124,7 @@ def connect(cluster: Cluster) -> None:
     Raises:
         UserError: they cannot be reached.
     """
-    launched = any(_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
+    launched = any(_read_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
     if cluster.coordinator is None and not launched:
         return
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -143,12 +143,12 @@ def connect(cluster: Cluster) -> None:
         ) from None
 
 
-def _count(text: str) -> int:
+def _read_count(text: str) -> int:
     """A number of processes; 1 where nothing, or no number, is said."""
     return int(text) if text.strip().isdecimal() else 1
 
 
-def leave(code: int) -> int:
+def leave_program(code: int) -> int:
     """The exit code of a program that ends early.
 
     With other processes it ends here: JAX would wait for them to end too, minutes long, while
@@ -185,10 +185,10 @@ def use_every_core() -> None:
             )
         return
     with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
-        jax.config.update("jax_num_cpu_devices", min(cores(), MOST_CPU_DEVICES))
+        jax.config.update("jax_num_cpu_devices", min(count_cores(), MOST_CPU_DEVICES))
 
 
-def cores() -> int:
+def count_cores() -> int:
     """How many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

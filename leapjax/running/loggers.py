@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from leapjax.errors import UserError
-from leapjax.extras import missing_explained
+from leapjax.extras import report_missing
 
 Log = Callable[[int, Mapping[str, float]], None]  # (training step, values by name)
 
@@ -33,13 +33,13 @@ class About(NamedTuple):
     begin: int  # training steps that were done, and logged, before
 
 
-def nowhere(step: int, values: Mapping[str, float]) -> None:
+def log_nothing(step: int, values: Mapping[str, float]) -> None:
     """Logs nothing."""
 
 
-def tensorboard(about: About) -> Logger:
+def open_tensorboard(about: About) -> Logger:
     """Event files in the run's folder."""
-    writer = _installed("tensorboard").SummaryWriter(
+    writer = _import_logger("tensorboard").SummaryWriter(
         str(about.folder / "tensorboard"), purge_step=about.begin + 1 if about.begin else None
     )
 
@@ -50,9 +50,9 @@ def tensorboard(about: About) -> Logger:
     return Logger(log, writer.close)
 
 
-def wandb(about: About) -> Logger:
+def open_wandb(about: About) -> Logger:
     """A run of Weights & Biases, in the run's folder."""
-    run = _installed("wandb").init(
+    run = _import_logger("wandb").init(
         project="leapjax", name=about.folder.name, id=about.name, resume="allow",
         dir=str(about.folder), config=dict(about.configuration),
         mode=os.environ.get("WANDB_MODE", "offline"),
@@ -64,7 +64,10 @@ def wandb(about: About) -> Logger:
     return Logger(log, run.finish)
 
 
-LOGGERS: Mapping[str, Callable[[About], Logger]] = {"tensorboard": tensorboard, "wandb": wandb}
+LOGGERS: Mapping[str, Callable[[About], Logger]] = {
+    "tensorboard": open_tensorboard,
+    "wandb": open_wandb,
+}
 _MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
@@ -77,20 +80,20 @@ def check(names: Sequence[str]) -> None:
     for name in names:
         if name not in LOGGERS:
             raise UserError(f"unknown logger {name!r}: expected some of {', '.join(LOGGERS)}")
-        _installed(name)
+        _import_logger(name)
 
 
-def _installed(name: str) -> ModuleType:
+def _import_logger(name: str) -> ModuleType:
     """The module that a logger needs."""
-    with missing_explained():
+    with report_missing():
         return importlib.import_module(_MODULES[name])
 
 
 @contextlib.contextmanager
-def opened(names: Sequence[str], about: Callable[[], About]) -> Iterator[Log]:
+def open_loggers(names: Sequence[str], about: Callable[[], About]) -> Iterator[Log]:
     """Inside, what is given to the function goes to some loggers; they begin with the first."""
     if not names:
-        yield nowhere
+        yield log_nothing
         return
     with contextlib.ExitStack() as stack:
         begun: list[Logger] = []

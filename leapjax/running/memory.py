@@ -33,7 +33,7 @@ def check_state(state: TrainState) -> None:
         UserError: says how large it is.
     """
     sizes = "--width, --layers, and sizes of the method and the domain"
-    check({sizes: _bytes(state) + _bytes(state.params)})
+    check({sizes: _count_bytes(state) + _count_bytes(state.params)})
 
 
 def check_program(program: Any) -> None:
@@ -53,6 +53,6 @@ def check_program(program: Any) -> None:
     check({options: device * jax.local_device_count()})
 
 
-def _bytes(tree: PyTree) -> int:
+def _count_bytes(tree: PyTree) -> int:
     leaves = jax.tree.leaves(tree)
     return sum(int(np.prod(leaf.shape, dtype=object)) * leaf.dtype.itemsize for leaf in leaves)

@@ -15,7 +15,7 @@ from leapjax import files, scores
 from leapjax.errors import UserError
 
 
-def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
+def draw_training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
     """What the method reports, each against steps: the loss first."""
     steps = [entry["step"] for entry in metrics]
     names = [name for name in metrics[0] if name not in ("step", "seconds")]
@@ -31,7 +31,7 @@ def training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
     save(figure, path)
 
 
-def success_by_iteration(
+def draw_success_by_iteration(
     iterations: Sequence[int], outcomes: Sequence[tuple[int, int]], title: str, path: Path
 ) -> None:
     """Success rate against planning iterations (paper, figure 6, left).
@@ -69,7 +69,7 @@ def check_figure(path: Path) -> None:
 def save(figure: Figure, path: Path) -> None:
     """Writes a figure, atomically, and lets go of it."""
     try:
-        with files.whole(path) as scratch:
+        with files.write_whole(path) as scratch:
             figure.savefig(scratch, dpi=120)
     finally:
         plt.close(figure)

@@ -67,7 +67,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
     mesh = make_mesh(config)
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(
-        agent.energy, config.planner, chunk_sizes(config), encode_next=agent.encode_next
+        agent.energy, config.planner, choose_chunk_sizes(config), encode_next=agent.encode_next
     )
     like = make_blank_steps(domain) if config.demos else ()
     state = jax.eval_shape(agent.init, jax.random.key(0))
@@ -101,7 +101,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
     return wait
 
 
-def chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
+def choose_chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
     """Plans that are made together: as many as there are episodes, up to the usual."""
     return (min(PLANS_TOGETHER, 1 << (config.episodes - 1).bit_length()),)
 
@@ -113,7 +113,7 @@ def make_mesh(config: AnyConfig) -> Mesh:
         UserError: they cannot share the batch.
     """
     try:
-        examples = config.training.batch // config.training.run
+        examples = config.training.batch // config.training.consecutive
         return sharding.make_mesh(examples, jax.devices(), config.cluster.fsdp)
     except ValueError as error:
         raise UserError(f"--batch, --fsdp: {error}") from None

@@ -48,18 +48,18 @@ class Meter:
         now = time.monotonic()
         rate = (done - self._first) / max(now - self._begun, 1e-9)
         if self._bar:
-            self._bar.update(self._task, completed=done, note=f"{speed(rate)} {note}")
+            self._bar.update(self._task, completed=done, note=f"{format_speed(rate)} {note}")
             return
         if now - self._shown < LOG_INTERVAL and done != self._total:
             return
         self._shown = now
         left = f"{(self._total - done) / rate:.0f}s" if rate else "unknown"
         self._console.print(
-            f"{self._title} {done}/{self._total}  {speed(rate)}  ETA {left}  {note}",
+            f"{self._title} {done}/{self._total}  {format_speed(rate)}  ETA {left}  {note}",
             highlight=False,
         )
 
 
-def speed(rate: float) -> str:
+def format_speed(rate: float) -> str:
     """How many a second; of less than one, how long each takes."""
     return f"{rate:.1f}/s" if rate >= 1 or rate == 0 else f"{1 / rate:.1f}s each"

@@ -19,7 +19,7 @@ from rich.table import Table
 from leapjax import compilation, scores
 from leapjax.checks import LARGEST_SEED
 from leapjax.errors import UserError, first_line
-from leapjax.files import only_process_in, read_text, whole, write_text
+from leapjax.files import lock_folder, read_text, write_text, write_whole
 from leapjax.rollouts import Episodes
 from leapjax.running import jax_setup
 from leapjax.running.schema import (
@@ -31,8 +31,8 @@ from leapjax.running.schema import (
     Nullable,
     Number,
     Schema,
-    loads,
-    problem,
+    find_problem,
+    parse_json,
 )
 from leapjax.serialization import read_json
 from leapjax.version import find_version
@@ -105,14 +105,14 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
         if not line.strip():
             continue
         try:
-            row = loads(line)
+            row = parse_json(line)
         except (ValueError, RecursionError) as error:
             reason = "" if isinstance(error, json.JSONDecodeError) else f" ({first_line(error)})"
             raise UserError(f"{path}, line {number}: not JSON{reason}") from None
-        wrong = problem(row, schema) or _contradiction(row)
+        wrong = find_problem(row, schema) or _find_contradiction(row)
         if wrong:
             raise UserError(f"{path}, line {number}: {wrong}")
-        row["success"] = success(row)  # rows of an earlier version have counts alone
+        row["success"] = compute_success(row)  # rows of an earlier version have counts alone
         first = line_of.setdefault(row["hash"], number)
         if first != number:
             raise UserError(
@@ -123,22 +123,24 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
     return rows
 
 
-def _contradiction(row: Row) -> str | None:
+def _find_contradiction(row: Row) -> str | None:
     """What fields say against each other."""
     for name in ("successes", "first_pass_successes"):
         if (row.get(name) or 0) > row["episodes"]:
             return f"{row[name]} {name} of {row['episodes']} episodes"
-    if not math.isclose(row.get("success", success(row)), success(row), abs_tol=1e-9):
+    if not math.isclose(
+        row.get("success", compute_success(row)), compute_success(row), abs_tol=1e-9
+    ):
         return f"success is {row['success']}, of {row['successes']} of {row['episodes']} episodes"
     return None
 
 
-def success(row: Row) -> float:
+def compute_success(row: Row) -> float:
     """The success rate of a row, as a fraction."""
     return row["successes"] / row["episodes"]
 
 
-def folder(recorded: bool, runs: Path) -> Path:
+def choose_folder(recorded: bool, runs: Path) -> Path:
     """Where rows go: to those that are committed, or beside the runs that they are of."""
     return Path("results") if recorded else runs
 
@@ -159,7 +161,7 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
             json.dumps(value, allow_nan=False)
         except ValueError:
             raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
-    with only_process_in(path.parent, wait=True):
+    with lock_folder(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         # First, so that a process killed in between leaves episodes without a row, which the next
         # one drops, and no row without its episodes.
@@ -168,14 +170,14 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
         if episodes is not None:
             tables[row["hash"]] = as_table(episodes)
         if tables or known:
-            _write_episodes(_episodes_path(path), tables)
+            _write_episodes(_locate_episodes(path), tables)
         lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
         write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def change(path: Path, changed: Callable[[Any], Any]) -> Any:
     """Rewrites a JSON file as what becomes of it, None where there is none, atomically."""
-    with only_process_in(path.parent, wait=True):
+    with lock_folder(path.parent, wait=True):
         found = changed(read_json(path) if path.exists() else None)
         write_text(path, json.dumps(found, indent=1) + "\n")
     return found
@@ -198,7 +200,7 @@ def write_csv(path: Path, episodes: Episodes) -> None:
     write_text(path, "\n".join([",".join(EPISODE.names or ()), *lines]) + "\n")
 
 
-def _episodes_path(path: Path) -> Path:
+def _locate_episodes(path: Path) -> Path:
     """Returns the file of the episodes of a file of rows."""
     return path.parent / "episodes" / f"{path.stem}.npz"
 
@@ -215,7 +217,7 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file of episodes is damaged.
     """
-    path = _episodes_path(path)
+    path = _locate_episodes(path)
     if not path.exists():
         return {}
     try:
@@ -232,7 +234,7 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
 def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
     # An array a row: where a row is added, git stores the new one and shares the others.
     arrays: Any = tables  # NumPy's stubs take the arrays for its other arguments
-    with whole(path) as scratch:
+    with write_whole(path) as scratch:
         np.savez_compressed(scratch, **arrays)
 
 
@@ -241,21 +243,21 @@ def find(path: Path, configuration: str) -> Row | None:
     return next((row for row in read(path) if row["hash"] == configuration), None)
 
 
-def versions() -> dict[str, str]:
+def find_versions() -> dict[str, str]:
     """What a result was made with; starts JAX, if it was not."""
     found = {}
     for name in ("jax", "flax", "optax", "minigrid", "numpy", "ale-py"):
         with contextlib.suppress(metadata.PackageNotFoundError):  # of an extra
             found[name] = metadata.version(name)
-    found["leapjax"] = find_version() + code_version(Path(__file__).parent.parent.parent)
-    machine = f"{compilation.name_processor()}, cores: {jax_setup.cores()}"
+    found["leapjax"] = find_version() + find_code_version(Path(__file__).parent.parent.parent)
+    machine = f"{compilation.name_processor()}, cores: {jax_setup.count_cores()}"
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         machine += f", {len(devices)} {devices[0].device_kind}"
     return {**found, "python": platform.python_version(), "machine": machine}
 
 
-def code_version(root: Path) -> str:
+def find_code_version(root: Path) -> str:
     """Which commit last changed the code of a checkout, as a local version: "+g1a2b3c4".
 
     With ".dirty" where the code differs from it; empty where there is no repository. Rows are
@@ -276,24 +278,26 @@ def code_version(root: Path) -> str:
         return ""
 
 
-def today() -> str:
+def format_date() -> str:
     """The date of a row."""
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
-def percent(row: Row) -> str:
+def format_rate(row: Row) -> str:
     """A success rate with its 95% interval."""
-    return _rate(success(row), scores.wilson_interval(row["successes"], row["episodes"]))
+    return _format_with_interval(
+        compute_success(row), scores.wilson_interval(row["successes"], row["episodes"])
+    )
 
 
-def percent_over_seeds(rows: Sequence[Row]) -> str:
+def format_rate_over_seeds(rows: Sequence[Row]) -> str:
     """The mean success rate of rows of several training seeds with its 95% interval."""
     counts = [row["successes"] for row in rows], [row["episodes"] for row in rows]
-    mean = statistics.fmean(map(success, rows))
-    return _rate(mean, scores.interval_over_seeds(*counts))
+    mean = statistics.fmean(map(compute_success, rows))
+    return _format_with_interval(mean, scores.interval_over_seeds(*counts))
 
 
-def _rate(rate: float, interval: tuple[float, float]) -> str:
+def _format_with_interval(rate: float, interval: tuple[float, float]) -> str:
     return f"{rate:.1%} [{interval[0]:.1%}, {interval[1]:.1%}]"
 
 
@@ -324,7 +328,7 @@ def summarize(row: Row) -> str:
 def format_success(row: Row) -> str:
     """A success rate, and that of the data where it is known."""
     data = _find_number(row, "data_success")
-    return percent(row) + ("" if data is None else f" (data: {data:.1%})")
+    return format_rate(row) + ("" if data is None else f" (data: {data:.1%})")
 
 
 def format_return(row: Row) -> str:
@@ -341,7 +345,7 @@ def _find_number(row: Row, name: str) -> float | None:
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def planner_name(row: Row) -> str:
+def name_planner(row: Row) -> str:
     """How a row's plans were found, as far as it says."""
     configuration = row.get("configuration", {})
     planner, rules = configuration.get("planner", {}), configuration.get("rules", 0)
@@ -354,14 +358,14 @@ def planner_name(row: Row) -> str:
     return ", ".join(part for part, said in parts.items() if said)
 
 
-def success_table(rows: Sequence[Row]) -> Table:
+def make_success_table(rows: Sequence[Row]) -> Table:
     """Success rates beside the paper's; below, the mean over training seeds if there are several.
 
     The mean return comes first where a row's criterion of success was not given by the user.
     """
     measures = {
-        "success [95%]": (format_success, percent_over_seeds),
-        "return": (format_return, _mean_return),
+        "success [95%]": (format_success, format_rate_over_seeds),
+        "return": (format_return, _format_mean_return),
     }
     if any("criterion" in row and not row.get("criterion_given") for row in rows):
         measures = dict(reversed(measures.items()))
@@ -372,7 +376,7 @@ def success_table(rows: Sequence[Row]) -> Table:
     )
 
     def named(row: Row) -> tuple[str, ...]:
-        return row["level"], f"{row['method']} ({row['preset']})", planner_name(row)
+        return row["level"], f"{row['method']} ({row['preset']})", name_planner(row)
 
     def paper(row: Row) -> str:
         found = row.get("paper_success")
@@ -391,13 +395,13 @@ def success_table(rows: Sequence[Row]) -> Table:
     return result
 
 
-def _mean_return(rows: Sequence[Row]) -> str:
+def _format_mean_return(rows: Sequence[Row]) -> str:
     returns = [_find_number(row, "mean_return") for row in rows]
     known = [each for each in returns if each is not None]
     return f"{statistics.fmean(known):.2f}" if len(known) == len(rows) else "-"
 
 
-def time_table(rows: Sequence[Row]) -> Table:
+def make_time_table(rows: Sequence[Row]) -> Table:
     """Where the time of each run went."""
     parts = ("demos", "compile", "train", "eval")
     result = Table("level", "seed", *(f"{part} (s)" for part in parts), "plans/s")

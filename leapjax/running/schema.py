@@ -59,17 +59,17 @@ POSITIVE = Number(1e-12)
 KINDS = {str: "str", bool: "bool", dict: "object", list: "array"}
 
 
-def loads(text: str) -> Any:
+def parse_json(text: str) -> Any:
     """The value of a JSON text.
 
     Raises:
         ValueError: it is not JSON, or an object names a field twice.
         RecursionError: it is nested too deeply.
     """
-    return json.loads(text, object_pairs_hook=_object)
+    return json.loads(text, object_pairs_hook=_make_object)
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
@@ -78,7 +78,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def problem(value: Any, schema: Schema, name: str = "") -> str | None:
+def find_problem(value: Any, schema: Schema, name: str = "") -> str | None:
     """What is wrong with a value, with the path of the field; None if nothing is.
 
     Args:
@@ -89,53 +89,57 @@ def problem(value: Any, schema: Schema, name: str = "") -> str | None:
     if isinstance(schema, Absent):
         schema = schema.schema
     if isinstance(schema, Nullable):
-        return None if value is None else problem(value, schema.schema, name)
+        return None if value is None else find_problem(value, schema.schema, name)
     if schema in (int, float):
         schema = Number(whole=schema is int)
     if isinstance(schema, Number):
-        return _problem_of_number(value, schema, name)
+        return _find_problem_of_number(value, schema, name)
     if isinstance(schema, OneOf):
         if value in schema.texts:
             return None
-        return f"{name} is {_shown(value)}, expected one of {', '.join(schema.texts)}"
+        return f"{name} is {_shorten(value)}, expected one of {', '.join(schema.texts)}"
     if isinstance(schema, dict):
-        return _wrong_type(value, dict, name) or _problem_of_fields(value, schema, name)
+        return _find_wrong_type(value, dict, name) or _find_problem_of_fields(value, schema, name)
     if isinstance(schema, Each | Named):
         kind = list if isinstance(schema, Each) else dict
-        if wrong := _wrong_type(value, kind, name):
+        if wrong := _find_wrong_type(value, kind, name):
             return wrong
         if len(value) < schema.least:
             return f"{name or 'the value'} is empty"
         parts = enumerate(value) if isinstance(schema, Each) else value.items()
-        found = (problem(part, schema.schema, f"{name}[{key!r}]") for key, part in parts)
+        found = (find_problem(part, schema.schema, f"{name}[{key!r}]") for key, part in parts)
         return next((each for each in found if each), None)
-    return _wrong_type(value, schema, name)
+    return _find_wrong_type(value, schema, name)
 
 
-def _problem_of_fields(value: dict[str, Any], fields: dict[str, Schema], name: str) -> str | None:
+def _find_problem_of_fields(
+    value: dict[str, Any], fields: dict[str, Schema], name: str
+) -> str | None:
     missing = [
         each for each, of in fields.items() if each not in value and not isinstance(of, Absent)
     ]
     if missing:
         return f"{name or 'a row'} without {', '.join(missing)}"
     path = f"{name}." if name else ""
-    found = (problem(value[each], of, path + each) for each, of in fields.items() if each in value)
+    found = (
+        find_problem(value[each], of, path + each) for each, of in fields.items() if each in value
+    )
     return next((each for each in found if each), None)
 
 
-def _problem_of_number(value: Any, number: Number, name: str) -> str | None:
+def _find_problem_of_number(value: Any, number: Number, name: str) -> str | None:
     kind = int if number.whole else float
     if isinstance(value, bool) or not isinstance(value, int if number.whole else int | float):
         return f"{name} is a {type(value).__name__}, expected {kind.__name__}"
     if not -LARGEST < value < LARGEST:  # NaN too
-        return f"{name} is {_shown(value)}: no number that a run could give"
+        return f"{name} is {_shorten(value)}: no number that a run could give"
     if not number.least <= value <= number.most:
         most = "" if number.most == LARGEST else f" and at most {number.most}"
-        return f"{name} is {_shown(value)}, expected at least {number.least}{most}"
+        return f"{name} is {_shorten(value)}, expected at least {number.least}{most}"
     return None
 
 
-def _wrong_type(value: Any, kind: type, name: str) -> str | None:
+def _find_wrong_type(value: Any, kind: type, name: str) -> str | None:
     if isinstance(value, kind):
         return None
     if not name:
@@ -143,5 +147,5 @@ def _wrong_type(value: Any, kind: type, name: str) -> str | None:
     return f"{name} is a {type(value).__name__}, expected {KINDS[kind]}"
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     return str(value)[:20]

@@ -10,16 +10,16 @@ import jax
 
 from leapjax.batching import NotANumber
 from leapjax.errors import UserError, first_line
-from leapjax.extras import missing_explained
+from leapjax.extras import report_missing
 from leapjax.running import jax_setup, startup
-from leapjax.running.interruption import Interrupted, Interruption, interruptible
+from leapjax.running.interruption import Interrupted, Interruption, catch_signals
 from leapjax.training import NonFiniteLoss
 
 T = TypeVar("T")
 FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can be said in one line
 
 
-def arguments_of(arguments: Sequence[str] | None) -> list[str]:
+def read_arguments(arguments: Sequence[str] | None) -> list[str]:
     """The command line of a program: what was given, or the real one.
 
     Raises:
@@ -29,7 +29,7 @@ def arguments_of(arguments: Sequence[str] | None) -> list[str]:
     try:
         check_values(given)
     except UserError as error:
-        raise SystemExit(_end(f"error: {error}", 2)) from None
+        raise SystemExit(_report_failure(f"error: {error}", 2)) from None
     return given
 
 
@@ -59,7 +59,7 @@ def parse(kind: type[T], module: str, arguments: Sequence[str], **options: Any) 
     """
     import tyro  # noqa: PLC0415  (`leapjax --help` needs no extra)
 
-    return tyro.cli(kind, prog=startup.command(module), args=list(arguments), **options)
+    return tyro.cli(kind, prog=startup.format_command(module), args=list(arguments), **options)
 
 
 # A path that is too long, leads through a file, into a folder that may not be looked into, or into
@@ -67,7 +67,7 @@ def parse(kind: type[T], module: str, arguments: Sequence[str], **options: Any) 
 NAMED_WRONGLY = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT}
 
 
-def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
+def run_program(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
     """Does the work of a program; the exit code.
 
     Args:
@@ -76,32 +76,32 @@ def guarded(module: str, arguments: Sequence[str], work: Callable[[], object]) -
         work: all that it does.
     """
     try:
-        with missing_explained(startup.extra_of(module)):
+        with report_missing(startup.find_extra(module)):
             work()
     except Interrupted as stopped:
         stop(module, arguments, stopped)
     except UserError as error:
-        return _end(f"error: {describe(error)}", 2)
+        return _report_failure(f"error: {describe(error)}", 2)
     except NotANumber as error:
-        return _end(f"error: {error}", 1)
+        return _report_failure(f"error: {error}", 1)
     except NonFiniteLoss as error:
-        return _end(f"error: {error}; the last checkpoint is from before it", 1)
+        return _report_failure(f"error: {error}; the last checkpoint is from before it", 1)
     except jax.errors.JaxRuntimeError as error:
         if not jax.distributed.is_initialized():
             raise
         reason = first_line(error)
-        return _end(
+        return _report_failure(
             f"error: the processes of this run have lost each other ({reason}): start all of them "
             "again, and they continue from the last checkpoint",
             1,
         )
     except KeyboardInterrupt:
-        return _end("stopped by Ctrl-C", 130)
+        return _report_failure("stopped by Ctrl-C", 130)
     except OSError as error:
         if error.errno not in NAMED_WRONGLY:
             raise
         place = error.filename or "the working folder"
-        return _end(f"error: {error.strerror}: {place}", 2)
+        return _report_failure(f"error: {error.strerror}: {place}", 2)
     return 0
 
 
@@ -111,7 +111,9 @@ def describe(error: Exception) -> str:
     return f"{error} ({', '.join(options)})" if options else str(error)
 
 
-def stoppable(module: str, arguments: Sequence[str], work: Callable[[Interruption], object]) -> int:
+def run_interruptible_program(
+    module: str, arguments: Sequence[str], work: Callable[[Interruption], object]
+) -> int:
     """The same for long work, which SIGINT and SIGTERM stop where nothing is lost."""
 
     def give_up(stopped: Interrupted) -> None:
@@ -119,20 +121,20 @@ def stoppable(module: str, arguments: Sequence[str], work: Callable[[Interruptio
             stop(module, arguments, stopped)
 
     def interrupted_or_done() -> None:
-        with interruptible(give_up) as interruption:
+        with catch_signals(give_up) as interruption:
             work(interruption)
 
-    return guarded(module, arguments, interrupted_or_done)
+    return run_program(module, arguments, interrupted_or_done)
 
 
 def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoReturn:
     """Ends an interrupted program, and says how to continue it."""
-    command = " ".join([startup.command(module), *map(shlex.quote, arguments)])
+    command = " ".join([startup.format_command(module), *map(shlex.quote, arguments)])
     print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
     # At once: threads that still compile or write would crash in the interpreter's own end.
     jax_setup.exit_at_once(stopped.exit_code)
 
 
-def _end(message: str, code: int) -> int:
+def _report_failure(message: str, code: int) -> int:
     print(message, file=sys.stderr)
-    return jax_setup.leave(code)
+    return jax_setup.leave_program(code)

@@ -25,10 +25,10 @@ def is_program() -> bool:
     While `python -m` looks for a module, and imports the packages that hold it, its name for the
     program is "-m".
     """
-    return str(started()) == "-m" or started().stem == COMMAND
+    return str(find_program()) == "-m" or find_program().stem == COMMAND
 
 
-def started() -> Path:
+def find_program() -> Path:
     """What the interpreter runs, as `sys.argv` says it."""
     return Path(next(iter(getattr(sys, "argv", ())), ""))
 
@@ -40,7 +40,7 @@ def prepare() -> None:
     imported: it reads its settings then.
     """
     for number in SIGNALS:
-        signal.signal(number, end)
+        signal.signal(number, end_on_signal)
     sys.stdout, sys.stderr = make_output(sys.stdout), make_output(sys.stderr)
     if "--version" in sys.argv[1:]:
         print(COMMAND, find_version())
@@ -52,7 +52,7 @@ def prepare() -> None:
     try:
         import jax  # noqa: F401, PLC0415
     except Exception as error:  # noqa: BLE001  (each setting raises its own)
-        message = f"error: cannot import JAX{settings_of_jax()}: {error or type(error).__name__}"
+        message = f"error: cannot import JAX{list_jax_settings()}: {error or type(error).__name__}"
         print(" ".join(message.split()), file=sys.stderr)
         sys.exit(2)
 
@@ -94,16 +94,16 @@ def end_unread() -> NoReturn:
     os._exit(UNREAD)
 
 
-def command(module: str) -> str:
+def format_command(module: str) -> str:
     """How a program was started: `leapjax babyai`, or `python -m experiments.babyai`.
 
     Args:
         module: of the program, such as "experiments.babyai".
     """
     package, _, name = module.partition(".")
-    if started().stem == COMMAND:
+    if find_program().stem == COMMAND:
         return f"{COMMAND} {name}"
-    if started().parts[-2:] == (package, "__main__.py"):
+    if find_program().parts[-2:] == (package, "__main__.py"):
         return f"python -m {package} {name}"
     return f"python -m {module}"
 
@@ -113,13 +113,13 @@ def find_modules_here() -> None:
 
     Called once `leapjax` is imported: it is the installed one, whatever is in that folder.
     """
-    if started().stem == COMMAND and not sys.flags.safe_path:
+    if find_program().stem == COMMAND and not sys.flags.safe_path:
         with contextlib.suppress(OSError):  # the working folder was removed
             sys.path.insert(0, str(Path.cwd()))
 
 
-def end(number: int, _: FrameType | None = None) -> None:
-    """The signal handler until `interruptible` has its own.
+def end_on_signal(number: int, _: FrameType | None = None) -> None:
+    """The signal handler until `catch_signals` has its own.
 
     It raises nothing: an import, or a callback of the interpreter, may drop what is raised.
     """
@@ -151,7 +151,7 @@ def print_uncaught(
     from leapjax.extras import explain_missing  # noqa: PLC0415  (imports JAX)
 
     spec = sys.modules["__main__"].__spec__  # None for the installed script
-    explanation = explain_missing(error, extra_of(spec.name if spec else ""))
+    explanation = explain_missing(error, find_extra(spec.name if spec else ""))
     if explanation is None:
         sys.__excepthook__(kind, error, trace)
         return
@@ -159,7 +159,7 @@ def print_uncaught(
     sys.exit(2)
 
 
-def extra_of(module: str) -> str:
+def find_extra(module: str) -> str:
     """The extra of the package that a program needs, by its module, such as `experiments.atari`.
 
     A program that is named after a domain needs that of the domain, all others need BabyAI's.
@@ -170,7 +170,7 @@ def extra_of(module: str) -> str:
     return domain.extra if isinstance(domain, Place) else "babyai"
 
 
-def settings_of_jax() -> str:
+def list_jax_settings() -> str:
     """The settings of JAX and XLA in the environment, for a message; empty if there are none."""
     given = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if _is_setting(name)]
     return f" with {', '.join(given)}" if given else ""

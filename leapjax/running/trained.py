@@ -10,7 +10,7 @@ from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.pretrained import Pretrained, Specification
 from leapjax.running.data import find_demonstrated
-from leapjax.running.programs import chunk_sizes
+from leapjax.running.programs import choose_chunk_sizes
 from leapjax.running.run import Run
 
 
@@ -26,7 +26,7 @@ def load_trained(run: Run) -> Pretrained:
     if run.config.play in (None, run.config.level):  # the seeds of another level are others
         seeds.check_disjoint(find_demonstrated(checkpoint), run.played)
     trained = pretrained.read_specification(checkpoint)
-    wanted, found = (_training_settings(s) for s in (run.specification, trained))
+    wanted, found = (_select_training_settings(s) for s in (run.specification, trained))
     for name in wanted:
         if wanted[name] != found.get(name):
             label = name.rsplit(".", 1)[-1]
@@ -38,12 +38,12 @@ def load_trained(run: Run) -> Pretrained:
         getattr(s.method_settings, "target_return", None) for s in (run.specification, trained)
     )
     return pretrained.load(
-        checkpoint, run.config.planner, chunk_sizes(run.config), run.config.play,
+        checkpoint, run.config.planner, choose_chunk_sizes(run.config), run.config.play,
         None if target == known else target, finished=run.config.record,
     )  # fmt: skip
 
 
-def _training_settings(specification: Specification) -> dict[str, Any]:
+def _select_training_settings(specification: Specification) -> dict[str, Any]:
     """What a trained planner cannot be asked to change: all but how it searches, and for what."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -70,5 +70,5 @@ def add_rules(run: Run, planner: Pretrained) -> Pretrained:
     if not weight or rules is None:
         return planner
     energy = compose([planner.energy, rules], [1.0, weight])
-    plan = compile_planner(energy, run.config.planner, chunk_sizes(run.config))
+    plan = compile_planner(energy, run.config.planner, choose_chunk_sizes(run.config))
     return dataclasses.replace(planner, energy=energy, params=(planner.params, ()), plan=plan)

@@ -15,11 +15,6 @@ class Settings:
         exchange_objects: With `augment`: also exchange keys, balls and boxes for each other.
         clutter: Largest share of the cells not needed by the demonstration to fill with random
             objects, in 0 .. 1.
-        lookalikes: Clutter may share the kind or the colour of the target.
-        false_starts: Share of training windows that begin with random moves, in 0 .. 1. It needs a
-            context of 0.
-        detours: Share of training windows that lead around obstacles, in 0 .. 1. It needs a context
-            of 0.
         channels: Features of each grid cell.
         rounds: Rounds of convolution over the grid.
         fields: Learned distance fields; 0 leaves convolutions alone.
@@ -31,9 +26,6 @@ class Settings:
     augment: bool = False
     exchange_objects: bool = False
     clutter: float = 0.0
-    lookalikes: bool = False
-    false_starts: float = 0.0
-    detours: float = 0.0
     channels: int = 32
     rounds: int = 2
     fields: int = 8
@@ -48,4 +40,4 @@ class Settings:
         check_at_least(self, 0, "rounds", most=200)  # each is compiled by itself
         check_at_least(self, 0, "fields", "word_heads", most=1000)
         check_at_least(self, 0, "radius", most=100)  # no level is larger
-        check_within(self, 0, 1, "clutter", "false_starts", "detours")
+        check_within(self, 0, 1, "clutter")

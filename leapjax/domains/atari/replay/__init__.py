@@ -1,7 +1,7 @@
 """DQN-Replay: games as Dopamine's replay buffer kept them, read as whole trajectories.
 
-A run of a game is a folder of shards; shard N is six files, each a gzip of one `.npy`
-(Agarwal et al., 2020: 50 shards of 1,000,000 rows R):
+Five DQNs, of seeds 1 to 5, learned each game. The games of one are a folder of shards; shard N is
+six files, each a gzip of one `.npy` (Agarwal et al., 2020: 50 shards of 1,000,000 rows R):
 
     $store$_observation_ckpt.N.gz  [R, 84, 84] uint8: the frame before each action
     $store$_action_ckpt.N.gz       [R] int32

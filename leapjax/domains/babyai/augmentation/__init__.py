@@ -1,8 +1,7 @@
 """More windows from the same demonstrations, one kind of augmentation a file.
 
-`equivalents` applies symmetries of the world and its language, `clutter` adds objects,
-`false_starts` and `detours` add moves before the window. The extras of a window are the cells
-that its demonstration needs free from here on: `[S, S]` bool.
+`equivalents` applies symmetries of the world and its language, `clutter` adds objects. The extras
+of a window are the cells that its demonstration needs free from here on: `[S, S]` bool.
 """
 
 import numpy as np
@@ -10,9 +9,7 @@ import numpy as np
 from leapjax.domain import Augmentation
 from leapjax.domains.babyai import symmetries
 from leapjax.domains.babyai.augmentation.clutter import add_clutter
-from leapjax.domains.babyai.augmentation.detours import add_detour
 from leapjax.domains.babyai.augmentation.equivalents import apply_symmetries
-from leapjax.domains.babyai.augmentation.false_starts import add_false_start
 from leapjax.domains.babyai.augmentation.words import find_words
 from leapjax.domains.babyai.settings import Settings
 from leapjax.types import Demonstration
@@ -25,13 +22,8 @@ def choose_augmentations(settings: Settings) -> list[Augmentation]:
         found.append(
             lambda key, w: apply_symmetries(key, w, find_words(), settings.exchange_objects)
         )
-    if settings.false_starts:
-        found.append(lambda key, w: add_false_start(key, w, settings.false_starts))
-    if settings.detours:
-        found.append(lambda key, w: add_detour(key, w, settings.detours, find_words()))
     if settings.clutter:
-        lookalikes = find_words() if settings.lookalikes else None
-        found.append(lambda key, w: add_clutter(key, w, settings.clutter, lookalikes))
+        found.append(lambda key, w: add_clutter(key, w, settings.clutter))
     return found
 
 

@@ -1,22 +1,36 @@
-"""Random objects that an instruction does not mean."""
+"""Lookalikes: clutter that may share the kind or the colour of the target."""
 
 import jax
 import jax.numpy as jnp
 
 from leapjax.domains.babyai import symmetries
+from leapjax.domains.babyai.augmentation.clutter import (
+    choose_cells,
+    draw_unlike,
+    find_target,
+    put_objects,
+)
 from leapjax.domains.babyai.augmentation.words import GridWords
+from leapjax.types import Window
 
 
-def draw_unlike(
-    kind_key: jax.Array, colour_key: jax.Array, target: jax.Array, cells: tuple[int, ...]
-) -> tuple[jax.Array, jax.Array]:
-    """Draws kinds and colours `[S, S]` that both differ from those of the target `[3]`."""
-    kinds = jnp.array(symmetries.INTERCHANGEABLE)
-    # A cyclic shift by at least one never gives the target's.
-    shift = jax.random.randint(kind_key, cells, 1, len(kinds))
-    kind = kinds[(target[0] - kinds[0] + shift) % len(kinds)]
-    shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
-    return kind, (target[1] + shift) % symmetries.COLOURS
+def add_lookalikes(key: jax.Array, window: Window, share: float, words: GridWords) -> Window:
+    """Adds objects like BabyAI's `add_clutter`, of which some resemble the target.
+
+    If the instruction names both kind and colour of the target, a new object may share one of
+    them.
+
+    Args:
+        key: of the random choices.
+        window: one training example.
+        share: largest probability of a free cell to get an object, in 0 .. 1.
+        words: the words that name kinds and colours.
+    """
+    share_key, where_key, kind_key, colour_key = jax.random.split(key, 4)
+    target, cells = find_target(window.context), window.context.observation.grid.shape[:2]
+    both = names_both(window.context.observation.instruction, target, words)
+    kind, colour = draw_other(kind_key, colour_key, target, cells, both)
+    return put_objects(window, choose_cells(share_key, where_key, window, share), kind, colour)
 
 
 def draw_other(

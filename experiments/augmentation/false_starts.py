@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from leapjax.domains.babyai.augmentation.earlier_moves import prepend_moves
+from experiments.augmentation.earlier_moves import prepend_moves
 from leapjax.types import Window
 
 FALSE_MOVES = 6  # at most

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from leapjax.domains.babyai.augmentation.earlier_moves import prepend_moves
-from leapjax.domains.babyai.augmentation.objects import draw_other, names_both
+from experiments.augmentation.earlier_moves import prepend_moves
+from experiments.augmentation.lookalikes import draw_other, names_both
 from leapjax.domains.babyai.augmentation.words import GridWords
 from leapjax.domains.babyai.dynamics import FORWARD, passable
 from leapjax.domains.babyai.symmetries import EMPTY, LEFT, RIGHT
