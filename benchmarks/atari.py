@@ -24,7 +24,7 @@ from benchmarks import training
 from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
-from experiments.tables.atari import encoding
+from experiments.tables.atari import describe_encoding
 from leapjax import pretrained, sharding
 from leapjax.batching import compile_planner
 from leapjax.configuration import AnyConfig, change, make_domain, specify
@@ -51,7 +51,7 @@ class Options:
     """Games that are played together."""
     training: bool = True
     """Measure training too."""
-    run: int = 16
+    consecutive: int = 16
     """Windows in a row whose states preset `paper` encodes once; beside windows drawn alone."""
     json: Path | None = None
     """Write the rows of playing here."""
@@ -89,9 +89,11 @@ def run(options: Options) -> None:
     ]
     papers = [config for config in configs if config.model.architecture == "paper"]
     try:
-        in_runs = [change(config, training={"run": options.run}) for config in papers]
+        in_sequence = [
+            change(config, training={"consecutive": options.consecutive}) for config in papers
+        ]
     except ValueError as error:
-        raise UserError(f"--run {options.run}: {error}") from None
+        raise UserError(f"--consecutive {options.consecutive}: {error}") from None
     console = Console()
     playing = [
         row for config in configs for row in measure(config, options.batches, options.seconds)
@@ -99,7 +101,7 @@ def run(options: Options) -> None:
     console.print(*tables(playing), sep="\n")
     write_rows(options.json, playing)
     if options.training:
-        trained = [training.measure(config, options.seconds) for config in [*configs, *in_runs]]
+        trained = [training.measure(config, options.seconds) for config in [*configs, *in_sequence]]
         console.print(training.table(trained))
         write_rows(options.training_json, trained)
 
@@ -183,7 +185,7 @@ def tables(rows: Sequence[Row]) -> tuple[Table, Table]:
         spent = (whole, *(row[f"{part}_seconds"] for part in ("planning", "encoding", "playing")))
         milliseconds = (f"{1e3 * seconds:.1f}" for seconds in spent)
         taken.add_row(*name, *milliseconds, f"{row['batch'] / whole:.0f}")
-        encoded.add_row(*name, f"{1e3 * row['anew_seconds']:.1f}", *encoding(row))
+        encoded.add_row(*name, f"{1e3 * row['anew_seconds']:.1f}", *describe_encoding(row))
     return taken, encoded
 
 

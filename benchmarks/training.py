@@ -25,7 +25,7 @@ from benchmarks.flops import matmul_flops
 from benchmarks.planning import random_contexts
 from benchmarks.timing import Row, check_writable, fastest, matmul_peak, write_rows
 from leapjax import pretrained, sharding, training
-from leapjax.agents import learning
+from leapjax.agents.optimizer import make_optimizer
 from leapjax.configuration import AnyConfig, change, make_domain, specify
 from leapjax.data.windows import Steps, concatenate
 from leapjax.domain import Domain
@@ -117,7 +117,7 @@ class Stepper:
         contexts, tokens = jax.device_put((contexts, tokens), split)
         encode = sharding.split_batches(lambda _, *given: self._encode(*given), mesh)
         memory = encode(None, params, contexts)
-        optimizer = learning.make_optimizer(config.training)
+        optimizer = make_optimizer(config.training)
         optimize = jax.jit(
             lambda state: optimizer.update(state.params, state.optimizer, state.params)
         )
@@ -184,7 +184,7 @@ def _is_float(leaf: jax.Array) -> bool:
 
 def measure(config: AnyConfig, seconds: float) -> Row:
     """One preset on one level."""
-    batch, windows = config.training.batch, config.training.run
+    batch, windows = config.training.batch, config.training.consecutive
     mesh = sharding.make_mesh(batch // windows)
     step = Stepper(config, mesh)
     taken = fastest(lambda: [step() for _ in range(5)], seconds) / 5
@@ -197,7 +197,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
         "horizon": config.planner.horizon,
         "context": config.context,
         "batch": batch,
-        "run": windows,
+        "consecutive": windows,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
         "parts": step.parts(mesh, seconds) if windows == 1 else [],  # those of runs are shared
@@ -230,7 +230,8 @@ def table(rows: Sequence[Row]) -> Table:
     for row in rows:
         result.add_row(
             row["level"],
-            row["preset"] + (f", runs of {row['run']}" if row["run"] > 1 else ""),
+            row["preset"]
+            + (f", {row['consecutive']} consecutive" if row["consecutive"] > 1 else ""),
             f"{row['steps_per_second']:.1f}",
             f"{1e3 / row['steps_per_second']:.1f}",
             f"{row['gflops']:.0f}",

@@ -64,12 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] == ["collect"]:
         options = shell.parse(Collect, "experiments.atari collect", given[1:])
         return shell.run_interruptible_program(
-            f"experiments.{EXPERIMENT.name}", given, lambda _: run(options)
+            f"experiments.{EXPERIMENT.name}", given, lambda _: collect_games(options)
         )
     return running.main(EXPERIMENT, given)
 
 
-def run(options: Collect) -> None:
+def collect_games(options: Collect) -> None:
     """Makes data.
 
     Raises:
@@ -95,23 +95,23 @@ def run(options: Collect) -> None:
             options.longest, options.workers, meter.update,
         )  # fmt: skip
     games = [game for manifest in made for game in manifest["games"]]
-    console.print(scores_table(games))
+    console.print(make_scores_table(games))
     if options.record:
-        results.add(RECORDED, data_name(options.game, transitions), games)
+        results.add(RECORDED, name_data(options.game, transitions), games)
 
 
-def data_name(game: str, transitions: int) -> str:
+def name_data(game: str, transitions: int) -> str:
     """Returns what data of a game are recorded as: its name, where there are as many as usual."""
     usual = transitions == presets.transitions(game)
     return game if usual else f"{game}, {transitions:,} transitions"
 
 
-def game_of(name: str) -> str:
-    """Returns the game of data that `data_name` calls so."""
+def parse_game(name: str) -> str:
+    """Returns the game of data that `name_data` calls so."""
     return name.partition(",")[0]
 
 
-def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
+def make_scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
     """What demonstrators have reached, by how often they act at random."""
     table = Table("random actions", "games", "transitions", "mean score", "least", "most")
     for noise in sorted({game["noise"] for game in games}):

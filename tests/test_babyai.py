@@ -25,7 +25,7 @@ from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
 DOMAIN = BABYAI.make(LEVEL, Settings())
-MINE = storage.dataset_id(DOMAIN, 6, 0)
+MINE = storage.name_dataset(DOMAIN, 6, 0)
 SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
 FIELDS = (
     "experiment domain level method preset seed demos episodes successes mean_return mean_length "
@@ -296,7 +296,7 @@ def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, cap
     assert babyai.main(arguments) == 0
     specification = only_folder(tmp_path / "runs") / "specification.json"
     specification.write_text(before := specification.read_text() + "\n")
-    monkeypatch.setattr(pretrained, "identity", lambda specification: "of another version")
+    monkeypatch.setattr(pretrained, "describe_identity", lambda specification: "of another version")
     assert babyai.main(arguments) == 2
     assert "is of another configuration" in capsys.readouterr().err
     assert specification.read_text() == before

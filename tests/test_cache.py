@@ -9,7 +9,7 @@ import pytest
 
 import leapjax as leap
 from leapjax import methods
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError

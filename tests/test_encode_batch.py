@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domains.babyai import repeats
 from leapjax.domains.babyai.encoders import state_tokens
 from leapjax.methods import find_method

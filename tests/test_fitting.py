@@ -9,7 +9,7 @@ import pytest
 
 import leapjax as leap
 from leapjax import fitting, pretrained
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import specify
 from leapjax.domain import Demonstrations
 from leapjax.models.trajectory import ModelConfig

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from leapjax import batching, planners, rollouts, sharding, training
 from leapjax.agents import leap
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domains.babyai.domain import BABYAI

@@ -8,7 +8,7 @@ from PIL import Image
 
 from experiments import star_animation, stars
 from experiments.common import searches
-from leapjax.agents.learning import Setup
+from leapjax.agents.base import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.stars import graphs

@@ -5,7 +5,7 @@ from types import MappingProxyType
 from typing import Any
 
 from leapjax.agents import leap
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import AnyConfig, Config
 from leapjax.methods import find_method
 from leapjax.models.trajectory import ModelConfig

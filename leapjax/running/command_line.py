@@ -61,11 +61,11 @@ def parse(
     """
     shell.check_values(arguments)
     choice, others = choose(kind, arguments)
-    data = storage.described(choice.demonstrations) if choice.demonstrations else Described()
+    data = storage.describe_dataset(choice.demonstrations) if choice.demonstrations else Described()
     methods = choose_methods(choice)
     configs = []
     for level in choose_levels(domain, choice, data):
-        folder = pretrained.published(level) if choice.pretrained else choice.checkpoint
+        folder = pretrained.find_published(level) if choice.pretrained else choice.checkpoint
         trained = pretrained.read_specification(folder) if folder else None
         for method in methods or [trained.method if trained else Config.method]:
             default = make_default(kind, domain, level, method, choice, data, trained)

@@ -11,7 +11,7 @@ import numpy as np
 
 from leapjax import files, processes
 from leapjax.data import seeds, storage
-from leapjax.data.storage import reasons
+from leapjax.data.storage import describe_dropped
 from leapjax.domain import Domain, Source
 from leapjax.environments import judge_episode
 from leapjax.errors import UserError
@@ -37,13 +37,13 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     source = storage.find_source(run.domain, config.demos, run.seed)
     name = config.demonstrations or source.default
     begun = time.perf_counter()
-    if config.demonstrations is None and processes.first_does(lambda: not source.exists(name)):
+    if config.demonstrations is None and processes.run_on_first(lambda: not source.exists(name)):
         if run.domain.scaling.measure is None:  # the network needs to know nothing of the data
             run.programs.begin(run)
-        processes.first_does(lambda: _make(run, source, name))
+        processes.run_on_first(lambda: _make(run, source, name))
     # Each process reads for itself: the data need not be on one shared disk.
-    loaded = processes.together(lambda: source.load(name, run.seed))
-    data, dropped = loaded.demonstrations[: config.demos], reasons(loaded)
+    loaded = processes.run_together(lambda: source.load(name, run.seed))
+    data, dropped = loaded.demonstrations[: config.demos], describe_dropped(loaded)
     run.seconds["demos"] += time.perf_counter() - begun
     if dropped:
         run.console.print(f"{len(data)} episodes of {name}; dropped: {dropped}", highlight=False)
@@ -121,7 +121,7 @@ def check_data(
             )
         return None
 
-    processes.first_does(check)
+    processes.run_on_first(check)
 
 
 def find_demonstrated(folder: Path) -> list[int]:

@@ -54,7 +54,7 @@ class Interruption:
             raise Interrupted(self._number)
 
     @contextlib.contextmanager
-    def deferred(self) -> Iterator[None]:
+    def defer_signals(self) -> Iterator[None]:
         """Inside, a signal waits: look at `requested`. At the end it is raised."""
         self.check()
         self._deferred = True

@@ -7,7 +7,7 @@ import jax
 
 from leapjax import checkpoints, pretrained
 from leapjax.checks import check_integer, check_number
-from leapjax.configuration import AnyConfig, episode_seeds, make_domain, specify
+from leapjax.configuration import AnyConfig, choose_episode_seeds, make_domain, specify
 from leapjax.data import seeds, storage
 from leapjax.domain import Domain
 from leapjax.errors import UserError
@@ -35,7 +35,7 @@ def check(config: AnyConfig) -> None:
             "needs demonstrations to train on, and a method that learns nothing has none by default"
         )
     check_seeds(config.seeds)
-    episode_seeds(config)
+    choose_episode_seeds(config)
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
     loggers.check(config.loggers)
@@ -48,7 +48,9 @@ def check(config: AnyConfig) -> None:
     checkpoints.check_path(config.runs)
     if config.play is not None and config.checkpoint is None:
         raise UserError("--play: another level is played with a --checkpoint, and there is none")
-    recorded = storage.described(config.demonstrations).level if config.demonstrations else None
+    recorded = (
+        storage.describe_dataset(config.demonstrations).level if config.demonstrations else None
+    )
     # `module:id` is an environment that a module registers; data know it by its id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
@@ -58,7 +60,9 @@ def check(config: AnyConfig) -> None:
     domain = make_domain(config)
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.demonstrations.collect is None and domain.demonstrations.source is None:
-        raise UserError(f"{storage.no_demonstrator(domain)} ({config.flag('demonstrations')})")
+        raise UserError(
+            f"{storage.explain_no_demonstrator(domain)} ({config.flag('demonstrations')})"
+        )
     if config.rules and domain.rules is None:
         raise UserError(f"--rules: {config.level} has no rules that are written as an energy")
     if config.planner.horizon > domain.max_steps:

@@ -69,7 +69,7 @@ def check_figure(path: Path) -> None:
 def save(figure: Figure, path: Path) -> None:
     """Writes a figure, atomically, and lets go of it."""
     try:
-        with files.whole(path) as scratch:
+        with files.write_whole(path) as scratch:
             figure.savefig(scratch, dpi=120)
     finally:
         plt.close(figure)

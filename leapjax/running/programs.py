@@ -9,7 +9,7 @@ import jax
 from jax.sharding import Mesh
 
 from leapjax import pretrained, sharding, training
-from leapjax.agents import learning
+from leapjax.agents.batches import make_blank_steps
 from leapjax.batching import CompiledPlanner, compile_planner
 from leapjax.configuration import AnyConfig
 from leapjax.errors import UserError
@@ -69,7 +69,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
     plan = compile_planner(
         agent.energy, config.planner, choose_chunk_sizes(config), encode_next=agent.encode_next
     )
-    like = learning.blank_steps(domain) if config.demos else ()
+    like = make_blank_steps(domain) if config.demos else ()
     state = jax.eval_shape(agent.init, jax.random.key(0))
     memory.check_state(state)
 
@@ -113,7 +113,7 @@ def make_mesh(config: AnyConfig) -> Mesh:
         UserError: they cannot share the batch.
     """
     try:
-        examples = config.training.batch // config.training.run
+        examples = config.training.batch // config.training.consecutive
         return sharding.make_mesh(examples, jax.devices(), config.cluster.fsdp)
     except ValueError as error:
         raise UserError(f"--batch, --fsdp: {error}") from None

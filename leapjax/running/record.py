@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from leapjax import processes, scores
-from leapjax.configuration import resolved
+from leapjax.configuration import list_settings
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
 from leapjax.running import plots, results
@@ -42,14 +42,14 @@ def record(
                 experiment.animate(planner, run, run.played[:3], folder / "plan.gif")
             run.console.print(f"pictures: {folder}", highlight=False)
 
-    processes.first_does(write)
+    processes.run_on_first(write)
     run.console.print(results.summarize(row))
     return row
 
 
 def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
     """The JSON row of a finished run."""
-    config, lengths = run.config, episodes.lengths
+    config, paper, lengths = run.config, run.experiment.paper, episodes.lengths
     return {
         "experiment": run.experiment.name,
         "domain": config.domain,
@@ -78,11 +78,11 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
         "plans": episodes.plans,
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
-        "paper_success": run.experiment.paper(config.level, config.method),
+        "paper_success": paper and paper(config.level, config.method),
         **describe_success(run),
         "date": results.format_date(),
         "hash": run.name,
-        "configuration": resolved(config, run.seed),
+        "configuration": list_settings(config, run.seed),
     }
 
 

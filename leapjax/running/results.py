@@ -19,7 +19,7 @@ from rich.table import Table
 from leapjax import compilation, scores
 from leapjax.checks import LARGEST_SEED
 from leapjax.errors import UserError, first_line
-from leapjax.files import only_process_in, read_text, whole, write_text
+from leapjax.files import lock_folder, read_text, write_text, write_whole
 from leapjax.rollouts import Episodes
 from leapjax.running import jax_setup
 from leapjax.running.schema import (
@@ -161,7 +161,7 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
             json.dumps(value, allow_nan=False)
         except ValueError:
             raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
-    with only_process_in(path.parent, wait=True):
+    with lock_folder(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
         # First, so that a process killed in between leaves episodes without a row, which the next
         # one drops, and no row without its episodes.
@@ -177,7 +177,7 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
 
 def change(path: Path, changed: Callable[[Any], Any]) -> Any:
     """Rewrites a JSON file as what becomes of it, None where there is none, atomically."""
-    with only_process_in(path.parent, wait=True):
+    with lock_folder(path.parent, wait=True):
         found = changed(read_json(path) if path.exists() else None)
         write_text(path, json.dumps(found, indent=1) + "\n")
     return found
@@ -234,7 +234,7 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
 def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
     # An array a row: where a row is added, git stores the new one and shares the others.
     arrays: Any = tables  # NumPy's stubs take the arrays for its other arguments
-    with whole(path) as scratch:
+    with write_whole(path) as scratch:
         np.savez_compressed(scratch, **arrays)
 
 

@@ -39,7 +39,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         Interrupted: the run was asked to stop; its newest state is saved.
     """
     run = learn_statistics(run, data)
-    processes.first_does(lambda: run.opened.enter_context(files.only_process_in(run.folder)))
+    processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
     steps: Any = (
@@ -55,11 +55,13 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         jax.block_until_ready(step.draw(key, state.step, steps))
     run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
-    processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
-    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
+    processes.run_on_first(lambda: files.check_room(folder, 3 * size))  # two and the next
+    saved = Checkpoints(
+        folder / pretrained.CHECKPOINTS, pretrained.describe_identity(run.specification)
+    )
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
     # Not before: what does not fit the run that is there leaves it as it is.
-    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
+    processes.run_on_first(lambda: pretrained.save_specification(folder, run.specification))
     metrics: Metrics = []
     if restored is not None:
         state = restored
@@ -71,7 +73,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     before = metrics[-1]["seconds"] if metrics else 0.0
     begun = last_saved = time.perf_counter()
     with (
-        run.interruption.deferred(),
+        run.interruption.defer_signals(),
         contextlib.closing(saved),
         Meter(console, "training", total, int(state.step)) as meter,
     ):
@@ -89,7 +91,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
             for number in filter(None, signals):
                 run.interruption.adopt(number)
             if done == total or any(signals) or any(dues):
-                processes.first_does(lambda: write_metrics(folder, metrics))
+                processes.run_on_first(lambda: write_metrics(folder, metrics))
                 saved.save(now)
                 last_saved = time.perf_counter()
             return any(signals)

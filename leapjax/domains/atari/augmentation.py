@@ -1,4 +1,4 @@
-"""More windows from the same games: in a mirror, and moved by a few pixels."""
+"""More windows from the same games: in a mirror."""
 
 from collections.abc import Sequence
 
@@ -38,18 +38,3 @@ def reflect(frames: jax.Array, mirror: Mirror) -> jax.Array:
     part = (..., slice(*mirror.rows), slice(*mirror.columns))
     frames = jnp.asarray(frames)
     return frames.at[part].set(jnp.flip(frames[part], mirror.axis - 2))
-
-
-def shifted(key: jax.Array, window: Window, most: int) -> Window:
-    """A window whose frames are all moved by the same few pixels (Kostrikov et al., DrQ, 2020)."""
-    corner = jax.random.randint(key, (2,), 0, 2 * most + 1)
-
-    def move(frames: jax.Array) -> jax.Array:
-        around = [(0, 0)] * (frames.ndim - 2) + [(most, most)] * 2
-        wide = jnp.pad(frames, around, mode="edge")
-        start = [jnp.int32(0)] * (frames.ndim - 2) + [corner[0], corner[1]]
-        return jax.lax.dynamic_slice(wide, start, frames.shape)
-
-    context = window.context
-    moved = context._replace(observation=move(context.observation), past=move(context.past))
-    return window._replace(context=moved)

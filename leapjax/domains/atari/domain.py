@@ -19,7 +19,7 @@ from leapjax.domain import (
     Source,
 )
 from leapjax.domains.atari import replay
-from leapjax.domains.atari.augmentation import mirror_window, shifted
+from leapjax.domains.atari.augmentation import mirror_window
 from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
 from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.environments import Adapter
@@ -45,7 +45,6 @@ class Settings:
         max_steps: Decisions after which a game is cut off.
         features: Features of the first convolution; the others have twice as many.
         mirror: Mirror every other training window, left and right exchanged.
-        shift: Pixels by which all frames of a training window may be shifted at random, at most.
     """
 
     transitions: int = 50_000
@@ -54,7 +53,6 @@ class Settings:
     max_steps: int = MAX_STEPS
     features: int = 32
     mirror: bool = False
-    shift: int = 0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -62,7 +60,6 @@ class Settings:
         check_at_least(self, 1, "dqn_seed", most=MAX_TRAINING_SEED)  # each has games of its own
         check_at_least(self, 1, "features", most=10_000)
         check_at_least(self, 1, "max_steps", most=MOST_STEPS)
-        check_at_least(self, 0, "shift", most=WIDTH - 1)
         check_within(self, 0, 1, "sticky")
 
 
@@ -90,7 +87,6 @@ def make(name: str, settings: Settings) -> Domain:
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 
     mirror = functools.partial(mirror_window, mirror=game.mirror, actions=game.actions)
-    shift = functools.partial(shifted, most=settings.shift)
     return Domain(
         level=name,
         make_adapter=make_adapter,
@@ -99,7 +95,7 @@ def make(name: str, settings: Settings) -> Domain:
         blank=np.zeros((HEIGHT, WIDTH), np.uint8),
         encoders={"paper": state_tokens, "leapjax": current_tokens},
         demonstrations=Demonstrations(source=make_source(game, settings)),
-        augmentations=Augmentations([mirror] * settings.mirror + [shift] * (settings.shift > 0)),
+        augmentations=Augmentations([mirror] * settings.mirror),
         scaling=Scaling(returns=game.return_scale),
         signature={"actions": list(game.actions)},
     )

@@ -67,7 +67,7 @@ def collect(
     """
     logs = replay.replay_logs(folder, game, dqn_seed)
     workers = workers or len(os.sched_getaffinity(0))
-    with files.only_process_in(logs):
+    with files.lock_folder(logs):
         _claim(logs)
         files.check_room(logs, transitions * BYTES)
         made = read_manifests(folder, game, dqn_seed, transitions, longest)

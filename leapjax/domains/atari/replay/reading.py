@@ -67,7 +67,7 @@ def read(
         place = cached
         if (place / key).is_dir():
             return load_conversion(place / key)
-    with files.only_process_in(place, wait=True):
+    with files.lock_folder(place, wait=True):
         if not (place / key).is_dir():  # another process may have made it meanwhile
             convert(logs, choose_trajectories(logs, numbers, transitions, seed), game, place / key)
     return load_conversion(place / key)
@@ -84,7 +84,7 @@ def _name_conversion(logs: Path, numbers: list[int], transitions: int, seed: int
 def _find_places(folder: Path) -> tuple[Path, Path]:
     """Returns two folders for conversions: beside the data of a DQN, and in the user's cache."""
     name = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
-    return folder / "leapjax", files.cache_folder() / "dqn-replay" / name
+    return folder / "leapjax", files.find_cache_folder() / "dqn-replay" / name
 
 
 def _is_writable(place: Path) -> bool:

@@ -79,7 +79,7 @@ def _write_part(
 ) -> None:
     """Writes a part of a shard, atomically."""
     with (
-        files.whole(path) as scratch,
+        files.write_whole(path) as scratch,
         scratch.open("wb") as raw,
         gzip.GzipFile("", "wb", _LEVEL, raw, mtime=0) as file,  # the same bytes at any time
     ):
