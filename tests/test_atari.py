@@ -118,14 +118,14 @@ def test_success_is_the_score_of_a_gamer():
 
 def test_a_state_is_the_last_four_frames():
     given = jnp.asarray(frames(6))
-    states = np.asarray(encoders.stacked(given, 6))
+    states = np.asarray(encoders.stack_frames(given, 6))
     assert states.shape == (6, 84, 84, 4)
     for index in range(6):
         for back in range(4):
             expected = given[index - back] if index >= back else np.zeros((84, 84), np.uint8)
             np.testing.assert_array_equal(states[index, :, :, 3 - back], expected)
-    np.testing.assert_array_equal(encoders.stacked(given, 1), states[-1:])
-    np.testing.assert_array_equal(encoders.stacked(given[:2], 1)[0], states[1])
+    np.testing.assert_array_equal(encoders.stack_frames(given, 1), states[-1:])
+    np.testing.assert_array_equal(encoders.stack_frames(given[:2], 1)[0], states[1])
 
 
 @pytest.mark.parametrize("architecture", ["paper", "leapjax"])
@@ -163,7 +163,7 @@ def test_as_many_states_are_encoded_while_playing_as_the_tables_say(name, past):
 def test_without_a_past_the_whole_frame_has_changed():
     context = window(8, context=0).context
     assert context.past.shape == (0, 84, 84)
-    shown = encoders.changes(encoders.stacked(encoders.seen(context), 1))[0]
+    shown = encoders.compute_changes(encoders.stack_frames(encoders.join_frames(context), 1))[0]
     np.testing.assert_array_equal(shown[..., 1:3], 0)
     np.testing.assert_allclose(shown[..., 3], encoders.CHANGES * shown[..., 0], rtol=1e-5)
     encoder = domain.make("Seaquest", domain.Settings()).encoders["leapjax"](MODEL, 0)
@@ -181,7 +181,7 @@ def test_every_other_window_is_in_a_mirror(name):
     context = drawn.context._replace(observation=past[-1], past=past[:-1], actions=ids)
     drawn = drawn._replace(context=context, actions=ids[::-1])
     show = jax.jit(
-        functools.partial(augmentation.mirrored, mirror=game.mirror, actions=game.actions)
+        functools.partial(augmentation.mirror_window, mirror=game.mirror, actions=game.actions)
     )
     shown = [show(jax.random.key(seed), drawn) for seed in range(40)]
     as_played = [bool((each.actions == drawn.actions).all()) for each in shown]

@@ -102,7 +102,7 @@ def check_labels(states: Graph, where: str, labels: int) -> None:
     """Checks that the labels of nodes are in range.
 
     Raises:
-        UserError: one is not.
+        UserError: a label is out of range.
     """
     for field, values in states._asdict().items():
         check_range(f"{where}: {field}", values, 0, labels - 1)
