@@ -28,7 +28,7 @@ from leapjax.domains.atari.emulator import Emulator
 from leapjax.domains.atari.games import GAMES
 from leapjax.environments import Eager
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Origin
 from leapjax.types import Demonstration, Energy

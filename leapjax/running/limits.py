@@ -11,7 +11,7 @@ from leapjax.configuration import AnyConfig, choose_episode_seeds, make_domain, 
 from leapjax.data import seeds, storage
 from leapjax.domain import Domain
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
