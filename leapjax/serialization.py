@@ -45,7 +45,10 @@ def from_json(kind: type[T], values: Any, **types_of: type) -> T:
     needed = {n for n, f in fields.items() if f.default is f.default_factory is nothing}
     odd = sorted((values.keys() - fields.keys()) | (needed - values.keys()))
     if odd:
-        raise UserError(f"{kind.__name__}: missing or unknown {', '.join(odd)}")
+        raise UserError(
+            f"{kind.__name__}: missing or unknown {', '.join(odd)}: expected what this version of "
+            "leapjax writes; read it with the version that wrote it, or train again"
+        )
     converted = {name: _convert(hints[name], value, name) for name, value in values.items()}
     try:
         return kind(**converted)

@@ -93,7 +93,7 @@ def test_the_settings_of_a_row_can_be_read_back():
             fewer = {name: value for name, value in row[group].items() if name != field.name}
             default = dataclasses.replace(settings, **{field.name: field.default})
             assert serialization.from_json(type(settings), fewer) == default
-        with pytest.raises(UserError, match="missing or unknown mood"):
+        with pytest.raises(UserError, match="unknown mood: expected what this version"):
             serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 

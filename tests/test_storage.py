@@ -477,6 +477,17 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
     assert_same(storage.load(NAME, LEVEL).demonstrations, [expected])
 
 
+def test_minigrids_own_observations_need_a_seed(local_demonstrations):
+    states = local_demonstrations[0].observations
+    mission = ["go to it"] * len(states.pose)
+    given = {"image": states.grid, "direction": states.pose[:, 2], "mission": mission}
+    picture = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8)
+    words = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
+    space = gym.spaces.Dict(image=picture, direction=gym.spaces.Discrete(4), mission=words)
+    other_data_set(space, given)
+    assert "can be used, only 1 without the seed of their reset" in refused()
+
+
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
     ids = [storage.name_dataset(LEVEL._replace(level=level.name), 500, 0) for level in known]
