@@ -16,7 +16,7 @@ steps, episodes = (int(given) for given in (sys.argv[1:] + ["600", "20"][len(sys
 
 # Data: somebody's, or of a rule that balances the pole.
 NAME = "mine/cartpole-v0"
-if not storage.exists(NAME):
+if not storage.has_dataset(NAME):
     env = DataCollector(gymnasium.make("CartPole-v1"))
     for seed in range(20):
         (x, speed, angle, turning), _ = env.reset(seed=seed)

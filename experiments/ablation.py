@@ -17,36 +17,36 @@ LEVEL = "GoToObjMazeS4"
 ITERATIONS = 30  # the paper's N of this level
 
 
-def shooting(trained: GibbsConfig) -> ShootingConfig:
+def configure_shooting(trained: GibbsConfig) -> ShootingConfig:
     """The best of 30 random plans."""
     return ShootingConfig(trained.horizon)
 
 
-def cross_entropy(trained: GibbsConfig) -> CrossEntropyConfig:
+def configure_cross_entropy(trained: GibbsConfig) -> CrossEntropyConfig:
     """30 plans in each of as many rounds as the paper's Gibbs sampling has iterations."""
     return CrossEntropyConfig(trained.horizon, ITERATIONS)
 
 
-def gibbs(trained: GibbsConfig) -> GibbsConfig:
+def configure_gibbs(trained: GibbsConfig) -> GibbsConfig:
     """Algorithm 1, with the paper's N."""
     return dataclasses.replace(trained, iterations=ITERATIONS)
 
 
-def confident(trained: GibbsConfig) -> GibbsConfig:
+def configure_confident(trained: GibbsConfig) -> GibbsConfig:
     """One action in each pass, the most certain first."""
     return dataclasses.replace(trained, fill="confident", iterations=trained.horizon)
 
 
-def beams(trained: GibbsConfig) -> BeamConfig:
+def configure_beams(trained: GibbsConfig) -> BeamConfig:
     """Ten beams, from left to right."""
     return BeamConfig(trained.horizon)
 
 
-def _case(name: str, method: str, paper: tuple[float, float, float], *more: Way) -> Case:
+def _make_case(name: str, method: str, paper: tuple[float, float, float], *more: Way) -> Case:
     ways = [
-        Way("random shooting", method, search=shooting, paper=paper[0]),
-        Way("cross-entropy method", method, search=cross_entropy, paper=paper[1]),
-        Way("Gibbs sampling", method, search=gibbs, paper=paper[2]),
+        Way("random shooting", method, search=configure_shooting, paper=paper[0]),
+        Way("cross-entropy method", method, search=configure_cross_entropy, paper=paper[1]),
+        Way("Gibbs sampling", method, search=configure_gibbs, paper=paper[2]),
         *more,
     ]
     return Case(name, [Model(LEVEL)], LEVEL, ways)
@@ -55,12 +55,12 @@ def _case(name: str, method: str, paper: tuple[float, float, float], *more: Way)
 ANALYSIS = Analysis(
     "ablation",
     (
-        _case(
+        _make_case(
             "masked-model", "leap", (23.3, 57.5, 62.5),
-            Way("most certain first", search=confident),
-            Way("beam search", search=beams),
+            Way("most certain first", search=configure_confident),
+            Way("beam search", search=configure_beams),
         ),
-        _case("classifier", "classifier", (25.0, 12.5, 15.5)),
+        _make_case("classifier", "classifier", (25.0, 12.5, 15.5)),
     ),
     timed=True,
 )  # fmt: skip

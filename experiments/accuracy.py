@@ -71,10 +71,10 @@ def report(options: Options) -> None:
             )
     jax_setup.start()
     for run in options.runs:
-        Console(markup=False).print(describe(pretrained.load(run), options, run.name))
+        Console(markup=False).print(make_table(pretrained.load(run), options, run.name))
 
 
-def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
+def load_learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
     """Some demonstrations that a run has learned from."""
     count = min(count, origin.demos)
     source = domain.demonstrations.source
@@ -86,7 +86,7 @@ def learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstratio
     return _collect(domain, count, origin.seed)
 
 
-def others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
+def collect_others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
     """As many of the domain's demonstrator, of another training seed."""
     last = seeds.MAX_TRAINING_SEED - 1
     return _collect(domain, min(count, origin.demos), last - (origin.seed == last))
@@ -98,26 +98,29 @@ def _collect(domain: Domain, count: int, seed: int) -> Sequence[Demonstration]:
     return collect(count, seed, lambda done: None).demonstrations
 
 
-def describe(planner: Pretrained, options: Options, title: str) -> Table:
+def make_table(planner: Pretrained, options: Options, title: str) -> Table:
     """Accuracy by position, of both kinds of demonstrations."""
     specification = planner.specification
     domain, origin = pretrained.make_domain(specification), specification.origin
-    kinds = learned(domain, origin, options.demos), others(domain, origin, options.demos)
-    columns = [accuracy(planner, data, options.samples) for data in kinds]
+    kinds = (
+        load_learned(domain, origin, options.demos),
+        collect_others(domain, origin, options.demos),
+    )
+    columns = [count_hits(planner, data, options.samples) for data in kinds]
     table = Table("position in the plan", "learned from", "others", title=title)
     for position in range(specification.planner.horizon):
-        shares = (_share(right[position], asked[position]) for right, asked in columns)
+        shares = (_format_share(right[position], asked[position]) for right, asked in columns)
         table.add_row(str(position + 1), *shares)
     table.add_section()
-    table.add_row("all", *(_share(right.sum(), asked.sum()) for right, asked in columns))
+    table.add_row("all", *(_format_share(right.sum(), asked.sum()) for right, asked in columns))
     return table
 
 
-def _share(right: int, asked: int) -> str:
+def _format_share(right: int, asked: int) -> str:
     return f"{right / asked:.1%}" if asked else "-"
 
 
-def accuracy(
+def count_hits(
     planner: Pretrained, data: Sequence[Demonstration], samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many actions the model finds most likely, of how many: `[T]` each, by position.
@@ -137,7 +140,7 @@ def accuracy(
         def one(start: jax.Array) -> tuple[jax.Array, jax.Array]:
             horizon = specification.planner.horizon
             window = windows.window(steps, start, specification.context, horizon, end)
-            return hits(planner.energy, params, window, specification.method_settings.end)
+            return find_hits(planner.energy, params, window, specification.method_settings.end)
 
         right, asked = jax.lax.map(one, starts, batch_size=TOGETHER)
         return right.sum(axis=0), asked.sum(axis=0)
@@ -146,7 +149,9 @@ def accuracy(
     return right, asked
 
 
-def hits(energy: Energy, params: Params, window: Window, end: bool) -> tuple[jax.Array, jax.Array]:
+def find_hits(
+    energy: Energy, params: Params, window: Window, end: bool
+) -> tuple[jax.Array, jax.Array]:
     """Whether each action is the likeliest, given those before it and MASK after it.
 
     After the end action there is nothing to predict but more of it: those do not count.

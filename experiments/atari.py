@@ -42,8 +42,8 @@ class Collect:
         transitions: Transitions to make at least, in whole games; None for as many as preset
             leapjax learns from.
         folder: Folder for the data; if games were begun there, they are continued.
-        replay_run: Number of the run, as DQN-Replay has five of each game; each has games of its
-            own.
+        dqn_seed: Number of the data, from 1, as DQN-Replay has the games of DQNs of five seeds;
+            each has games of its own.
         longest: Decisions after which a game is cut off, because a ball can fly on for ever.
         workers: Processes; None for one on each core.
         record: Write the scores of the demonstrators to results/, which is committed.
@@ -52,7 +52,7 @@ class Collect:
     game: str
     transitions: int | None = None
     folder: Path = Path(FOLDER)
-    replay_run: int = 1
+    dqn_seed: int = 1
     longest: int = LONGEST
     workers: int | None = None
     record: bool = False
@@ -64,25 +64,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[:1] == ["collect"]:
         options = shell.parse(Collect, "experiments.atari collect", given[1:])
         return shell.run_interruptible_program(
-            f"experiments.{EXPERIMENT.name}", given, lambda _: run(options)
+            f"experiments.{EXPERIMENT.name}", given, lambda _: collect_games(options)
         )
     return running.main(EXPERIMENT, given)
 
 
-def run(options: Collect) -> None:
+def collect_games(options: Collect) -> None:
     """Makes data.
 
     Raises:
         UserError: an unknown game, numbers that cannot be, or data that are not to be recorded.
     """
-    for name in ("transitions", "replay_run", "longest", "workers"):
+    for name in ("transitions", "dqn_seed", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    Settings(replay_run=options.replay_run, max_steps=options.longest)  # raises above their ranges
+    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises above their ranges
     memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
-    if options.record and (options.replay_run, options.longest) != (1, LONGEST):
+    if options.record and (options.dqn_seed, options.longest) != (1, LONGEST):
         raise UserError(
-            f"--record is for data that are learned from: --replay-run 1, --longest {LONGEST}"
+            f"--record is for data that are learned from: --dqn-seed 1, --longest {LONGEST}"
         )
     make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
     from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (ale-py is optional)
@@ -91,27 +91,27 @@ def run(options: Collect) -> None:
     transitions = options.transitions or presets.transitions(options.game)
     with Meter(console, "transitions", transitions) as meter:
         made = collect(
-            options.folder, find_game(options.game), transitions, options.replay_run,
+            options.folder, find_game(options.game), transitions, options.dqn_seed,
             options.longest, options.workers, meter.update,
         )  # fmt: skip
     games = [game for manifest in made for game in manifest["games"]]
-    console.print(scores_table(games))
+    console.print(make_scores_table(games))
     if options.record:
-        results.add(RECORDED, data_name(options.game, transitions), games)
+        results.add(RECORDED, name_data(options.game, transitions), games)
 
 
-def data_name(game: str, transitions: int) -> str:
+def name_data(game: str, transitions: int) -> str:
     """Returns what data of a game are recorded as: its name, where there are as many as usual."""
     usual = transitions == presets.transitions(game)
     return game if usual else f"{game}, {transitions:,} transitions"
 
 
-def game_of(name: str) -> str:
-    """Returns the game of data that `data_name` calls so."""
+def parse_game(name: str) -> str:
+    """Returns the game of data that `name_data` calls so."""
     return name.partition(",")[0]
 
 
-def scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
+def make_scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
     """What demonstrators have reached, by how often they act at random."""
     table = Table("random actions", "games", "transitions", "mean score", "least", "most")
     for noise in sorted({game["noise"] for game in games}):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from experiments.common.episodes import watched
+from experiments.common.episodes import watch_episode
 from experiments.common.pictures import Frame, save_animation
 from leapjax.environments import closing
 from leapjax.pretrained import Pretrained
@@ -29,19 +29,19 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     with closing(run.domain.make_adapter()) as adapter:
         assert isinstance(adapter, AtariAdapter)
         context, executed = planner.specification.context, run.config.executed
-        for event in watched(
+        for event in watch_episode(
             adapter, planner, context, seeds[0], run.seed, executed, MOST_DECISIONS
         ):
             if not isinstance(event, Plan):
                 step += 1
             elif step % SHOWN == 0:
                 plan = np.asarray(event.actions[0])
-                drawn = picture(adapter.frame, plan, actions, adapter.score, title)
+                drawn = draw_picture(adapter.frame, plan, actions, adapter.score, title)
                 frames.append((drawn, STEP_MS))
     save_animation(frames, path)
 
 
-def picture(
+def draw_picture(
     frame: np.ndarray, plan: np.ndarray, actions: Sequence[str], score: float, title: str
 ) -> Image.Image:
     """A frame `[84, 84]`, and the plan `[T]` beside it: the first of its actions is executed."""

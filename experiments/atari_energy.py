@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from scipy import stats
 
-from experiments.accuracy import learned
+from experiments.accuracy import load_learned
 from experiments.common import figures
 from leapjax import pretrained
 from leapjax.data import windows
@@ -76,14 +76,14 @@ def report(options: Options) -> None:
         planner = pretrained.load(checkpoint)
         specification = planner.specification
         domain, origin = pretrained.make_domain(specification), specification.origin
-        each = correlate(planner, learned(domain, origin, origin.demos), options.windows)
+        each = correlate(planner, load_learned(domain, origin, origin.demos), options.windows)
         found = results.add(path, specification.level, each)
         console.print(
             f"{specification.level}: rank correlation {each['correlation']:.2f} of energy "
             f"and reward (p = {each['p_value']:.2g}, {len(each['energies'])} trajectories)"
         )
     picture = options.runs / "atari-energy.png"
-    figures.energy_against_reward(found, picture)
+    figures.draw_energies(found, picture)
     console.print(f"picture: {picture}", highlight=False)
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.babyai_drawing import picture, spelled, way_of
-from experiments.common.episodes import watched
+from experiments.babyai_drawing import draw_picture, find_way, spell_actions
+from experiments.common.episodes import watch_episode
 from experiments.common.pictures import Frame, save_animation
 from leapjax.domains.babyai import levels
 from leapjax.domains.babyai.adapter import ACTIONS, BabyAIAdapter
@@ -25,19 +25,19 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
     level = levels.find_level(run.domain.level)
     frames: list[Frame] = []
     for level_seed in seeds:
-        frames += episode_frames(planner, level, level_seed, run.seed, run.config.executed)
+        frames += draw_episode(planner, level, level_seed, run.seed, run.config.executed)
     save_animation(frames, path)
 
 
-def episode_frames(
+def draw_episode(
     planner: Pretrained, level: Level, level_seed: int, seed: int, executed: int | None = None
 ) -> list[Frame]:
     """The frames of one episode with their durations in milliseconds."""
     with closing(BabyAIAdapter(level)) as adapter:
-        return _frames(adapter, planner, level_seed, seed, executed)
+        return _draw_frames(adapter, planner, level_seed, seed, executed)
 
 
-def _frames(
+def _draw_frames(
     adapter: BabyAIAdapter, planner: Pretrained, level_seed: int, seed: int, executed: int | None
 ) -> list[Frame]:
     frames: list[Frame] = []
@@ -45,15 +45,15 @@ def _frames(
     context = planner.specification.context
     horizon = planner.specification.planner.horizon
     most = MAX_PLANS * min(3, -(-horizon // (executed or horizon)))  # shorter ones, a few more
-    for event in watched(adapter, planner, context, level_seed, seed, executed, most):
+    for event in watch_episode(adapter, planner, context, level_seed, seed, executed, most):
         if isinstance(event, Plan):
             replan += 1
             trace = np.asarray(event.trace[0])
             for iteration in _distinct(trace):
                 which = f"plan {replan}, iteration {iteration + 1} of {len(trace)}"
-                text = f"{which}: {spelled(trace[iteration])}"
-                ways = [way_of(adapter, trace[iteration])]
-                frames.append((picture(adapter, text, ways), REFINE_MS))
+                text = f"{which}: {spell_actions(trace[iteration])}"
+                ways = [find_way(adapter, trace[iteration])]
+                frames.append((draw_picture(adapter, text, ways), REFINE_MS))
             frames[-1] = (frames[-1][0], PAUSE_MS)
             continue
         action, transition = event
@@ -61,7 +61,7 @@ def _frames(
         over = transition.terminated or transition.truncated
         outcome = ("success" if transition.success else "failed") if over else "executing"
         text = f"step {step}: {ACTIONS[action]}; {outcome}"
-        frames.append((picture(adapter, text), PAUSE_MS if over else STEP_MS))
+        frames.append((draw_picture(adapter, text), PAUSE_MS if over else STEP_MS))
     return frames
 
 

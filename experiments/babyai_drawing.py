@@ -18,7 +18,7 @@ GLYPHS = ("L", "R", "F", "pick", "drop", "open", "end", "?")  # of actions, and 
 Colour = tuple[int, int, int]
 
 
-def picture(
+def draw_picture(
     adapter: BabyAIAdapter,
     text: str,
     ways: Sequence[Sequence[Cell]] = (),
@@ -54,12 +54,12 @@ def picture(
     return image
 
 
-def spelled(actions: np.ndarray) -> str:
+def spell_actions(actions: np.ndarray) -> str:
     """A plan `[T]` in short."""
     return " ".join(GLYPHS[int(action)] for action in actions)
 
 
-def way_of(adapter: BabyAIAdapter, actions: np.ndarray) -> list[Cell]:
+def find_way(adapter: BabyAIAdapter, actions: np.ndarray) -> list[Cell]:
     """The cells that a plan leads through, found by playing it on a copy of the level."""
     copied = copy.deepcopy(adapter.env)
     cells = [agent_cell(copied)]

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from experiments.babyai_drawing import picture
+from experiments.babyai_drawing import draw_picture
 from experiments.common.pictures import check_picture, save_sheet
 from leapjax import pretrained, rollouts
 from leapjax.checks import check_integer
@@ -78,13 +78,13 @@ class Recorder(BabyAIAdapter):
     @property
     def tasks(self) -> list[bool]:
         """Which single tasks of the instruction are done by now."""
-        return tasks_done(self.env.instrs)  # type: ignore[attr-defined]
+        return list_tasks_done(self.env.instrs)  # type: ignore[attr-defined]
 
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed."""
         observation = super().reset(seed)
         self.cells = [observations.agent_cell(self.env)]
-        self.detour = detour(self)
+        self.detour = measure_detour(self)
         return observation
 
     def step(self, action: int) -> Transition:
@@ -109,7 +109,7 @@ def report(options: Options) -> None:
     played = seeds.validation_seeds(0, options.episodes)
     if options.gallery is not None:
         check_picture(options.gallery)
-    level = only_level(options.runs, options.executed)
+    level = find_common_level(options.runs, options.executed)
     jax_setup.start()
     recorders: list[Recorder] = []
     successes: list[bool] = []
@@ -119,17 +119,17 @@ def report(options: Options) -> None:
         successes += good
     failed = [r for r, good in zip(recorders, successes, strict=True) if not good]
     console.print(f"{level.name}: {len(failed)} of {len(recorders)} episodes failed")
-    console.print(by_cause(failed))
+    console.print(make_cause_table(failed))
     if any(len(recorder.tasks) > 1 for recorder in recorders):
-        console.print(by_tasks(recorders, failed))
-    console.print(by_detour(recorders, failed))
+        console.print(make_task_table(recorders, failed))
+    console.print(make_detour_table(recorders, failed))
     if failed and options.drawn > 0:
         path = options.gallery or options.runs[0] / "failures.png"
-        draw(failed[: options.drawn], path)
+        draw_gallery(failed[: options.drawn], path)
         console.print(f"gallery: {path}", highlight=False)
 
 
-def only_level(runs: Sequence[Path], executed: int | None) -> Level:
+def find_common_level(runs: Sequence[Path], executed: int | None) -> Level:
     """The level of all of these runs.
 
     Raises:
@@ -164,7 +164,7 @@ def play(
     return recorders, episodes.successes.tolist()
 
 
-def detour(adapter: BabyAIAdapter) -> int | None:
+def measure_detour(adapter: BabyAIAdapter) -> int | None:
     """Cells that the shortest free way is longer than the straight one; None: no way, no goal."""
     start, goal = observations.agent_cell(adapter.env), adapter.goal
     if goal == observations.NO_GOAL:
@@ -175,7 +175,7 @@ def detour(adapter: BabyAIAdapter) -> int | None:
     return length - abs(start[0] - goal[0]) - abs(start[1] - goal[1])
 
 
-def cause(recorder: Recorder) -> Cause:
+def find_cause(recorder: Recorder) -> Cause:
     """Why an episode failed."""
     last, cells = recorder.last, recorder.cells
     if last is not None and last.terminated:
@@ -187,7 +187,7 @@ def cause(recorder: Recorder) -> Cause:
     return Cause.CIRCLES if len(set(cells[len(cells) // 2 :])) <= FEW_CELLS else Cause.WANDERS
 
 
-def tasks_done(instruction: Instr) -> list[bool]:
+def list_tasks_done(instruction: Instr) -> list[bool]:
     """Which single tasks of an instruction are done, in its order.
 
     A task that is the whole instruction never counts as done: its success ends the episode.
@@ -202,9 +202,9 @@ def tasks_done(instruction: Instr) -> list[bool]:
     return visit(instruction, False)
 
 
-def by_cause(failed: Sequence[Recorder]) -> Table:
+def make_cause_table(failed: Sequence[Recorder]) -> Table:
     """Failures by what happened."""
-    counts = Counter(cause(recorder) for recorder in failed)
+    counts = Counter(find_cause(recorder) for recorder in failed)
     result = Table("what happened", "episodes")
     for each in Cause:
         if counts[each]:
@@ -212,7 +212,7 @@ def by_cause(failed: Sequence[Recorder]) -> Table:
     return result
 
 
-def by_tasks(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
+def make_task_table(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
     """Failures by how many tasks the instruction has, and how many of them were done."""
     totals = Counter(len(r.tasks) for r in played)
     failures = Counter((len(done), sum(done)) for done in (r.tasks for r in failed))
@@ -225,7 +225,7 @@ def by_tasks(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
     return result
 
 
-def by_detour(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
+def make_detour_table(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
     """Failures by how much longer than straight the shortest free way is."""
     totals, failures = (Counter(r.detour for r in some) for some in (played, failed))
     result = Table("detour (cells)", "episodes", "failed")
@@ -236,14 +236,15 @@ def by_detour(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
     return result
 
 
-def draw(failed: Sequence[Recorder], path: Path) -> None:
+def draw_gallery(failed: Sequence[Recorder], path: Path) -> None:
     """How each episode ended, with all of its way.
 
     Raises:
         UserError: the picture cannot be written.
     """
     pictures = [
-        picture(r, f"{len(r.cells) - 1} steps: {cause(r).value}", [r.cells]) for r in failed
+        draw_picture(r, f"{len(r.cells) - 1} steps: {find_cause(r).value}", [r.cells])
+        for r in failed
     ]
     save_sheet(pictures, COLUMNS, path)
 

@@ -105,14 +105,14 @@ def report(options: Options, interruption: Interruption) -> None:
             EXPERIMENT, config, options.seed, console, interruption, played, plays=False
         )
         with opened as this:
-            found.append(landscape(this, options.trajectories))
-    console.print(table(found))
-    keep(folder / RESULTS, found)
-    figures.landscape(found, options.runs / "landscape.png")
+            found.append(measure_landscape(this, options.trajectories))
+    console.print(make_table(found))
+    keep_measurements(folder / RESULTS, found)
+    figures.draw_landscape(found, options.runs / "landscape.png")
     console.print(f"picture: {options.runs / 'landscape.png'}", highlight=False)
 
 
-def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
+def keep_measurements(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
     """Adds what was found to a file, in the place of others of the same level, preset and seed."""
 
     def name(each: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -124,13 +124,13 @@ def keep(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
     results.change(path, changed)
 
 
-def landscape(this: Run, count: int) -> dict[str, Any]:
+def measure_landscape(this: Run, count: int) -> dict[str, Any]:
     """One training, watched; and plans of what was learned."""
-    firsts = beginnings(this, count)
+    firsts = collect_beginnings(this, count)
     end = this.domain.num_actions - 1
 
     def measure(energy: Energy, params: Params) -> dict[str, float]:
-        found = {n: mean_energy(energy, params, firsts, n / 100, end) for n in CORRUPTED}
+        found = {n: compute_mean_energy(energy, params, firsts, n / 100, end) for n in CORRUPTED}
         return {f"random_{share}": float(mean) for share, mean in found.items()}
 
     planner = train(this, load_demonstrations(this), measure)
@@ -145,13 +145,13 @@ def landscape(this: Run, count: int) -> dict[str, Any]:
         "seed": this.seed,
         "trajectories": count,
         "training": watched,
-        "planning": refinement(planner, firsts.context),
+        "planning": measure_refinement(planner, firsts.context),
         "versions": results.find_versions(),
         "date": results.format_date(),
     }
 
 
-def beginnings(this: Run, count: int) -> Window:
+def collect_beginnings(this: Run, count: int) -> Window:
     """The beginnings `[B]` of demonstrations of another training seed.
 
     Of those that are as long as a plan: to some models the end of an episode is no action.
@@ -161,7 +161,7 @@ def beginnings(this: Run, count: int) -> Window:
     """
     domain, specification = this.domain, this.specification
     horizon = specification.planner.horizon
-    data = accuracy.others(domain, specification.origin, count)
+    data = accuracy.collect_others(domain, specification.origin, count)
     data = [each for each in data if len(each.actions) >= horizon]
     if not data:
         raise UserError(
@@ -175,7 +175,7 @@ def beginnings(this: Run, count: int) -> Window:
     )(steps.starts)
 
 
-def corrupted(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax.Array:
+def corrupt_actions(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax.Array:
     """Actions `[T]`, each random with a probability, but never the end action.
 
     Where a demonstration goes on, the end is not one of its actions.
@@ -186,19 +186,19 @@ def corrupted(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax
 
 
 @functools.partial(jax.jit, static_argnames=("energy", "end"))
-def mean_energy(
+def compute_mean_energy(
     energy: Energy, params: Params, begins: Window, share: float, end: int
 ) -> jax.Array:
     """The mean energy `[]` of what was done in windows `[B]`, a share of it replaced at random."""
 
     def one(place: jax.Array, window: Window) -> jax.Array:
-        actions = corrupted(jax.random.key(place), window.actions, share, end)
+        actions = corrupt_actions(jax.random.key(place), window.actions, share, end)
         return energy.total(params, energy.encode(params, window.context), actions)
 
     return jax.vmap(one)(jnp.arange(len(begins.actions)), begins).mean()
 
 
-def refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
+def measure_refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
     """The energy of plans after every iteration, with the paper's N: their mean, and some.
 
     Plans of what demonstrations began with, so that their energies compare.
@@ -216,7 +216,7 @@ def refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
     }
 
 
-def table(found: Sequence[dict[str, Any]]) -> Table:
+def make_table(found: Sequence[dict[str, Any]]) -> Table:
     """Energies at the end of training, for a terminal."""
     names = [f"{share}% random" for share in CORRUPTED]
     shown = Table("level", "preset", *names, "plans, N = 1", "last")

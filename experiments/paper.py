@@ -12,11 +12,11 @@ SUCCESS = {
 }
 
 
-def paper_success(level: str) -> dict[str, float]:
+def list_success(level: str) -> dict[str, float]:
     """The paper's success rates on a level, in percent, by method; of other levels none."""
     return dict(zip(METHODS, SUCCESS.get(level, ()), strict=False))
 
 
 def find_success(level: str, method: str) -> float | None:
     """The paper's success rate of a method on a level, in percent; None where it has none."""
-    return paper_success(level).get(method)
+    return list_success(level).get(method)

@@ -16,22 +16,22 @@ from minigrid.core.world_object import WorldObj
 
 from experiments.augmentation import augment
 from experiments.common import cases
-from experiments.common.cases import Analysis, Case, Model, Way, alone, drawn_at
+from experiments.common.cases import Analysis, Case, Model, Way, alone, draw_at
 from leapjax.configuration import AnyConfig, change
 from leapjax.domains.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.domains.babyai.constraints import (
+    count_revisits,
     goal_before_visit,
-    half_of_obstacles,
+    hide_half_of_obstacles,
+    hide_lava,
+    hide_marks,
+    hide_open_doors,
     immediate_lava,
     lava,
     left_turns,
-    revisits,
+    replace_pick_up,
     steps_to_visit,
-    told_to_go,
     turns_over,
-    without_lava,
-    without_marks,
-    without_open_doors,
 )
 from leapjax.domains.babyai.levels import find_level
 from leapjax.domains.babyai.observations import Observation
@@ -52,12 +52,12 @@ AGAIN = 16.0  # nats for each time that the agent was before where it comes to
 PICKUP = ACTIONS.index("pickup")
 
 
-def longer(config: AnyConfig) -> AnyConfig:
+def train_longer(config: AnyConfig) -> AnyConfig:
     """Trains every method longer, where one of them has more to learn."""
     return change(config, training={"steps": 3000})
 
 
-def with_false_starts(config: AnyConfig) -> AnyConfig:
+def add_false_starts(config: AnyConfig) -> AnyConfig:
     """Shows LEAP where beginnings lead that no demonstration has: a constraint asks for such ones.
 
     A plan of one action has no beginning that others could follow.
@@ -65,7 +65,7 @@ def with_false_starts(config: AnyConfig) -> AnyConfig:
     return augment(config, false_starts=0.6) if config.method == "leap" else config
 
 
-def with_detours(config: AnyConfig) -> AnyConfig:
+def add_detours(config: AnyConfig) -> AnyConfig:
     """Shows ways around things, which demonstrations of empty rooms never have.
 
     IQL learns from transitions: nobody goes around anything in one step.
@@ -75,31 +75,31 @@ def with_detours(config: AnyConfig) -> AnyConfig:
     return augment(config, detours=0.5, lookalikes=True)
 
 
-def in_room(config: AnyConfig) -> AnyConfig:
+def learn_in_room(config: AnyConfig) -> AnyConfig:
     """Learns in an empty room for levels with obstacles and constraints."""
-    return longer(with_detours(with_false_starts(config)))
+    return train_longer(add_detours(add_false_starts(config)))
 
 
-def in_maze(config: AnyConfig) -> AnyConfig:
+def learn_in_maze(config: AnyConfig) -> AnyConfig:
     """Learns in a maze for levels with constraints."""
-    return longer(with_false_starts(config))
+    return train_longer(add_false_starts(config))
 
 
-def among_objects(config: AnyConfig) -> AnyConfig:
+def learn_among_objects(config: AnyConfig) -> AnyConfig:
     """Plans ten actions: a detour around objects is longer than plans in an empty room."""
-    found = in_maze(config)
+    found = learn_in_maze(config)
     if config.method != "leap":
         return found
     return change(found, planner={"horizon": 10, "iterations": 10})
 
 
-def for_maze(config: AnyConfig, sweeps: int) -> AnyConfig:
+def learn_for_maze(config: AnyConfig, sweeps: int) -> AnyConfig:
     """Learns in a room for a maze, whose ways are as long as so many sweeps reach."""
     changed = change(config, domain_settings={"sweeps": sweeps}, training={"steps": 2000})
-    return with_detours(changed)
+    return add_detours(changed)
 
 
-def far_sighted(config: AnyConfig) -> AnyConfig:
+def learn_long_distances(config: AnyConfig) -> AnyConfig:
     """Learns distances as long as the ways in a maze."""
     return change(config, domain_settings={"sweeps": 40})
 
@@ -157,7 +157,7 @@ def _is_marked(cell: WorldObj | None) -> bool:
     return cell is not None and cell.type == "floor"
 
 
-def unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
+def penalise_unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
     """The energy of a model that sees neither lava nor coloured cells, and penalties that do."""
     return functools.partial(_penalised, penalties=penalties, weight=weight)
 
@@ -167,17 +167,17 @@ def _penalised(energies: Sequence[Energy], penalties: Sequence[Penalty], weight:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
         return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
 
-    def sees(context: Context) -> Context:
-        return without_marks(without_lava(context))
+    def hide_obstacles(context: Context) -> Context:
+        return hide_marks(hide_lava(context))
 
-    return constrain(view(energies[0], sees), penalty, partial=True)
+    return constrain(view(energies[0], hide_obstacles), penalty, partial=True)
 
 
 # What judges the next action alone: those that violate anything at once are removed.
-masked = functools.partial(unseen, weight=math.inf)
+masked = functools.partial(penalise_unseen, weight=math.inf)
 
 
-def exploring(minimise: Minimise, handling: bool = False) -> Minimise:
+def penalise_revisits(minimise: Minimise, handling: bool = False) -> Minimise:
     """The same energy, and more for each time that the agent comes where it was (`revisits`)."""
     return functools.partial(_explored, minimise=minimise, nats=AGAIN, handling=handling)
 
@@ -186,41 +186,41 @@ def _explored(
     energies: Sequence[Energy], minimise: Minimise, nats: float, handling: bool
 ) -> Energy:
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return nats * revisits(context, actions, handling)
+        return nats * count_revisits(context, actions, handling)
 
     return constrain(minimise(energies), penalty, partial=True)
 
 
-def left_to_right(trained: GibbsConfig) -> GibbsConfig:
+def fill_left_to_right(trained: GibbsConfig) -> GibbsConfig:
     """Gibbs sampling that fills a plan from its beginning, which a constraint then judges."""
     return dataclasses.replace(trained, fill="sequential", iterations=trained.horizon, resampled=1)
 
 
-def beams(trained: GibbsConfig) -> BeamConfig:
+def search_beams(trained: GibbsConfig) -> BeamConfig:
     """Many beginnings of a plan at once: where what leads to the end first leads away from it."""
     return BeamConfig(horizon=trained.horizon, beams=16)
 
 
 # Where models disagree the likeliest plan leads nowhere: noise leads out of it.
-noisily = drawn_at(2.0)
+noisily = draw_at(2.0)
 # Of what is left where the likeliest action is removed, the likeliest leads to and fro.
-wandering = drawn_at(5.0)
+wandering = draw_at(5.0)
 
 
-def refined(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
+def refine_plan(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
     """Filled from its beginning, and gone over again: what comes later says what is first."""
-    filled = left_to_right(trained)
+    filled = fill_left_to_right(trained)
     return dataclasses.replace(filled, iterations=rounds * filled.iterations)
 
 
-def twice(trained: GibbsConfig) -> GibbsConfig:
+def refine_once(trained: GibbsConfig) -> GibbsConfig:
     """Filled from its beginning, then gone over once more: where a detour is to be found."""
-    return dataclasses.replace(refined(trained, rounds=2), temperature=1.0)
+    return dataclasses.replace(refine_plan(trained, rounds=2), temperature=1.0)
 
 
 def halves(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
     """Two models, each of which sees one half of the obstacles."""
-    views = (functools.partial(half_of_obstacles, part=part) for part in (0, 1))
+    views = (functools.partial(hide_half_of_obstacles, part=part) for part in (0, 1))
     return compose([view(e, see) for e, see in zip(energies, views, strict=True)], weights)
 
 
@@ -232,7 +232,7 @@ def one_half(energies: Sequence[Energy]) -> Energy:
 def fetch(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
     """A model that goes to objects, which says nothing of picking up, and one that picks up."""
     go, pick_up = energies
-    return compose([neutral(view(go, told_to_go), [PICKUP]), pick_up], weights)
+    return compose([neutral(view(go, replace_pick_up), [PICKUP]), pick_up], weights)
 
 
 def only_pick_up(energies: Sequence[Energy]) -> Energy:
@@ -240,7 +240,7 @@ def only_pick_up(energies: Sequence[Energy]) -> Energy:
     return fetch(energies, [0.0, 1.0])
 
 
-def _explorers(
+def _make_explorers(
     name: str,
     minimise: Minimise,
     at_once: Minimise | None = None,
@@ -254,25 +254,27 @@ def _explorers(
         minimise: without that.
         at_once: what methods of one action minimise; None: the same.
         search: how LEAP plans.
-        handling: see `revisits`.
+        handling: see `count_revisits`.
     """
-    whole, single = (exploring(m, handling) for m in (minimise, at_once or minimise))
+    whole, single = (penalise_revisits(m, handling) for m in (minimise, at_once or minimise))
     each = f"{name}, exploring, replanned after each action"
     ways = [
         Way(f"{name}, exploring", minimise=whole, search=search, executed=3),
-        Way(each, minimise=whole, search=refined, executed=1),
+        Way(each, minimise=whole, search=refine_plan, executed=1),
     ]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
     return [way._replace(remembers=True, explores=True) for way in ways]
 
 
-def _noisier(minimise: Minimise, temperature: float) -> list[Way]:
+def _make_noisier(minimise: Minimise, temperature: float) -> list[Way]:
     """Methods of one action, drawn as preset `paper` asks for."""
-    search = drawn_at(temperature)
+    search = draw_at(temperature)
     return [Way(f"{name}, with more noise", name, minimise, search) for name in ("dt", "iql")]
 
 
-def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, float]) -> Case:
+def _make_adaptation(
+    name: str, model: Model, level: str, paper: tuple[float, float, float]
+) -> Case:
     leap, dt, iql = paper
     at_once = masked(immediate_lava)
     return Case(
@@ -281,45 +283,48 @@ def _adaptation(name: str, model: Model, level: str, paper: tuple[float, float, 
         level,
         [
             Way("next action", minimise=at_once, search=wandering, executed=1, paper=leap),
-            Way("whole plan", minimise=unseen(lava), search=left_to_right, paper=leap),
+            Way(
+                "whole plan", minimise=penalise_unseen(lava), search=fill_left_to_right, paper=leap
+            ),
             Way("dt", "dt", at_once, wandering, paper=dt),
             Way("iql", "iql", at_once, wandering, paper=iql),
-            *_noisier(at_once, 12.0),
-            *_explorers("whole plan", masked(lava), at_once, left_to_right),
+            *_make_noisier(at_once, 12.0),
+            *_make_explorers("whole plan", masked(lava), at_once, fill_left_to_right),
         ],
         Watched,
     )
 
 
-def _constraints(name: str, model: Model, level: str) -> Case:
+def _make_constraints(name: str, model: Model, level: str) -> Case:
     both, never = masked(immediate_lava, left_turns), masked(lava, left_turns)
+    told = penalise_unseen(lava, left_turns)
     return Case(
         f"constraints-{name}",
         [model],
         level,
         [
-            Way("whole plan", minimise=unseen(lava, left_turns), search=twice, executed=3),
+            Way("whole plan", minimise=told, search=refine_once, executed=3),
             Way("dt", "dt", both, wandering),
             Way("iql", "iql", both, wandering),
-            *_noisier(both, 12.0),
-            *_explorers("whole plan", never, both, left_to_right),
+            *_make_noisier(both, 12.0),
+            *_make_explorers("whole plan", never, both, fill_left_to_right),
             Way(
-                "whole plan, exploring, beam search", minimise=exploring(never), search=beams,
-                executed=3, remembers=True, explores=True,
+                "whole plan, exploring, beam search", minimise=penalise_revisits(never),
+                search=search_beams, executed=3, remembers=True, explores=True,
             ),
         ],
         WatchedTurns,
     )  # fmt: skip
 
 
-def _errand(name: str, model: Model, level: str, budget: int) -> Case:
+def _make_errand(name: str, model: Model, level: str, budget: int) -> Case:
     few_turns = functools.partial(turns_over, budget=budget)
     at_once = masked(goal_before_visit, few_turns)
-    told = unseen(steps_to_visit, few_turns)
-    lightly = unseen(steps_to_visit, few_turns, weight=LIGHT)
+    told = penalise_unseen(steps_to_visit, few_turns)
+    lightly = penalise_unseen(steps_to_visit, few_turns, weight=LIGHT)
     ways = [
-        Way("whole plan", minimise=told, search=left_to_right, executed=3),
-        Way("whole plan, beam search", minimise=lightly, search=beams, executed=3),
+        Way("whole plan", minimise=told, search=fill_left_to_right, executed=3),
+        Way("whole plan, beam search", minimise=lightly, search=search_beams, executed=3),
         Way("dt", "dt", at_once, wandering),
         Way("iql", "iql", at_once, wandering),
         Way("dt, told how far", "dt", told),
@@ -334,33 +339,33 @@ def _errand(name: str, model: Model, level: str, budget: int) -> Case:
     )
 
 
-def _plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> list[Way]:
+def _make_plain(paper: tuple[float, float, float], minimise: Minimise = alone) -> list[Way]:
     leap, dt, iql = paper
     return [
         Way("leap", minimise=minimise, paper=leap),
         Way("leap, three actions of each plan", minimise=minimise, executed=3, paper=leap),
         Way("dt", "dt", minimise, paper=dt),
         Way("iql", "iql", minimise, paper=iql),
-        Way("leap, with noise", minimise=minimise, search=drawn_at(4.0), executed=1),
-        Way("dt, with noise", "dt", minimise, drawn_at(8.0)),
-        Way("iql, with noise", "iql", minimise, drawn_at(12.0)),
-        *_explorers("leap", minimise),
+        Way("leap, with noise", minimise=minimise, search=draw_at(4.0), executed=1),
+        Way("dt, with noise", "dt", minimise, draw_at(8.0)),
+        Way("iql, with noise", "iql", minimise, draw_at(12.0)),
+        *_make_explorers("leap", minimise),
     ]
 
 
 def doors_as_empty(energies: Sequence[Energy]) -> Energy:
     """What the one model of a case says where open doors are shown as empty cells."""
-    return view(energies[0], without_open_doors)
+    return view(energies[0], hide_open_doors)
 
 
-def _without_doors(paper: tuple[float, float, float]) -> list[Way]:
+def _make_without_doors(paper: tuple[float, float, float]) -> list[Way]:
     """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
-    views = _plain(paper, doors_as_empty)
+    views = _make_plain(paper, doors_as_empty)
     named = [way._replace(name=f"{way.name}, open doors seen as empty") for way in views]
-    return [*_plain(paper), *named]
+    return [*_make_plain(paper), *named]
 
 
-def _composed(
+def _make_composed(
     minimise: Callable[[Sequence[Energy]], Energy], paper: tuple[float, float, float]
 ) -> list[Way]:
     leap, dt, iql = paper
@@ -368,56 +373,56 @@ def _composed(
         Way("sum", minimise=minimise, search=noisily, paper=leap),
         Way("dt", "dt", minimise, noisily, paper=dt),
         Way("iql", "iql", minimise, noisily, paper=iql),
-        Way("sum, with more noise", minimise=minimise, search=drawn_at(4.0), executed=1),
-        *_noisier(minimise, 8.0),
+        Way("sum, with more noise", minimise=minimise, search=draw_at(4.0), executed=1),
+        *_make_noisier(minimise, 8.0),
     ]
 
 
 MAZE, OBSTACLES = "GoToObjMazeS4", "GoToBehindObstacles"
-ROOM, OPEN_MAZE = Model("GoToLocalS8N1", in_room), Model(MAZE, in_maze)
-OBJECTS = Model("GoToLocalS8N7", among_objects)
+ROOM, OPEN_MAZE = Model("GoToLocalS8N1", learn_in_room), Model(MAZE, learn_in_maze)
+OBJECTS = Model("GoToLocalS8N7", learn_among_objects)
 CASES = (
-    _adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
-    _adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
-    _adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
-    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _plain((77.5, 36.0, 60.5))),
+    _make_adaptation("easy", ROOM, "GoToLavaEasy", (92.0, 68.0, 90.5)),
+    _make_adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
+    _make_adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
+    Case("generalization-easy", [ROOM], "GoToLocalS8N15", _make_plain((77.5, 36.0, 60.5))),
     # Distances reach as far as ways in the maze are long, not as those in a room.
     Case(
         "generalization-medium",
-        [Model("GoToLocalS7N1", functools.partial(for_maze, sweeps=28))],
-        "GoToObjMazeS4R2", _without_doors((64.0, 37.5, 57.5)),
+        [Model("GoToLocalS7N1", functools.partial(learn_for_maze, sweeps=28))],
+        "GoToObjMazeS4R2", _make_without_doors((64.0, 37.5, 57.5)),
     ),
     Case(
         "generalization-hard",
-        [Model("GoToLocalS10N1", functools.partial(for_maze, sweeps=40))],
-        MAZE, _without_doors((61.0, 24.5, 65.5)),
+        [Model("GoToLocalS10N1", functools.partial(learn_for_maze, sweeps=40))],
+        MAZE, _make_without_doors((61.0, 24.5, 65.5)),
     ),
     Case(
-        "composition-easy", [Model(OBSTACLES, in_room)] * 2, OBSTACLES,
+        "composition-easy", [Model(OBSTACLES, learn_in_room)] * 2, OBSTACLES,
         [
-            *_composed(halves, (83.5, 58.0, 42.5)),
+            *_make_composed(halves, (83.5, 58.0, 42.5)),
             Way("one half alone", minimise=one_half, search=noisily),
-            *_explorers("sum", halves),
+            *_make_explorers("sum", halves),
             Way(
                 "sum, exploring, replanned after each action, not gone over",
-                minimise=exploring(halves), search=left_to_right, executed=1,
+                minimise=penalise_revisits(halves), search=fill_left_to_right, executed=1,
                 remembers=True, explores=True,
             ),
         ],
     ),
     Case(
-        "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", far_sighted)],
+        "composition-medium", [Model(MAZE), Model("PickUpLocalS10N1", learn_long_distances)],
         "PickUpObjMazeS4",
         [
-            *_composed(fetch, (43.0, 15.5, 11.5)),
+            *_make_composed(fetch, (43.0, 15.5, 11.5)),
             Way("pick-up alone", minimise=only_pick_up, search=noisily),
-            *_explorers("sum", fetch, handling=True),
+            *_make_explorers("sum", fetch, handling=True),
         ],
     ),
-    _constraints("room", ROOM, "GoToLavaMedium"),
-    _constraints("maze", OPEN_MAZE, "GoToLavaHard"),
-    _errand("errand", ROOM, "GoToVia", FEW_TURNS),
-    _errand("detour", OBJECTS, "GoToViaDetour", DETOUR_TURNS),
+    _make_constraints("room", ROOM, "GoToLavaMedium"),
+    _make_constraints("maze", OPEN_MAZE, "GoToLavaHard"),
+    _make_errand("errand", ROOM, "GoToVia", FEW_TURNS),
+    _make_errand("detour", OBJECTS, "GoToViaDetour", DETOUR_TURNS),
 )  # fmt: skip
 ANALYSIS = Analysis("properties", CASES)
 

@@ -27,10 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Publishes every run that is named."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.publish", given)
-    return shell.run_program("experiments.publish", given, lambda: publish(options.runs))
+    return shell.run_program("experiments.publish", given, lambda: publish_runs(options.runs))
 
 
-def publish(runs: Sequence[Path]) -> None:
+def publish_runs(runs: Sequence[Path]) -> None:
     """Publishes runs, the later one where two are of one level."""
     targets = [pretrained.PUBLISHED / pretrained.read_specification(run).level for run in runs]
     jax_setup.start()

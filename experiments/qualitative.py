@@ -18,15 +18,15 @@ from PIL import Image
 from rich.console import Console
 
 from experiments import properties
-from experiments.babyai_drawing import Colour, picture, spelled, way_of
+from experiments.babyai_drawing import Colour, draw_picture, find_way, spell_actions
 from experiments.common import cases
 from experiments.common.cases import Way, Work
-from experiments.common.episodes import watched
+from experiments.common.episodes import watch_episode
 from experiments.common.pictures import save_sheet
 from leapjax import files, pretrained
 from leapjax.data import seeds
 from leapjax.domains.babyai.adapter import BabyAIAdapter
-from leapjax.domains.babyai.constraints import in_half
+from leapjax.domains.babyai.constraints import find_half
 from leapjax.domains.babyai.levels import find_level
 from leapjax.domains.babyai.observations import Cell, agent_cell
 from leapjax.environments import closing
@@ -86,11 +86,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.qualitative", given)
     return shell.run_interruptible_program(
-        "experiments.qualitative", given, lambda interruption: draw(options, interruption)
+        "experiments.qualitative", given, lambda interruption: draw_figures(options, interruption)
     )
 
 
-def draw(options: Options, interruption: Interruption) -> None:
+def draw_figures(options: Options, interruption: Interruption) -> None:
     """Both figures."""
     seeds.test_seeds(options.test_seed, MOST_LEVELS)
     seeds.training_seeds(options.seed)
@@ -105,8 +105,8 @@ def draw(options: Options, interruption: Interruption) -> None:
     folder = Path("docs") if options.record else options.runs
     for where in (folder, options.runs):  # not after hours of work
         files.check_writable(where)
-    refined = [each for level in PLANNED for each in refinement(level, options.test_seed)]
-    asked = [unlearned(work, *names, options) for names in ASKED]
+    refined = [each for level in PLANNED for each in draw_refinement(level, options.test_seed)]
+    asked = [draw_unlearned(work, *names, options) for names in ASKED]
     sheets = (refined, 1 + len(ITERATIONS)), (asked, len(asked))
     for name, (pictures, columns) in zip(FIGURES, sheets, strict=True):
         path = folder / f"{name}.png"
@@ -114,7 +114,7 @@ def draw(options: Options, interruption: Interruption) -> None:
         work.console.print(f"wrote {path}", highlight=False)
 
 
-def refinement(level: str, first: int) -> list[Image.Image]:
+def draw_refinement(level: str, first: int) -> list[Image.Image]:
     """A plan of a published planner after some iterations of algorithm 1, and what came of it."""
     planner = pretrained.load(level)
     trained = planner.specification.planner
@@ -125,50 +125,53 @@ def refinement(level: str, first: int) -> list[Image.Image]:
         """The level as it was at first, and where plans lead after more and more iterations."""
         with closing(BabyAIAdapter(find_level(level))) as start:
             start.reset(found.level_seed)
-        return start, [way_of(start, found.trace[n - 1]) for n in ITERATIONS]
+        return start, [find_way(start, found.trace[n - 1]) for n in ITERATIONS]
 
     def refined(found: Drawn) -> bool:
         return all(before != after for before, after in pairwise(plans_of(found)[1]))
 
-    domain = cases.domain_of(level, [planner])
-    asked = cases.asked(domain, Way("refined"), [planner], search)
-    found = episode(level, asked, None, first, refined)
+    domain = cases.make_played_domain(level, [planner])
+    asked = cases.make_planner(domain, Way("refined"), [planner], search)
+    found = find_episode(level, asked, None, first, refined)
     start, ways = plans_of(found)
     plans = [
-        picture(start, f"N = {n}: {spelled(found.trace[n - 1])}", [way])
+        draw_picture(start, f"N = {n}: {spell_actions(found.trace[n - 1])}", [way])
         for n, way in zip(ITERATIONS, ways, strict=True)
     ]
-    return [*plans, executed(found)]
+    return [*plans, draw_executed(found)]
 
 
-def unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Image.Image:
+def draw_unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Image.Image:
     """What models do in a world that they were not trained in."""
     (case,) = (case for case in properties.CASES if case.name == case_name)
     (way,) = (way for way in case.ways if way.name == way_name)
-    models = cases.models_of(work, case, way.method, options.seed)
+    models = cases.load_models(work, case, way.method, options.seed)
     search = way.search(models[0].specification.planner)
-    planner = cases.asked(cases.domain_of(case.level, models), way, models, search)
-    found = episode(case.level, planner, way.executed, options.test_seed)
+    planner = cases.make_planner(cases.make_played_domain(case.level, models), way, models, search)
+    found = find_episode(case.level, planner, way.executed, options.test_seed)
     halves: list[tuple[list[Cell], Colour]] = []
     if case_name.startswith("composition"):  # who sees which obstacles
         state = found.adapter.observe()
         halves = [
-            ([(x, y) for x, y in np.argwhere(in_half(state.grid, state.goal, part))], colour)
+            (
+                [(x, y) for x, y in np.argwhere(find_half(state.grid, state.goal, part))],
+                colour,
+            )
             for part, colour in enumerate(HALVES)
         ]
-    return executed(found, case_name, halves)
+    return draw_executed(found, case_name, halves)
 
 
-def executed(
+def draw_executed(
     found: Drawn, name: str = "", marked: Sequence[tuple[Sequence[Cell], Colour]] = ()
 ) -> Image.Image:
     """What came of an episode's plans, each in a colour of its own."""
     plans = f"{len(found.ways)} plan{'s' * (len(found.ways) > 1)}"
     text = f"{name}{': ' * bool(name)}{plans}, {found.steps} steps, {found.outcome}"
-    return picture(found.adapter, text, found.ways, marked)
+    return draw_picture(found.adapter, text, found.ways, marked)
 
 
-def episode(
+def find_episode(
     level: str,
     planner: Pretrained,
     limit: int | None,
@@ -189,13 +192,13 @@ def episode(
     """
     for level_seed in range(first, first + MOST_LEVELS):
         with closing(BabyAIAdapter(find_level(level))) as adapter:
-            found = played(adapter, planner, limit, level_seed)
+            found = play_episode(adapter, planner, limit, level_seed)
         if found.steps >= STEPS and wanted(found):
             return found
     raise UserError(f"--test-seed {first}: none of {MOST_LEVELS} episodes is worth a drawing")
 
 
-def played(
+def play_episode(
     adapter: BabyAIAdapter, planner: Pretrained, limit: int | None, level_seed: int
 ) -> Drawn:
     """One episode."""
@@ -203,7 +206,9 @@ def played(
     ways: list[list[Cell]] = []
     steps, outcome = 0, "gave up"
     length = planner.specification.context
-    for event in watched(adapter, planner, length, level_seed, executed=limit, most=MOST_PLANS):
+    for event in watch_episode(
+        adapter, planner, length, level_seed, executed=limit, most=MOST_PLANS
+    ):
         if isinstance(event, Plan):
             traces.append(np.asarray(event.trace[0]))
             ways.append([agent_cell(adapter.env)])

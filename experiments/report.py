@@ -30,26 +30,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
     command = startup.format_command("experiments.report")
     argparse.ArgumentParser(command, description=about).parse_args(given)
-    return shell.run_program("experiments.report", given, rewrite)
+    return shell.run_program("experiments.report", given, rewrite_tables)
 
 
-def rewrite() -> None:
+def rewrite_tables() -> None:
     """Rewrites every table, and draws every figure of rows, here."""
-    for path, text in documents(Path()).items():
+    for path, text in make_documents(Path()).items():
         write_text(path, text)
-    rows, folder = rows_of(Path(), "babyai"), Path("docs")
-    by_passes = puzzles.success_by_passes(rows_of(Path(), *PUZZLES))
-    figures.iterations_by_level(babyai.success_by_iterations(rows), folder / "iterations.png")
-    figures.iterations_by_level(by_passes, folder / "searches.png")
-    figures.methods_by_level(
-        babyai.success_by_method(rows), babyai.COMPARED, folder / "methods.png"
+    rows, folder = read_rows(Path(), "babyai"), Path("docs")
+    by_passes = puzzles.group_by_passes(read_rows(Path(), *PUZZLES))
+    figures.draw_iterations(babyai.group_by_iterations(rows), folder / "iterations.png")
+    figures.draw_iterations(by_passes, folder / "searches.png")
+    figures.draw_methods(
+        babyai.compute_success_by_method(rows), babyai.COMPARED, folder / "methods.png"
     )
-    figures.intervals(babyai.aggregates(rows), folder / "aggregate.png")
-    figures.landscape(_measured(Path(), "landscape"), folder / "landscape.png")
-    figures.energy_against_reward(_measured(Path(), "atari-energy"), folder / "atari-energy.png")
+    figures.draw_intervals(babyai.compute_aggregates(rows), folder / "aggregate.png")
+    figures.draw_landscape(_read_measured(Path(), "landscape"), folder / "landscape.png")
+    figures.draw_energies(_read_measured(Path(), "atari-energy"), folder / "atari-energy.png")
 
 
-def rows_of(root: Path, *names: str) -> list[Row]:
+def read_rows(root: Path, *names: str) -> list[Row]:
     """Reads the rows of some experiments, each with its episodes where they are recorded.
 
     Raises:
@@ -70,21 +70,21 @@ def rows_of(root: Path, *names: str) -> list[Row]:
     return found
 
 
-def _measured(root: Path, name: str) -> Any:
-    return measured.read(root / "results" / f"{name}.json")
+def _read_measured(root: Path, name: str) -> Any:
+    return measured.read_measured(root / "results" / f"{name}.json")
 
 
-def rows_by_source(root: Path) -> dict[str, Any]:
+def read_sources(root: Path) -> dict[str, Any]:
     """What tables are made from: rows by experiment, and what was measured, by file."""
-    rows: dict[str, Any] = {name: rows_of(root, name) for name in EXPERIMENTS}
-    rows |= {name: _measured(root, name) for name in MEASURED}
+    rows: dict[str, Any] = {name: read_rows(root, name) for name in EXPERIMENTS}
+    rows |= {name: _read_measured(root, name) for name in MEASURED}
     return rows | {"puzzles": [row for name in PUZZLES for row in rows[name]]}
 
 
-def documents(root: Path) -> dict[Path, str]:
+def make_documents(root: Path) -> dict[Path, str]:
     """What each document with tables should say, given the rows."""
-    rows = rows_by_source(root)
-    sections = sections_of(rows)
+    rows = read_sources(root)
+    sections = list_sections(rows)
     written = {}
     for path in (root / name for name in DOCUMENTS):
         text = read_text(path)
@@ -95,7 +95,7 @@ def documents(root: Path) -> dict[Path, str]:
     return written
 
 
-def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str], str]]:
+def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str], str]]:
     """By name of the section, what makes its table, and the source of the rows that it takes.
 
     Args:
@@ -103,26 +103,26 @@ def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str]
     """
     properties = ANALYSES["properties"]
     return {
-        "results": (functools.partial(babyai.success, settings=babyai.PRESETS), "babyai"),
-        "iterations": (babyai.iterations, "babyai"),
-        "methods": (babyai.methods, "babyai"),
-        "price": (functools.partial(babyai.price, measured=rows["methods"]), "babyai"),
-        "search-pays": (puzzles.searches, "puzzles"),
-        "arms": (puzzles.arms, "puzzles"),
-        "atari": (functools.partial(atari.played, data=rows["atari-data"]), "atari"),
-        "atari-data": (atari.data, "atari-data"),
-        "atari-energy": (atari.energy, "atari-energy"),
-        "atari-decisions": (atari.decisions, "atari-cost"),
-        "atari-training": (speed.training, "atari-training"),
-        "speed": (speed.speed, "planning"),
-        "planning": (speed.planning, "planning"),
-        "training": (speed.training, "training"),
-        "parts": (speed.parts, "training"),
-        "quality": (speed.quality, "quality"),
-        "landscape": (analyses.landscape, "landscape"),
+        "results": (functools.partial(babyai.compare_settings, settings=babyai.PRESETS), "babyai"),
+        "iterations": (babyai.compare_iterations, "babyai"),
+        "methods": (babyai.compare_methods, "babyai"),
+        "price": (functools.partial(babyai.compare_prices, measured=rows["methods"]), "babyai"),
+        "search-pays": (puzzles.compare_searches, "puzzles"),
+        "arms": (puzzles.compare_arms, "puzzles"),
+        "atari": (functools.partial(atari.compare_scores, data=rows["atari-data"]), "atari"),
+        "atari-data": (atari.describe_data, "atari-data"),
+        "atari-energy": (atari.compare_energies, "atari-energy"),
+        "atari-decisions": (atari.compare_decisions, "atari-cost"),
+        "atari-training": (speed.list_training, "atari-training"),
+        "speed": (speed.compare_speed, "planning"),
+        "planning": (speed.list_planning, "planning"),
+        "training": (speed.list_training, "training"),
+        "parts": (speed.list_parts, "training"),
+        "quality": (speed.compare_quality, "quality"),
+        "landscape": (analyses.compare_energies, "landscape"),
         "table-3": (
             functools.partial(
-                analyses.compared,
+                analyses.compare_ways,
                 properties,
                 ways=analyses.AS_THE_PAPER,
                 cases=analyses.OF_THE_PAPER,
@@ -130,15 +130,15 @@ def sections_of(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str]
             "properties",
         ),
         "exploring": (
-            functools.partial(analyses.compared, properties, ways=analyses.EXPLORING),
+            functools.partial(analyses.compare_ways, properties, ways=analyses.EXPLORING),
             "properties",
         ),
         "two-constraints": (
-            functools.partial(analyses.compared, properties, cases=analyses.ERRANDS),
+            functools.partial(analyses.compare_ways, properties, cases=analyses.ERRANDS),
             "properties",
         ),
         **{
-            name: (functools.partial(analyses.compared, each), name)
+            name: (functools.partial(analyses.compare_ways, each), name)
             for name, each in ANALYSES.items()
             if name != "properties"
         },
@@ -156,10 +156,10 @@ def replace_section(text: str, name: str, section: str) -> str:
 def is_used(row: Row) -> bool:
     """Whether a row is in a table; one that is in none is stale."""
     if row.get("experiment") in ANALYSES:
-        return analyses.uses(row)
+        return analyses.is_used(row)
     if row["domain"] in PUZZLES:
-        return puzzles.uses(row)
-    return atari.uses(row) if row["domain"] == "atari" else babyai.uses(row)
+        return puzzles.is_used(row)
+    return atari.is_used(row) if row["domain"] == "atari" else babyai.is_used(row)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from experiments.common.pictures import Frame, save_animation
-from experiments.common.searches import SEARCHES, searches
+from experiments.common.searches import SEARCHES, list_searches
 from leapjax import rollouts
 from leapjax.batching import compile_planner, plan_keys
 from leapjax.domains.puzzles.stars.graphs import Graph, Star, StarAdapter, find_level
@@ -27,7 +27,7 @@ BLUE, LIGHT, GREEN, RED = (80, 160, 255), (205, 228, 255), (60, 170, 80), (215, 
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
     """Draws the passes over one graph per level seed; nothing for methods of one action."""
-    if not searches(run.config):
+    if not list_searches(run.config):
         return
     horizon, fills = run.config.planner.horizon, planner.energy.accepts_mask
     shown = [s for s in SEARCHES if s.name in SHOWN and s.passes == 1]
@@ -51,38 +51,38 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
             name: np.asarray(plan(planner.params, keys, contexts).trace[0])[:, : star.length]
             for name, plan in plans.items()
         }
-        frames += _frames(star, graph, adapter.path, traces)
+        frames += _draw_frames(star, graph, adapter.path, traces)
     save_animation(frames, path)
 
 
-def _frames(
+def _draw_frames(
     star: Star, graph: Graph, path: np.ndarray, traces: dict[str, np.ndarray]
 ) -> list[Frame]:
     """One frame for each pass, the planners side by side."""
-    places, side = layout(star, graph), side_of(star)
+    places, side = place_nodes(star, graph), choose_side(star)
     passes = len(next(iter(traces.values())))
     found = []
     for index in range(passes):
         image = Image.new("RGB", (side * len(traces), side + CAPTION), WHITE)
         for column, (name, trace) in enumerate(traces.items()):
             last = index == passes - 1
-            panel = picture(graph, places, side, path, trace[: index + 1], name, last)
+            panel = draw_picture(graph, places, side, path, trace[: index + 1], name, last)
             image.paste(panel, (side * column, 0))
         found.append((image, LAST_MS if index == passes - 1 else PASS_MS))
     return found
 
 
-def side_of(star: Star) -> int:
+def choose_side(star: Star) -> int:
     """Pixels of a picture whose nodes do not cover each other, unless it would be too large."""
     return min(max(SIDE, 2 * (SPACING * star.length + 2 * RADIUS)), MOST)
 
 
-def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
+def place_nodes(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
     """Where each node is drawn: the centre in the middle, arms as rays."""
     after: dict[int, list[int]] = {}
     for parent, child in graph.edges.tolist():
         after.setdefault(parent, []).append(child)
-    middle = side_of(star) / 2
+    middle = choose_side(star) / 2
     step = (middle - 2 * RADIUS) / star.length
     places = {int(graph.node): (middle, middle)}
     for arm, first in enumerate(sorted(after[int(graph.node)])):
@@ -97,7 +97,7 @@ def layout(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
     return places
 
 
-def picture(
+def draw_picture(
     graph: Graph,
     places: dict[int, tuple[float, float]],
     side: int,

@@ -8,12 +8,12 @@ each takes.
 import sys
 from collections.abc import Sequence
 
-from experiments.common.searches import searches
+from experiments.common.searches import list_searches
 from experiments.star_animation import animate
 from leapjax.running import main as running
 from leapjax.running.run import Experiment
 
-EXPERIMENT = Experiment("stars", "stars", searches, animate)
+EXPERIMENT = Experiment("stars", "stars", list_searches, animate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

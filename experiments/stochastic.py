@@ -10,7 +10,7 @@ from experiments.common import cases
 from experiments.common.cases import NOISE, Analysis, Case, Model, Way
 
 
-def _case(level: str, leap: float, dt: float) -> Case:
+def _make_case(level: str, leap: float, dt: float) -> Case:
     return Case(
         level,
         [Model(f"{level}Slip")],
@@ -25,7 +25,7 @@ def _case(level: str, leap: float, dt: float) -> Case:
 
 
 ANALYSIS = Analysis(
-    "stochastic", (_case("GoToObjMazeS4", 57.5, 30.8), _case("GoToObjMazeS7", 33.3, 28.3))
+    "stochastic", (_make_case("GoToObjMazeS4", 57.5, 30.8), _make_case("GoToObjMazeS7", 33.3, 28.3))
 )
 
 

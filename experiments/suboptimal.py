@@ -20,15 +20,15 @@ PAPER = {
 }
 
 
-def calmly(trained: GibbsConfig) -> GibbsConfig:
+def lower_temperature(trained: GibbsConfig) -> GibbsConfig:
     """Plans are samples: drawn at the temperature of sequences, they have as many mistakes."""
     return dataclasses.replace(trained, temperature=min(trained.temperature, 0.5))
 
 
-def _case(level: str, suffix: str, leap: float, dt: float) -> Case:
+def _make_case(level: str, suffix: str, leap: float, dt: float) -> Case:
     whole = Way("whole plans", paper=leap)
     if suffix:
-        whole = whole._replace(search=calmly)
+        whole = whole._replace(search=lower_temperature)
     three = whole._replace(name="three actions of each plan", executed=3)
     ways = [whole, three, Way("dt", "dt", paper=dt)]
     ways.append(Way("dt, with noise", "dt", search=NOISE))
@@ -38,7 +38,7 @@ def _case(level: str, suffix: str, leap: float, dt: float) -> Case:
 ANALYSIS = Analysis(
     "suboptimal",
     [
-        _case(level, suffix, *paper)
+        _make_case(level, suffix, *paper)
         for level, (optimal, mistaken) in PAPER.items()
         for suffix, paper in {"": optimal, "Mistakes": mistaken, "Mislabelled": mistaken}.items()
     ],

@@ -7,11 +7,11 @@ way that there is, and reports success against the passes of the model that each
 import sys
 from collections.abc import Sequence
 
-from experiments.common.searches import searches
+from experiments.common.searches import list_searches
 from leapjax.running import main as running
 from leapjax.running.run import Experiment
 
-EXPERIMENT = Experiment("sudoku", "sudoku", searches)
+EXPERIMENT = Experiment("sudoku", "sudoku", list_searches)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -157,7 +157,7 @@ class CompiledPlanner:
         if typed:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
         else:
-            kind = _kind_of(keys)
+            kind = _name_kind(keys)
         inputs = jax.tree.map(np.asarray, (keys, contexts, cache))
         chunks = split_batch(batch, self.chunk_sizes)
         placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
@@ -325,7 +325,7 @@ def check_fit(name: str, tree: PyTree) -> None:
             )
 
 
-def _kind_of(keys: Array) -> str:
+def _name_kind(keys: Array) -> str:
     """The kind of raw keys `[B, width]`, which their width tells: 2 of `KEYS`, else the default.
 
     Raises:
@@ -362,8 +362,8 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
             as episodes.
     """
     key = planner_key(seed)
-    episodes = check_seeds(_whole(episodes), "episode")
-    replans = check_seeds(_whole(replans), "replan")
+    episodes = check_seeds(_convert_whole(episodes), "episode")
+    replans = check_seeds(_convert_whole(replans), "replan")
     batch = len(episodes)
     if len(replans) != batch:
         raise UserError(f"{batch} episodes, but {len(replans)} replans: expected one for each")
@@ -375,7 +375,7 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
     return np.asarray(_fold_in(key, folded))[:batch]
 
 
-def _whole(values: np.ndarray) -> np.ndarray:
+def _convert_whole(values: np.ndarray) -> np.ndarray:
     """Integers where all numbers are whole: `np.zeros(B)`, which holds floats, means B zeros."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f":
         with np.errstate(invalid="ignore"):

@@ -39,11 +39,11 @@ def check_integer(name: str, value: Any, least: int = 0, most: int = MOST) -> in
             raise TypeError
         number = operator.index(value)
     except TypeError:
-        raise UserError(f"{name} must be an integer, got {_shown(value)}") from None
+        raise UserError(f"{name} must be an integer, got {_shorten(value)}") from None
     if number < least:
-        raise UserError(f"{name} must be at least {least}, got {_shown(number)}")
+        raise UserError(f"{name} must be at least {least}, got {_shorten(number)}")
     if number > most:
-        raise UserError(f"{name} must be at most {most}, got {_shown(number)}")
+        raise UserError(f"{name} must be at most {most}, got {_shorten(number)}")
     return number
 
 
@@ -64,7 +64,7 @@ def check_number(name: str, value: Any, least: float = -LARGEST, most: float = L
             raise TypeError
         number = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise UserError(f"{name} must be a number, got {_shown(value)}") from None
+        raise UserError(f"{name} must be a number, got {_shorten(value)}") from None
     if not math.isfinite(number):
         raise UserError(f"{name} must be finite, got {number}")
     if least <= number <= most:
@@ -106,7 +106,7 @@ def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.nd
     except ValueError:  # lists of several lengths
         flat = False
     if not flat:
-        raise UserError(f"{name}s must be a sequence of integers, got {_shown(values)}")
+        raise UserError(f"{name}s must be a sequence of integers, got {_shorten(values)}")
     whole = isinstance(values, np.ndarray | jax.Array) and np.issubdtype(values.dtype, np.integer)
     if whole and len(values):
         array = np.asarray(values)  # of one type, so that its extremes speak for all
@@ -130,7 +130,7 @@ def check_flag(name: str, value: Any) -> bool:
         return value
     array = np.asarray(value)
     if array.size != 1 or array.dtype.kind not in "biuf" or array.item() not in (0, 1):
-        raise UserError(f"{name} must be true or false, got {_shown(value)}")
+        raise UserError(f"{name} must be true or false, got {_shorten(value)}")
     return bool(array.item())
 
 
@@ -145,7 +145,9 @@ def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray
     Raises:
         UserError: no sequence, or one of them is not an integer, or out of range.
     """
-    return np.array([check_integer(name, value, least) for value in _items(name, values)], np.int64)
+    return np.array(
+        [check_integer(name, value, least) for value in _list_items(name, values)], np.int64
+    )
 
 
 def check_numbers(
@@ -156,7 +158,7 @@ def check_numbers(
     Raises:
         UserError: no sequence, or one of them is no such number.
     """
-    return [check_number(name, value, least, most) for value in _items(name, values)]
+    return [check_number(name, value, least, most) for value in _list_items(name, values)]
 
 
 def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ...]:
@@ -170,7 +172,7 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
     Raises:
         UserError: other types, an index out of range or named twice, a mask of another length.
     """
-    items = _items(name, values)
+    items = _list_items(name, values)
     if items and all(isinstance(item, bool | np.bool_) for item in items):
         if len(items) != count:
             raise UserError(f"{name}: a mask of {len(items)} booleans, expected {count}")
@@ -281,10 +283,10 @@ def _check_type(name: str, value: Any, kind: Any) -> Any:
             return None
         return _check_type(name, value, next(each for each in kinds if each is not type(None)))
     if typing.get_origin(kind) is tuple:
-        items = _items(name, value)
+        items = _list_items(name, value)
         every = kinds[:1] * len(items) if kinds[1:] == (...,) else kinds
         if len(items) != len(every):
-            raise UserError(f"{name} must be {len(every)} values, got {_shown(value)}")
+            raise UserError(f"{name} must be {len(every)} values, got {_shorten(value)}")
         return tuple(_check_type(name, *each) for each in zip(items, every, strict=True))
     checked = value
     if kind is int:
@@ -292,9 +294,9 @@ def _check_type(name: str, value: Any, kind: Any) -> Any:
     elif kind is float:
         checked = check_number(name, value)
     elif kind is bool and not isinstance(value, bool | np.bool_):
-        raise UserError(f"{name} must be True or False, got {_shown(value)}")
+        raise UserError(f"{name} must be True or False, got {_shorten(value)}")
     elif kind is str and not isinstance(value, str):
-        raise UserError(f"{name} must be a text, got {_shown(value)}")
+        raise UserError(f"{name} must be a text, got {_shorten(value)}")
     elif kind in (bool, str):
         checked = kind(value)
     # An integer that stands for a number stays one: names of runs are made from what is written.
@@ -333,7 +335,7 @@ def check_within(config: object, least: float, most: float, *names: str) -> None
         check_number(name, getattr(config, name), least, most)
 
 
-def _items(name: str, values: Any) -> list[Any]:
+def _list_items(name: str, values: Any) -> list[Any]:
     """What a sequence holds."""
     try:
         if isinstance(values, str | bytes | Mapping):  # whose items are keys
@@ -341,10 +343,10 @@ def _items(name: str, values: Any) -> list[Any]:
         # Of an array of JAX as NumPy's, whose booleans and integers can be told apart.
         return list(np.asarray(values) if hasattr(values, "dtype") else values)
     except TypeError:
-        raise UserError(f"{name} must be a sequence, got {_shown(values)}") from None
+        raise UserError(f"{name} must be a sequence, got {_shorten(values)}") from None
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     """A value as a message quotes it."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -34,7 +34,7 @@ def use_disk_cache() -> None:
     if kept is not None or not allowed or choice == "off":
         return
     try:
-        folder = Path(choice) if choice else files.cache_folder() / "xla" / name_processor()
+        folder = Path(choice) if choice else files.find_cache_folder() / "xla" / name_processor()
         files.make_private(folder.absolute())
     except UserError as error:  # JAX would say so at every program, with its traceback
         _say_once(f"compiled programs are not kept: {error}")

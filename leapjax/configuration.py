@@ -11,13 +11,13 @@ from typing import Annotated, Any, Generic, TypeVar
 import tyro
 
 from leapjax import pretrained, serialization
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
 from leapjax.domains import find_domain, make_level
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.processes import Cluster
 
@@ -107,7 +107,7 @@ _NOT_HASHED = (
 )  # fmt: skip
 
 
-def blank(domain: str, level: str, method: str) -> AnyConfig:
+def make_config(domain: str, level: str, method: str) -> AnyConfig:
     """The defaults of every option, before any preset.
 
     Raises:
@@ -135,13 +135,13 @@ def change(config: AnyConfig, **changes: Any) -> AnyConfig:
     return dataclasses.replace(config, **found)
 
 
-def resolved(config: AnyConfig, seed: int) -> dict[str, Any]:
+def list_settings(config: AnyConfig, seed: int) -> dict[str, Any]:
     """All settings that one seed's result depends on, as JSON values."""
     values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
     return json.loads(json.dumps({**values, "seed": seed}))
 
 
-def configuration_hash(config: AnyConfig, seed: int) -> str:
+def hash_config(config: AnyConfig, seed: int) -> str:
     """Twelve hexadecimal digits that name a configuration.
 
     They are those of domain, level, method and what differs from the defaults alone, so that a
@@ -149,10 +149,10 @@ def configuration_hash(config: AnyConfig, seed: int) -> str:
     train and to play a checkpoint again are two things.
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
-    defaults = resolved(blank(**names), seed=-1)
-    values = resolved(config, seed)
-    values["training"] = pretrained.without_unnamed(values["training"])
-    settings = serialization.differences(values, defaults)
+    defaults = list_settings(make_config(**names), seed=-1)
+    values = list_settings(config, seed)
+    values["training"] = pretrained.drop_unnamed(values["training"])
+    settings = serialization.find_differences(values, defaults)
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -173,7 +173,7 @@ def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
     )  # fmt: skip
 
 
-def episode_seeds(config: AnyConfig) -> range:
+def choose_episode_seeds(config: AnyConfig) -> range:
     """The level seeds of the episodes that success is measured on.
 
     Raises:

@@ -149,7 +149,7 @@ def closing(adapter: A) -> Iterator[A]:
     close(adapter)
 
 
-def environments_of(adapter: Adapter) -> list[object]:
+def list_environments(adapter: Adapter) -> list[object]:
     """The Gymnasium environments that an adapter steps, without their wrappers.
 
     Finds attributes of the adapter, of its class, and of other adapters inside it. Lists are not
@@ -170,7 +170,7 @@ def environments_of(adapter: Adapter) -> list[object]:
     return found
 
 
-def _count(found: Any) -> str:
+def _describe_returned(found: Any) -> str:
     """What a step returned, in a message."""
     return f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
 
@@ -222,8 +222,8 @@ class GymnasiumAdapter:
         found = self.env.step(self._first_action + action)
         if not (isinstance(found, tuple) and len(found) == 5):
             raise UserError(
-                f"step of {self.env} returned {_count(found)}, not (observation, reward, "
-                "terminated, truncated, info): wrap it for Gymnasium"
+                f"step of {self.env} returned {_describe_returned(found)}, not (observation, "
+                "reward, terminated, truncated, info): wrap it for Gymnasium"
             )
         observation, reward, terminated, truncated, _ = found
         try:

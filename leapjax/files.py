@@ -90,12 +90,12 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         UserError: it cannot be written, for example because the disk is full.
     """
-    with whole(path) as scratch:
+    with write_whole(path) as scratch:
         scratch.write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def write_whole(path: Path) -> Iterator[Path]:
     """Gives a path to write to; what was written is at `path` afterwards, or nothing is.
 
     It is on the disk then, whatever happens to the power.
@@ -120,7 +120,7 @@ def whole(path: Path) -> Iterator[Path]:
             scratch.unlink(missing_ok=True)
 
 
-def cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """Returns the folder in which leapjax keeps what it can make again for this user.
 
     Raises:
@@ -253,7 +253,7 @@ def check_writable(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def only_process_in(folder: Path, wait: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, wait: bool = False) -> Iterator[None]:
     """Keeps other processes out of a folder; the system lets go however the process ends.
 
     Args:

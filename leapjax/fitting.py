@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax import compilation, pretrained, sharding
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows
@@ -16,7 +16,7 @@ from leapjax.domain import Domain, apply_statistics, measure_statistics
 from leapjax.domains import make_level
 from leapjax.errors import UserError
 from leapjax.methods import find_method, learns_from_rewards
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Origin, Pretrained, Specification
@@ -108,7 +108,7 @@ def fit(
         planner = planner or config.planner
         planner = dataclasses.replace(planner, horizon=asked.get("horizon", planner.horizon))
         settings = config.method_settings if settings is None else settings
-        mesh = sharding.make_mesh(training.batch // training.run, jax.local_devices())
+        mesh = sharding.make_mesh(training.batch // training.consecutive, jax.local_devices())
     except ValueError as error:  # the dataclasses refuse values that cannot be
         raise UserError(str(error)) from None
     data = _read(demonstrations, domain, seed)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from leapjax.agents.base import Method
 from leapjax.agents.bc import BC
 from leapjax.agents.bcq import BCQ
 from leapjax.agents.classifier import CLASSIFIER
@@ -9,7 +10,6 @@ from leapjax.agents.cql import CQL
 from leapjax.agents.dt import DT
 from leapjax.agents.iql import IQL
 from leapjax.agents.leap import LEAP
-from leapjax.agents.learning import Method
 from leapjax.agents.mopo import MOPO
 from leapjax.agents.plate import PLATE
 from leapjax.agents.qr_dqn import QR_DQN

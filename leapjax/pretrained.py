@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from leapjax import domains, rollouts, serialization, weights
-from leapjax.agents.learning import UNNAMED, Setup, TrainingConfig
+from leapjax.agents.base import UNNAMED, Setup, TrainingConfig
 from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
@@ -25,7 +25,7 @@ from leapjax.errors import UserError, first_line
 from leapjax.extras import report_missing
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 
@@ -178,7 +178,10 @@ class Pretrained:
         if folder.exists():
             raise UserError(f"{folder} is there already: name a new folder")
         checkpoints.save_params(
-            folder / CHECKPOINTS, self.params, identity(specification), specification.training.steps
+            folder / CHECKPOINTS,
+            self.params,
+            describe_identity(specification),
+            specification.training.steps,
         )
         save_specification(folder, specification)
 
@@ -223,19 +226,19 @@ def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None =
     return find_method(specification.method).make_agent(setup, mesh)
 
 
-def identity(specification: Specification) -> str:
+def describe_identity(specification: Specification) -> str:
     """What checkpoints of a run are sealed with: all of its specification but the defaults."""
     defaults = {name: type(getattr(specification, name))() for name in GROUPS}
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
-    changed = {name: serialization.differences(values[name], plain[name]) for name in GROUPS}
-    changed["training"] = without_unnamed(changed["training"])
+    changed = {name: serialization.find_differences(values[name], plain[name]) for name in GROUPS}
+    changed["training"] = drop_unnamed(changed["training"])
     if not specification.statistics:  # as before there were any
         del values["statistics"]
     return json.dumps(values | changed, sort_keys=True)
 
 
-def without_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:
+def drop_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of training that a result depends on."""
     return {name: value for name, value in training.items() if name not in UNNAMED}
 
@@ -260,7 +263,7 @@ def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
     Nothing is built, imported or unpacked before this: a specification is what a file says.
     """
     specification = parse_specification(check_path(folder))
-    whose = identity(specification)
+    whose = describe_identity(specification)
     if (folder / WEIGHTS).exists():
         return specification, weights.check_identity(folder / WEIGHTS, whose)
     return specification, _import_checkpoints().check_identity(folder / CHECKPOINTS, whose)
@@ -301,7 +304,7 @@ def parse_specification(folder: Path) -> Specification:
         raise UserError(f"{path}: {error}") from None
 
 
-def published(name: str) -> Path:
+def find_published(name: str) -> Path:
     """The folder of a planner that comes with the library.
 
     Raises:
@@ -326,11 +329,11 @@ def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
         UserError: the run cannot be read, has not come to its end, or the target not be written.
     """
     planner, target = load(folder, finished=True), check_path(target)
-    weights.write(target / WEIGHTS, planner.params, identity(planner.specification))
+    weights.write(target / WEIGHTS, planner.params, describe_identity(planner.specification))
     save_specification(target, planner.specification)
 
 
-def find(path: str | os.PathLike[str]) -> Path:
+def find_folder(path: str | os.PathLike[str]) -> Path:
     """The folder of a run; or, where there is none, of the published planner of a level.
 
     Raises:
@@ -341,7 +344,7 @@ def find(path: str | os.PathLike[str]) -> Path:
     return PUBLISHED / folder if published else folder
 
 
-def asking_for(specification: Specification, target_return: float) -> Specification:
+def ask_for_return(specification: Specification, target_return: float) -> Specification:
     """The same planner, asked for another return.
 
     Raises:
@@ -421,11 +424,11 @@ def load(
         raise UserError(f"planner must be a configuration such as GibbsConfig, got {planner!r}")
     if not isinstance(level, str | None):
         raise UserError(f"level must be a text, got {level!r}")
-    folder = find(path)
+    folder = find_folder(path)
     specification, saved = _read_sealed(folder)
-    whose = identity(specification)
+    whose = describe_identity(specification)
     if target_return is not None:
-        specification = asking_for(specification, target_return)
+        specification = ask_for_return(specification, target_return)
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:
         raise UserError(f"{folder} plans {horizon} actions, not {planner.horizon}: its horizon")
@@ -453,7 +456,7 @@ def load(
         params = checkpoints.restore_params(
             folder / CHECKPOINTS, like, whose, specification.training.steps if finished else None
         )
-        step = checkpoints.newest(folder / CHECKPOINTS)[0]
+        step = checkpoints.find_newest(folder / CHECKPOINTS)[0]
         if step < specification.training.steps:
             warnings.warn(
                 f"{folder} ends at step {step} of {specification.training.steps}", stacklevel=2

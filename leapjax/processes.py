@@ -78,7 +78,7 @@ def gather(value: Any) -> list[Any]:
     return [json.loads(row[:size].tobytes()) for row, size in zip(rows, sizes, strict=True)]
 
 
-def together(work: Callable[[], T]) -> T:
+def run_together(work: Callable[[], T]) -> T:
     """Does something on every process; what goes wrong on one stops them all.
 
     Raises:
@@ -95,13 +95,13 @@ def together(work: Callable[[], T]) -> T:
     return result  # type: ignore[return-value]
 
 
-def first_does(work: Callable[[], Any]) -> Any:
+def run_on_first(work: Callable[[], Any]) -> Any:
     """Does something on the first process; its result, a JSON value, on all of them.
 
     Raises:
         UserError: that of the first process.
     """
-    return gather(together(lambda: work() if is_first() else None))[0]
+    return gather(run_together(lambda: work() if is_first() else None))[0]
 
 
 def broadcast(tree: PyTree) -> PyTree:

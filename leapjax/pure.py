@@ -109,7 +109,7 @@ def compile_rollout(
         episode, ended = carry
         ended |= action >= end  # or MASK
         state, found = environment.step(episode.state, jnp.minimum(action, end - 1))
-        now = _advanced(episode.context, action, found)
+        now = _advance_context(episode.context, action, found)
         over = jnp.asarray(found.terminated | found.truncated) | (now.step >= max_steps)
         acted = episode._replace(
             state=state, context=now, score=episode.score + found.counted, over=over,
@@ -194,7 +194,9 @@ def _check_environment(environment: PureEnvironment) -> None:
         leaves = jax.tree.leaves(value)
         fits = [not leaf.shape and _is_one_of(leaf.dtype, types) for leaf in leaves]
         if fits != [True]:
-            raise UserError(f"step must return {kind} of shape () as {name}, got {_said(value)}")
+            raise UserError(
+                f"step must return {kind} of shape () as {name}, got {_describe_shapes(value)}"
+            )
 
 
 def _is_one_of(dtype: Any, types: Sequence[Any]) -> bool:
@@ -219,8 +221,8 @@ def _check_same(name: str, began: PyTree, led: PyTree) -> None:
     for (path, first), then in zip(jax.tree.leaves_with_path(began), leaves, strict=True):
         if first.shape != then.shape or not _is_promoted(first, then):
             raise UserError(
-                f"step returns {name}{jax.tree_util.keystr(path)} as {_said(then)}, but reset as "
-                f"{_said(first)}: expected the same"
+                f"step returns {name}{jax.tree_util.keystr(path)} as {_describe_shapes(then)}, but "
+                f"reset as {_describe_shapes(first)}: expected the same"
             )
 
 
@@ -234,7 +236,7 @@ def _is_promoted(first: jax.ShapeDtypeStruct, then: jax.ShapeDtypeStruct) -> boo
         return False
 
 
-def _said(tree: PyTree) -> str:
+def _describe_shapes(tree: PyTree) -> str:
     """Shapes and types in a message."""
     leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(tree)]
     return ", ".join(leaves) or str(tree)
@@ -247,7 +249,7 @@ def _is_finite(tree: PyTree) -> jax.Array:
     return jnp.array([jnp.isfinite(leaf).all() for leaf in floats], bool).all()
 
 
-def _advanced(context: Context, action: jax.Array, found: Transition) -> Context:
+def _advance_context(context: Context, action: jax.Array, found: Transition) -> Context:
     """The context after a step."""
 
     def shifted(past: jax.Array, latest: Array) -> jax.Array:

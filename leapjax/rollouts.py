@@ -13,7 +13,7 @@ import numpy as np
 
 from leapjax.batching import CompiledPlanner, plan_keys
 from leapjax.checks import check_flag, check_integer, check_seed, check_seeds
-from leapjax.environments import Adapter, Eager, Transition, close, environments_of
+from leapjax.environments import Adapter, Eager, Transition, close, list_environments
 from leapjax.errors import UserError
 from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token, to_plain_dicts
 
@@ -254,7 +254,7 @@ class _Episode:
         self.adapter, self.history = adapter, history
         self.eager = adapter if isinstance(adapter, Eager) else None
         # What no other episode may step, by identity.
-        self.owned = {id(part): part for part in (adapter, *environments_of(adapter))}
+        self.owned = {id(part): part for part in (adapter, *list_environments(adapter))}
         self.replans = 0
         self.cache: PyTree = None  # its row of what the planner returned with the last plan
 
@@ -285,7 +285,7 @@ def plan_episodes(
     return plans, [jax.tree.map(lambda x, n=n: x[n], cache) for n in range(len(histories))]
 
 
-def _alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
+def _group_alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
     """Episodes that can be planned for together: those with a cache, and those without."""
     for begun in (True, False):
         group = [each for each in episodes if (each.cache is not None) == begun]
@@ -315,7 +315,7 @@ def evaluate(
 
     Episodes under way take turns, so their environments must not share anything that a step or a
     reset changes. The same adapter twice is refused, and so is one Gymnasium environment in two
-    adapters (see `leapjax.environments.environments_of`); other state that they share is not found.
+    adapters (see `leapjax.environments.list_environments`); other shared state is not found.
 
     Args:
         make_adapter: makes one environment; called once per episode, in the order of the seeds.
@@ -428,7 +428,7 @@ def evaluate(
                 active.append(begin(place))
             if not active:
                 break
-            decided = [each for group in _alike(active) for each in decide(group)]
+            decided = [each for group in _group_alike(active) for each in decide(group)]
             for episode, actions in decided:
                 if episode.eager is not None and actions[0] < end:
                     episode.eager.begin(int(actions[0]))

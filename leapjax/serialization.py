@@ -18,7 +18,7 @@ IDENTITY = "identity"  # the array that says whose parameters are beside it
 T = TypeVar("T")
 
 
-def identity_digest(identity: str) -> np.ndarray:
+def hash_identity(identity: str) -> np.ndarray:
     """The SHA-256 of an identity: `[32]` uint8."""
     return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
 
@@ -45,7 +45,10 @@ def from_json(kind: type[T], values: Any, **types_of: type) -> T:
     needed = {n for n, f in fields.items() if f.default is f.default_factory is nothing}
     odd = sorted((values.keys() - fields.keys()) | (needed - values.keys()))
     if odd:
-        raise UserError(f"{kind.__name__}: missing or unknown {', '.join(odd)}")
+        raise UserError(
+            f"{kind.__name__}: missing or unknown {', '.join(odd)}: expected what this version of "
+            "leapjax writes; read it with the version that wrote it, or train again"
+        )
     converted = {name: _convert(hints[name], value, name) for name, value in values.items()}
     try:
         return kind(**converted)
@@ -91,7 +94,7 @@ def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
 
 
-def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def find_differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """What is not the default, part by part.
 
     Names made from it do not change when a setting is added later, with what was done before
@@ -101,7 +104,7 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
     for name, value in values.items():
         default = defaults.get(name)
         if isinstance(value, dict) and isinstance(default, dict):
-            value, default = differences(value, default), {}
+            value, default = find_differences(value, default), {}
         if value != default:
             found[name] = value
     return found

@@ -10,7 +10,7 @@ import numpy as np
 
 from leapjax import files
 from leapjax.errors import UserError, first_line
-from leapjax.serialization import IDENTITY, identity_digest
+from leapjax.serialization import IDENTITY, hash_identity
 from leapjax.types import Params
 
 ITEMSIZE = 2  # bytes of a number in half precision
@@ -29,13 +29,13 @@ def write(path: Path, params: Params, identity: str) -> None:
         ValueError: a parameter that is too large for half precision.
     """
     with np.errstate(over="ignore"):  # said below
-        arrays = {name: np.asarray(leaf, np.float16) for name, leaf in _by_name(params)}
+        arrays = {name: np.asarray(leaf, np.float16) for name, leaf in _name_parameters(params)}
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name} does not fit half precision")
-    with files.whole(path) as scratch, scratch.open("wb") as file:
+    with files.write_whole(path) as scratch, scratch.open("wb") as file:
         np.savez_compressed(
-            file, allow_pickle=False, **arrays, **{IDENTITY: identity_digest(identity)}
+            file, allow_pickle=False, **arrays, **{IDENTITY: hash_identity(identity)}
         )
 
 
@@ -52,13 +52,13 @@ def check_identity(path: Path, identity: str) -> list[int]:
     Raises:
         UserError: the file cannot be read, or is of another configuration.
     """
-    with _reading(path):
+    with _explain_failure(path):
         sizes = files.read_sizes(path)
         if sizes.pop(IDENTITY, 2**20) > HEADER:
-            raise _another(path)
+            raise _make_mismatch_error(path)
         with np.load(path, allow_pickle=False) as archive:
-            if not np.array_equal(archive[IDENTITY], identity_digest(identity)):
-                raise _another(path)
+            if not np.array_equal(archive[IDENTITY], hash_identity(identity)):
+                raise _make_mismatch_error(path)
     return [size // ITEMSIZE for size in sizes.values()]
 
 
@@ -74,25 +74,25 @@ def read(path: Path, like: Params, identity: str) -> Params:
         UserError: the file cannot be read, or is of another configuration.
     """
     check_identity(path, identity)
-    wanted = dict(_by_name(like))
-    with _reading(path):
+    wanted = dict(_name_parameters(like))
+    with _explain_failure(path):
         sizes = files.read_sizes(path)
         if sizes.keys() != wanted.keys() | {IDENTITY} or any(
             not 0 <= sizes[name] - ITEMSIZE * leaf.size <= HEADER for name, leaf in wanted.items()
         ):
-            raise _another(path)
+            raise _make_mismatch_error(path)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in wanted}
     for name, leaf in wanted.items():
         if (arrays[name].shape, arrays[name].dtype) != (leaf.shape, np.float16):
-            raise _another(path)
+            raise _make_mismatch_error(path)
     # NumPy converts: JAX would compile a program for each shape.
     leaves = [jnp.asarray(array.astype(np.float32)) for array in arrays.values()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
 @contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _explain_failure(path: Path) -> Iterator[None]:
     try:
         yield
     except UserError:
@@ -101,11 +101,11 @@ def _reading(path: Path) -> Iterator[None]:
         raise UserError(f"cannot read {path}: {first_line(error)}") from None
 
 
-def _another(path: Path) -> UserError:
+def _make_mismatch_error(path: Path) -> UserError:
     return UserError(f"{path} is of another configuration than the one beside it")
 
 
-def _by_name(params: Params) -> list[tuple[str, jax.Array]]:
+def _name_parameters(params: Params) -> list[tuple[str, jax.Array]]:
     """The leaves in the order of the tree, by their path in it."""
     leaves = jax.tree.leaves_with_path(params)
     return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves]

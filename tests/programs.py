@@ -16,7 +16,7 @@ import pytest
 from leapjax import domains, pretrained
 from leapjax.checkpoints import Checkpoints
 from leapjax.configuration import change, make_domain, specify
-from leapjax.files import only_process_in
+from leapjax.files import lock_folder
 from leapjax.presets import PRESETS
 from leapjax.running import command_line, results
 from leapjax.running import main as running
@@ -71,7 +71,9 @@ def untrained_run(folder, *options):
     pretrained.save_specification(folder, specification)
     agent = pretrained.make_agent(specification, domain)
     params = random_parameters(agent, 0.1)
-    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(specification))
+    saved = Checkpoints(
+        folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
+    )
     saved.save(TrainState(params, (), jnp.int32(specification.training.steps)))
     saved.close()
     return folder
@@ -81,7 +83,9 @@ def seal(folder):
     """Saves one parameter with the specification that is in a folder, whatever that says."""
     shutil.rmtree(folder / pretrained.CHECKPOINTS, ignore_errors=True)
     specification = pretrained.parse_specification(folder)
-    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(specification))
+    saved = Checkpoints(
+        folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
+    )
     params = {"w": jnp.ones((30, 30))} if specification.method != "random" else {}
     saved.save(TrainState(params, (), jnp.int32(specification.training.steps)))
     saved.close()
@@ -155,7 +159,7 @@ def place_with_a_run(tmp_path_factory):
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent
     place = Place(folder / "programs")
-    with only_process_in(place.folder, wait=True):
+    with lock_folder(place.folder, wait=True):
         if not place.rows("whole"):
             place.finish(place.start("whole"))
     return place

@@ -41,7 +41,7 @@ def counting_model():
 
 
 def test_actions_are_predicted_from_those_before_and_none_after():
-    right, counts = accuracy.hits(counting_model(), None, window([0, 1, 2, 0, 1]), end=True)
+    right, counts = accuracy.find_hits(counting_model(), None, window([0, 1, 2, 0, 1]), end=True)
     np.testing.assert_array_equal(right, [True, True, True, False, True])
     assert counts.all()
 
@@ -50,7 +50,7 @@ def test_actions_are_predicted_from_those_before_and_none_after():
 def test_what_comes_after_the_end_does_not_count(end):
     for third, known in ((2, True), (1, False)):  # the end is expected after 2 only
         model, plan = counting_model(), window([0, 1, third, END, END])
-        right, counts = accuracy.hits(model, None, plan, end)
+        right, counts = accuracy.find_hits(model, None, plan, end)
         np.testing.assert_array_equal(counts, [True, True, True, end, False])
         np.testing.assert_array_equal(right, [True, True, known, known and end, False])
 
@@ -83,7 +83,7 @@ def test_counts_are_those_of_every_step():
             for place, action in enumerate(ahead):
                 expected[0, place] += action == (ahead[place - 1] + 1 if place else 0)
                 expected[1, place] += 1
-    np.testing.assert_array_equal(accuracy.accuracy(planner, data, 10**15), expected)
+    np.testing.assert_array_equal(accuracy.count_hits(planner, data, 10**15), expected)
 
 
 @only_long

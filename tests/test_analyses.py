@@ -84,7 +84,7 @@ def test_every_way_of_every_program_runs(place, monkeypatch, program):
     """Of its first case; every method of its own."""
     of = program.ANALYSIS
     case = of.cases[0]
-    for method in cases.methods_of(case):
+    for method in cases.list_methods(case):
         plans = {} if method in ("leap", "classifier") else {"horizon": 1}
         small_one = of._replace(cases=[case], change=functools.partial(toy, **plans))
         monkeypatch.setattr(program, "ANALYSIS", small_one)
@@ -99,7 +99,7 @@ def test_every_case_can_be_made():
         names = [case.name for case in of.cases]
         assert len(set(names)) == len(names)
         for preset in ("leapjax", "paper"):
-            wanted = cases.check(of, Options(preset=preset))
+            wanted = cases.choose_cases(of, Options(preset=preset))
             assert [case.name for case in wanted] == names
         for case in of.cases:
             find_level(case.level)
@@ -110,7 +110,7 @@ def test_every_case_can_be_made():
 def test_ways_and_methods_can_be_chosen():
     def chosen(**options):
         options = Options(only=("composition-easy", "adaptation-hard"), **options)
-        found = cases.check(properties.ANALYSIS, options)
+        found = cases.choose_cases(properties.ANALYSIS, options)
         return {case.name: [way.name for way in case.ways] for case in found if case.ways}
 
     assert chosen(ways=("sum", "whole plan")) == {
@@ -125,8 +125,10 @@ def test_rows_are_named_by_all_that_matters():
 
     def name(seed=0, case=case, way=case.ways[1], **options):
         options = Options(**options)
-        settings = [cases.training_config(of, m, way.method, seed, options) for m in case.models]
-        return cases.row_name(of, case, way, settings, seed, options)
+        settings = [
+            cases.make_training_config(of, m, way.method, seed, options) for m in case.models
+        ]
+        return cases.hash_row(of, case, way, settings, seed, options)
 
     def changed(**changes):
         return name(way=case.ways[1]._replace(**changes))
@@ -135,13 +137,13 @@ def test_rows_are_named_by_all_that_matters():
         name(way=case.ways[0]), name(seed=1), name(episodes=100), name(preset="paper"),
         name(validation=True), changed(executed=1), changed(search=lambda given: given),
         changed(minimise=cases.alone), changed(remembers=True),
-        changed(minimise=properties.unseen(constraints.lava, weight=1.0)),
-        changed(minimise=properties.unseen(constraints.left_turns)),
+        changed(minimise=properties.penalise_unseen(constraints.lava, weight=1.0)),
+        changed(minimise=properties.penalise_unseen(constraints.left_turns)),
         name(case=case._replace(adapter=None)),
     ]  # fmt: skip
     assert len({name(), *others}) == 13
     assert name(force=True, record=True) == name()
-    same = properties.unseen(constraints.lava, weight=properties.WEIGHT)
+    same = properties.penalise_unseen(constraints.lava, weight=properties.WEIGHT)
     assert changed(minimise=same) == name()
 
 
@@ -150,9 +152,9 @@ def test_runs_with_the_augmentation_of_this_experiment_have_other_names():
 
     def settings(method, preset="leapjax"):
         options = Options(preset=preset)
-        config = cases.training_config(properties.ANALYSIS, model, method, 0, options)
+        config = cases.make_training_config(properties.ANALYSIS, model, method, 0, options)
         found = config.domain_settings
-        folder = cases.run_folder(config, 0).name.partition("-")[0]
+        folder = cases.find_run_folder(config, 0).name.partition("-")[0]
         return folder, *(getattr(found, name, None) for name in ("detours", "false_starts"))
 
     assert settings("leap") == ("augmented_babyai", 0.5, 0.6)
@@ -181,7 +183,7 @@ def test_what_cannot_be_is_one_line(arguments, message, place, monkeypatch, caps
 def test_tables_hold_todays_rows_beside_the_papers_numbers():
     of = ablation.ANALYSIS
     case, way = of.cases[0], of.cases[0].ways[2]
-    settings = [cases.training_config(of, m, "leap", 0, Options()) for m in case.models]
+    settings = [cases.make_training_config(of, m, "leap", 0, Options()) for m in case.models]
     row = {
         "experiment": "ablation", "case": case.name, "way": way.name, "method": "leap",
         "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
@@ -189,13 +191,13 @@ def test_tables_hold_todays_rows_beside_the_papers_numbers():
         "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
         "train_seconds": 300.0, "compile_seconds": 20.0, "eval_seconds": 40.0,
         "versions": {"machine": "x86_64"},
-        "hash": cases.row_name(of, case, way, settings, 0, Options()),
+        "hash": cases.hash_row(of, case, way, settings, 0, Options()),
     }  # fmt: skip
     stale = {**row, "successes": 0, "hash": "of another"}
-    told = analyses.compared(of, [row, stale], ways=[way.name], cases=["masked"])
+    told = analyses.compare_ways(of, [row, stale], ways=[way.name], cases=["masked"])
     (line,) = (line for line in told.splitlines() if "Gibbs" in line)
     assert "| 62.5% | - | 75.0%" in line and "2.0 ms" in line
-    assert "Gibbs" not in analyses.compared(of, [row], cases=["classifier"])
+    assert "Gibbs" not in analyses.compare_ways(of, [row], cases=["classifier"])
     assert report.is_used(row) and not report.is_used(stale)
 
 
@@ -214,15 +216,15 @@ def test_the_landscape_is_watched_while_it_forms(place, monkeypatch):
     assert (place / "runs" / "landscape.png").stat().st_size > 10_000
     for wrong in (["--trajectories", "0"], ["--record", "--steps", "3"]):
         assert landscape.main([*arguments, *wrong]) == 2
-    landscape.keep(path, [{**found, "preset": "paper"}, found])
+    landscape.keep_measurements(path, [{**found, "preset": "paper"}, found])
     assert [each["preset"] for each in json.loads(path.read_text())] == ["leapjax", "paper"]
 
 
 def test_a_share_of_actions_is_replaced_by_any_but_the_end():
     actions = jnp.full(7000, 2)
     for share in (0.0, 0.25, 1.0):
-        found = np.asarray(landscape.corrupted(jax.random.key(1), actions, share, end=6))
+        found = np.asarray(landscape.corrupt_actions(jax.random.key(1), actions, share, end=6))
         counts = np.bincount(found, minlength=7)
         assert counts[6] == 0
         assert counts[[0, 1, 3, 4, 5]] == pytest.approx(share * 7000 / 6, abs=120)  # 4 deviations
-    assert (landscape.corrupted(jax.random.key(1), actions, 0.0, end=6) == actions).all()
+    assert (landscape.corrupt_actions(jax.random.key(1), actions, 0.0, end=6) == actions).all()

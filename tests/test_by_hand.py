@@ -14,9 +14,9 @@ import optax
 import pytest
 
 from leapjax.agents import bc, bcq, classifier, cql, iql, mopo, plate, qr_dqn, rem
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.data import windows
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from tests import mixed, toy
 from tests.parameters import random_like
 from tests.programs import only_long
@@ -149,7 +149,7 @@ def test_bc():
 def test_classifier():
     case = make_case(classifier, classifier.Settings(), mixed.DOMAIN, horizon=4)
     setup, batch = case.setup, case.batch
-    call = caller(classifier.SequenceClassifier(setup.model, setup.sizes, setup.encoder()))
+    call = caller(classifier.SequenceClassifier(setup.model, setup.sizes, setup.make_encoder()))
     corrupted, degrees = jax.vmap(classifier.corrupt, (0, 0, 0, None))(
         KEYS, batch.actions, batch.imitated, toy.DOMAIN.num_actions
     )
@@ -165,7 +165,7 @@ def test_classifier():
 def test_bcq():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = around(case.batch)
-    say = many(case.setup.policy(("q", CHOICES), ("behaviour", CHOICES)))
+    say = many(case.setup.make_policy(("q", CHOICES), ("behaviour", CHOICES)))
     later, held = (say(of, steps.after) for of in (case.state.params, case.state.extra))
     likely = jax.nn.softmax(later["behaviour"])
     likely = likely / likely.max(axis=-1, keepdims=True) >= 0.9
@@ -197,8 +197,8 @@ def iql_loss(value, qs, least, logits, returns, taken):
 def test_iql():
     case = make_case(iql, iql.Settings(**IQL))
     steps, params = around(case.batch), case.state.params["params"]
-    critic = many(case.setup.policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)))
-    policy = many(case.setup.policy(("logits", CHOICES)))
+    critic = many(case.setup.make_policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)))
+    policy = many(case.setup.make_policy(("logits", CHOICES)))
     later = critic({"params": params["critic"]}, steps.after)["value"][..., 0]
     returns = steps.returned(later)
     held = critic(case.state.extra, steps.earlier)
@@ -219,7 +219,7 @@ def test_mopo():
     settings = mopo.Settings(**IQL, members=3, rollout=2, penalty=0.7, real_share=0.5)
     case = make_case(mopo, settings)
     steps, old, target = around(case.batch), case.state.params, case.state.extra
-    call = caller(mopo.Networks(case.setup.policy(("features", WIDTH)), CHOICES, 3))
+    call = caller(mopo.Networks(case.setup.make_policy(("features", WIDTH)), CHOICES, 3))
 
     seen, seen_later = (call(target, "features", of) for of in (steps.earlier, steps.after))
     later = call(old, "judge", call(old, "features", steps.after))[0]
@@ -277,7 +277,7 @@ def test_mopo():
 
 def test_cql():
     case = make_case(cql, cql.Settings(discount=DISCOUNT, alpha=0.7))
-    steps, say = around(case.batch), many(case.setup.policy(("q", CHOICES)))
+    steps, say = around(case.batch), many(case.setup.make_policy(("q", CHOICES)))
     later, held = (say(of, steps.after)["q"] for of in (case.state.params, case.state.extra))
     target = steps.returned(at(held, later.argmax(axis=-1)))
 
@@ -293,7 +293,7 @@ def test_qr_dqn():
     count = 3
     case = make_case(qr_dqn, qr_dqn.Settings(discount=DISCOUNT, quantiles=count))
     steps = around(case.batch)
-    apply = many(case.setup.policy(("q", CHOICES * count)))
+    apply = many(case.setup.make_policy(("q", CHOICES * count)))
 
     def say(params, contexts):
         """[B, P, N, 2]."""
@@ -322,7 +322,7 @@ def test_rem():
     count = 3
     case = make_case(rem, rem.Settings(discount=DISCOUNT, q_heads=count))
     steps = around(case.batch)
-    apply = many(case.setup.policy(("q", CHOICES * count)))
+    apply = many(case.setup.make_policy(("q", CHOICES * count)))
     mixtures = jnp.stack([rem.mixture(key, count) for key in DRAWS])
 
     def say(params, contexts):
@@ -345,7 +345,7 @@ def test_plate():
     horizon = 4
     case = make_case(plate, plate.Settings(state_weight=0.6), mixed.DOMAIN, horizon)
     actions, setup = case.batch.actions, case.setup
-    module = plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+    module = plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
     call = caller(module)
 
     def unrolled(params):

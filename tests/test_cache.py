@@ -9,11 +9,11 @@ import pytest
 
 import leapjax as leap
 from leapjax import methods
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from tests.parameters import random_parameters

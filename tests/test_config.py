@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import pytest
 
 import experiments.__main__ as programs
-from experiments.common.searches import searches
+from experiments.common.searches import list_searches
 from leapjax import domains, files, pretrained, serialization
-from leapjax.agents.learning import TrainingConfig
-from leapjax.configuration import configuration_hash, make_domain, resolved, specify
+from leapjax.agents.base import TrainingConfig
+from leapjax.configuration import hash_config, list_settings, make_domain, specify
 from leapjax.domains import DOMAINS, find_domain
 from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 from leapjax.presets import babyai, find_preset
 from leapjax.running import command_line, memory, shell
@@ -45,7 +45,7 @@ def parse(*arguments):
 def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {
-        configuration_hash(find_preset("babyai", level, method, name), seed)
+        hash_config(find_preset("babyai", level, method, name), seed)
         for level, method, name, seed in cases
     }
     assert len(hashes) == len(cases) > 80
@@ -57,21 +57,21 @@ def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
      "--radius 2", "--test-seed 1", "--validation", "--executed 3"],
 )  # fmt: skip
 def test_what_a_result_depends_on_is_in_its_hash(option):
-    assert configuration_hash(parse(*option.split()), 0) != configuration_hash(parse(), 0)
+    assert hash_config(parse(*option.split()), 0) != hash_config(parse(), 0)
 
 
 def test_what_it_does_not_depend_on_is_not():
     options = "--seeds 1 2 --record --runs elsewhere --no-pictures --checkpoint-seconds 1 --fsdp 2"
     more = "--microbatch 8 --demos 500"  # as the preset says
     found = parse(*options.split(), *more.split())
-    assert configuration_hash(found, 0) == configuration_hash(parse(), 0)
+    assert hash_config(found, 0) == hash_config(parse(), 0)
 
 
 def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
     def names(*options):
         chosen = parse(*options)
         specification = specify(chosen, 0, make_domain(chosen))
-        return configuration_hash(chosen, 0), pretrained.identity(specification)
+        return hash_config(chosen, 0), pretrained.describe_identity(specification)
 
     methods = [method for method in METHODS if METHODS[method].everywhere]
     before = [names("--method", method) for method in methods]
@@ -85,7 +85,7 @@ def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
 
 def test_the_settings_of_a_row_can_be_read_back():
     chosen = parse("--heads", "2", "--masking", "each", "--clutter", "0.2", "--steps", "7")
-    row = resolved(chosen, seed=0)
+    row = list_settings(chosen, seed=0)
     for group in GROUPS:
         settings = getattr(chosen, group)
         assert serialization.from_json(type(settings), row[group]) == settings
@@ -93,7 +93,7 @@ def test_the_settings_of_a_row_can_be_read_back():
             fewer = {name: value for name, value in row[group].items() if name != field.name}
             default = dataclasses.replace(settings, **{field.name: field.default})
             assert serialization.from_json(type(settings), fewer) == default
-        with pytest.raises(UserError, match="missing or unknown mood"):
+        with pytest.raises(UserError, match="unknown mood: expected what this version"):
             serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
@@ -133,9 +133,9 @@ def test_the_classifier_can_search_where_presets_fill_plans_action_by_action(dom
     found = {name: command_line.parse(domain, ["--method", name])[0]
              for name in ("leap", "classifier")}  # fmt: skip
     assert found["leap"].planner.fill == "confident"
-    ways = searches(found["classifier"])
+    ways = list_searches(found["classifier"])
     assert {way.planner.fill for way in ways} == {"together"}
-    assert len(searches(found["leap"])) > len(ways) > 5
+    assert len(list_searches(found["leap"])) > len(ways) > 5
 
 
 def test_every_program_is_known_by_name(capsys):

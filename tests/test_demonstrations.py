@@ -98,20 +98,6 @@ def test_the_full_view_bot_takes_a_shortest_way(name):
     assert through_doors > 0 or not name.endswith("Close")
 
 
-def test_the_full_view_bot_beats_the_exploring_one():
-    lengths = {FullViewBot: 0, BabyAIBot: 0}
-    for kind in lengths:
-        for seed in range(5):
-            env = reset("GoToObjMazeS7", seed)
-            bot, action, over = kind(env), None, False
-            while not over:
-                action = int(bot.replan(action))
-                _, _, terminated, truncated, _ = env.step(action)
-                over = terminated or truncated
-                lengths[kind] += 1
-    assert lengths[FullViewBot] < 0.8 * lengths[BabyAIBot]
-
-
 def doors(env) -> list[Door]:
     return [cell for cell in env.grid.grid if isinstance(cell, Door)]
 

@@ -21,19 +21,19 @@ def recorder(level: str, seed: int = 0) -> failures.Recorder:
 
 def test_causes_of_failure():
     idle = recorder("GoToLocalS7N5")
-    assert failures.cause(idle) == Cause.GAVE_UP
+    assert failures.find_cause(idle) == Cause.GAVE_UP
     idle.step(LEFT)
-    assert failures.cause(idle) == Cause.GAVE_UP
+    assert failures.find_cause(idle) == Cause.GAVE_UP
     while not idle.last.truncated:
         idle.step(LEFT)
-    assert failures.cause(idle) == Cause.CIRCLES
+    assert failures.find_cause(idle) == Cause.CIRCLES
 
     walker = recorder("GoToObjMazeS7")
     walker.cells += [(x, 0) for x in range(20)]
     walker.last = idle.last
-    assert failures.cause(walker) == Cause.WANDERS
+    assert failures.find_cause(walker) == Cause.WANDERS
     walker.env.carrying = object()
-    assert failures.cause(walker) == Cause.HOLDS
+    assert failures.find_cause(walker) == Cause.HOLDS
 
 
 def test_a_detour_is_what_the_way_is_longer_than_straight():
@@ -44,9 +44,9 @@ def test_a_detour_is_what_the_way_is_longer_than_straight():
         for y in (2, 4):
             found.env.grid.set(x, y, None)
     found.env.grid.set(5, 3, None)
-    assert failures.detour(found) == 8
+    assert failures.measure_detour(found) == 8
     found.env.grid.horz_wall(1, 3, 5)
-    assert failures.detour(found) is None
+    assert failures.measure_detour(found) is None
 
 
 def test_a_recorder_knows_the_way_that_was_walked():
@@ -81,9 +81,9 @@ def test_tasks_that_are_done_are_counted_through_nested_instructions():
     after = AfterInstr(goto(), both)
     for part in (both, after):
         part.a_done = part.b_done = False
-    assert failures.tasks_done(goto()) == [False]
-    assert failures.tasks_done(after) == [False, False, False]
+    assert failures.list_tasks_done(goto()) == [False]
+    assert failures.list_tasks_done(after) == [False, False, False]
     both.b_done = "success"
-    assert failures.tasks_done(after) == [False, False, True]
+    assert failures.list_tasks_done(after) == [False, False, True]
     both.a_done, after.b_done, after.a_done = "continue", "success", "continue"
-    assert failures.tasks_done(after) == [False, True, True]
+    assert failures.list_tasks_done(after) == [False, True, True]

@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 
 from leapjax import checkpoints, pretrained, weights
 from leapjax.checkpoints import Checkpoints
-from leapjax.configuration import blank, configuration_hash, make_domain, resolved, specify
+from leapjax.configuration import hash_config, list_settings, make_config, make_domain, specify
 from leapjax.data import storage
 from leapjax.domain import Collection
 from leapjax.errors import UserError
@@ -295,8 +295,8 @@ def parsed(domain, arguments):
 
     found = outcome(parse) or []
     for each in found:
-        assert len(configuration_hash(each, each.seeds[0])) == 12
-        assert "NaN" not in json.dumps(resolved(each, each.seeds[0]))
+        assert len(hash_config(each, each.seeds[0])) == 12
+        assert "NaN" not in json.dumps(list_settings(each, each.seeds[0]))
         assert each.context <= make_domain(each).max_steps and each.episodes > 0
         assert each.demos > 0 or each.training.steps == 0
     return found
@@ -332,7 +332,7 @@ def test_any_number_that_an_option_takes(domain):
     if domain == "gymnasium":  # nobody demonstrates it
         base += ["--demos", "0", "--steps", "0"]
     for method in METHODS if domain == "babyai" else ("leap", "iql"):
-        of = blank(domain, LEVELS[domain], method)
+        of = make_config(domain, LEVELS[domain], method)
         parts = [of.method_settings, of.planner]
         if method == "leap":  # what all methods have
             parts += [of, of.model, of.training, of.cluster, of.domain_settings]

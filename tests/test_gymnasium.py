@@ -360,7 +360,7 @@ def test_a_limit_of_steps_that_differs_is_the_users_choice():
 
 def saved_spaces(name, change):
     """Changes what a data set says of its spaces, as if it came from somewhere else."""
-    path = storage.datasets_folder() / name / "data" / "metadata.json"
+    path = storage.find_datasets_folder() / name / "data" / "metadata.json"
     metadata = json.loads(path.read_text())
     spaces = {each: json.loads(metadata[each]) for each in SPACES}
     change(spaces["observation_space"], spaces["action_space"])

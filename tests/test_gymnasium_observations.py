@@ -240,8 +240,8 @@ def test_statistics_are_kept_with_the_specification(tmp_path):
     before = specify(chosen, 0, domain)
     after = dataclasses.replace(before, statistics=domain.scaling.measure(data))
     assert after.statistics[0][0] == (0.0, 4.0)
-    assert "statistics" not in pretrained.identity(before)  # as of checkpoints from before
-    assert pretrained.identity(before) != pretrained.identity(after)
+    assert "statistics" not in pretrained.describe_identity(before)  # as of checkpoints from before
+    assert pretrained.describe_identity(before) != pretrained.describe_identity(after)
     pretrained.save_specification(tmp_path, after)
     assert pretrained.parse_specification(tmp_path) == after
     made = pretrained.make_domain(after).encoders["paper"](chosen.model, 0)

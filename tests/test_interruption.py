@@ -17,7 +17,7 @@ import pytest
 from experiments import babyai
 from leapjax.checkpoints import Checkpoints, restore_params
 from leapjax.errors import UserError
-from leapjax.files import only_process_in
+from leapjax.files import lock_folder
 from leapjax.running import jax_setup, results
 from leapjax.running import train as running_train
 from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
@@ -136,16 +136,16 @@ def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
         for look in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
             with pytest.raises(Interrupted, match="SIGTERM"):
                 look()
-        with pytest.raises(Interrupted, match="SIGTERM"), interruption.deferred():
+        with pytest.raises(Interrupted, match="SIGTERM"), interruption.defer_signals():
             pytest.fail("long work began")
 
 
 def test_a_deferred_signal_waits_and_a_second_one_does_not():
     refused = pytest.raises(Interrupted, match="SIGINT")
-    with catch_signals() as interruption, refused, interruption.deferred():
+    with catch_signals() as interruption, refused, interruption.defer_signals():
         os.kill(os.getpid(), signal.SIGINT)
         assert interruption.requested == signal.SIGINT
-    with catch_signals() as interruption, pytest.raises(Interrupted), interruption.deferred():
+    with catch_signals() as interruption, pytest.raises(Interrupted), interruption.defer_signals():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("the second waited")
@@ -156,7 +156,7 @@ def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, n
     monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
     with catch_signals(ended.append) as interruption:
-        with pytest.raises(Interrupted), interruption.deferred():
+        with pytest.raises(Interrupted), interruption.defer_signals():
             os.kill(os.getpid(), number)
             time.sleep(0.2)
         assert not ended
@@ -225,5 +225,5 @@ def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
 
 def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
     refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with only_process_in(tmp_path / "run"), refused, only_process_in(tmp_path / "run"):
+    with lock_folder(tmp_path / "run"), refused, lock_folder(tmp_path / "run"):
         pass

@@ -90,12 +90,6 @@ def test_every_registered_level_can_be_observed():
     assert shapes["BabyAI-OpenRedDoor-v0"] == (9, 5)
 
 
-def test_a_registered_id_is_not_the_papers_level_of_that_name():
-    env = levels.make_environment(levels.find_level("BabyAI-GoToObjMazeS4-v0"))
-    reset(env, 0)
-    assert not any(door.is_open for door in of_kind(env, "door"))
-
-
 def test_level_generation_prints_nothing(capsys):
     level = levels.find_level("GoToSeqS5R2")
     env = levels.make_environment(level)

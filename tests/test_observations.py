@@ -77,32 +77,6 @@ def test_an_observation_is_the_whole_state(name):
     assert picked > 10  # the walks did carry things
 
 
-def test_types_and_shapes_never_change():
-    level = levels.find_level("PickUpLoc")
-    observation = BabyAIAdapter(level).reset(0)
-    expected = {
-        "grid": ((8, 8, 3), np.uint8),
-        "pose": ((3,), np.int32),
-        "carried": ((2,), np.int32),
-        "goal": ((2,), np.int32),
-        "instruction": ((level.words,), np.int32),
-    }
-    found = {f: (v.shape, v.dtype) for f, v in observation._asdict().items()}
-    assert found == expected
-
-
-def test_observing_changes_nothing():
-    adapter = BabyAIAdapter(levels.find_level("GoToObjMazeS4R2Close"))
-    adapter.reset(0)
-    before = adapter.env.hash(64), adapter.env.step_count
-    first = adapter.observe()
-    observations.nearest_goal(adapter.env)
-    second = adapter.observe()
-    assert (adapter.env.hash(64), adapter.env.step_count) == before
-    first.grid[:] = 0  # nor do two observations share their grid
-    assert second.grid.any() and adapter.observe().grid.any()
-
-
 @pytest.mark.parametrize(
     ("name", "seeds"),
     [

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from leapjax.agents import plate
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.data import windows
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
 from tests.parameters import random_parameters
@@ -47,7 +47,7 @@ class Untrained:
         self.contexts = quick_jit(self.agent.batch)(jax.random.key(2), data()).context
         first = jax.tree.map(lambda x: x[0], self.contexts)
         self.context = windows.context_at(first, 0, past)
-        module = plate.AlternatingModel(setup.model, setup.sizes, setup.encoder())
+        module = plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
         self.apply = functools.partial(module.apply, self.params)
         self.memory = quick_jit(self.agent.energy.encode)(self.params, self.context)
         conditional = functools.partial(quick_jit(self.agent.energy.conditional), self.params)

@@ -89,7 +89,7 @@ def test_alone_a_process_agrees_with_itself():
     def refuse():
         raise UserError("no")
 
-    for ask in (processes.first_does, processes.together):
+    for ask in (processes.run_on_first, processes.run_together):
         assert ask(lambda: 3) == 3
         with pytest.raises(UserError, match="no"):
             ask(refuse)

@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from experiments import qualitative
-from experiments.babyai_drawing import COLOURS, picture, way_of
-from experiments.common.episodes import watched
+from experiments.babyai_drawing import COLOURS, draw_picture, find_way
+from experiments.common.episodes import watch_episode
 from leapjax import pretrained, rollouts
 from leapjax.domains.babyai.adapter import END, BabyAIAdapter
 from leapjax.domains.babyai.levels import find_level
@@ -33,7 +33,7 @@ def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
     plans = 0
     for row, level_seed in enumerate(seeds):
         adapter = BabyAIAdapter(LEVEL)
-        events = list(watched(adapter, planner, 0, level_seed, seed=3, executed=executed))
+        events = list(watch_episode(adapter, planner, 0, level_seed, seed=3, executed=executed))
         steps = [event for event in events if not isinstance(event, Plan)]
         plans += len(events) - len(steps)
         assert len(steps) == played.lengths[row]
@@ -45,16 +45,16 @@ def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
 def test_a_way_is_what_a_plan_would_do_and_is_drawn():
     adapter = BabyAIAdapter(LEVEL)
     adapter.reset(0)
-    turns = next(n for n in range(4) if len(set(way_of(adapter, [RIGHT] * n + [FORWARD]))) == 2)
+    turns = next(n for n in range(4) if len(set(find_way(adapter, [RIGHT] * n + [FORWARD]))) == 2)
     plan = [RIGHT] * turns + [FORWARD, END, FORWARD]
     before = agent_cell(adapter.env)
-    cells = way_of(adapter, plan)
+    cells = find_way(adapter, plan)
     assert agent_cell(adapter.env) == before == cells[0]  # nothing was done
     for action in plan[: turns + 1]:
         adapter.step(action)
     assert agent_cell(adapter.env) == cells[-1] and len(cells) == turns + 2
-    plain = np.asarray(picture(adapter, "text"))
-    drawn = np.asarray(picture(adapter, "text", [cells]))
+    plain = np.asarray(draw_picture(adapter, "text"))
+    drawn = np.asarray(draw_picture(adapter, "text", [cells]))
     changed = drawn[(plain != drawn).any(axis=-1)]
     assert len(changed) > 30 and (changed == COLOURS[0]).all()
 
@@ -67,7 +67,7 @@ def test_both_figures_are_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr(qualitative, "ITERATIONS", (2,))
     monkeypatch.setattr(qualitative, "PLANNED", ("GoToLocalS7N5",))
     monkeypatch.setattr(qualitative, "ASKED", (("composition-easy", "sum"),))
-    monkeypatch.setattr(qualitative.analysis, "models_of", lambda *_: [untrained, untrained])
+    monkeypatch.setattr(qualitative.cases, "load_models", lambda *_: [untrained, untrained])
     assert qualitative.main(["--test-seed", "0"]) == 0
     refined, asked = (Image.open(tmp_path / "runs" / f"{name}.png") for name in qualitative.FIGURES)
     assert refined.size == (2 * 336, 370) and asked.size == (336, 370)

@@ -223,7 +223,7 @@ def test_code_that_a_checkpoint_names_runs_only_if_the_caller_names_it(workplace
 
 def test_code_that_data_name(trap, monkeypatch):
     described = storage.Described("evilmod:Evil-v0", 3)
-    monkeypatch.setattr(storage, "described", lambda name: described)
+    monkeypatch.setattr(storage, "describe_dataset", lambda name: described)
     with pytest.raises(UserError, match="mine/data-v0 names the level evilmod:Evil-v0"):
         parse("gymnasium", ["--demonstrations", "mine/data-v0"])
     assert not trap.exists()
@@ -235,7 +235,7 @@ def test_code_that_data_name(trap, monkeypatch):
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "folder/" + "x" * 300, 7])
 def test_a_path_that_the_system_cannot_look_for(name, workplace):
     (workplace / "folder").mkdir()
-    for use in (leap.load, checkpoints.newest, Checkpoints, files.check_path):
+    for use in (leap.load, checkpoints.find_newest, Checkpoints, files.check_path):
         with pytest.raises(UserError, match="cannot look for|expected a path") as raised:
             use(name if not isinstance(name, str) else Path(name))
         assert len(str(raised.value)) < 200
@@ -268,7 +268,7 @@ def test_links_that_were_planted_in_a_shared_folder(workplace):
     files.write_text(shared / "row.json", "new")
     assert files.read_text(shared / "row.json") == "new"
     refused = pytest.raises(UserError, match="cannot write to .*shared.*symbolic links")
-    with refused, files.only_process_in(shared):
+    with refused, files.lock_folder(shared):
         pass
     assert mine.read_text() == "precious"
 

@@ -83,7 +83,7 @@ def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(spoil, reas
     collection = storage.load(recorded(NAMES["partial"], spoil=spoil), DOMAIN)
     assert collection.dropped == {reason: 1}
     assert [d.seed for d in collection.demonstrations] == [1000, 1002, 1003, 1004]
-    assert storage.reasons(collection) == f"1 {reason}"
+    assert storage.describe_dropped(collection) == f"1 {reason}"
 
 
 def test_an_episode_that_ends_at_another_match_is_dropped_and_counted():
@@ -95,7 +95,7 @@ def test_an_episode_that_ends_at_another_match_is_dropped_and_counted():
 
 def test_episodes_that_go_otherwise_are_dropped_and_counted():
     name = recorded(NAMES["partial"], episodes=6)
-    with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
+    with h5py.File(file_of(storage.find_datasets_folder(), name), "a") as file:
         file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never was
         file["episode_2"].attrs["seed"] = 5  # of another level
         file["episode_3/rewards"][-1] = 0.123
@@ -106,7 +106,7 @@ def test_episodes_that_go_otherwise_are_dropped_and_counted():
     found = storage.load(name, DOMAIN)
     assert found.dropped == {replay.DIFFERENT: 3, replay.NO_SEED: 1, replay.INCOMPLETE: 1}
     assert [d.seed for d in found.demonstrations] == [1000]
-    with h5py.File(file_of(storage.datasets_folder(), name), "a") as file:
+    with h5py.File(file_of(storage.find_datasets_folder(), name), "a") as file:
         file["episode_0/observations/image"][0] = 0
     with pytest.raises(UserError, match="can be used, only 4 that go otherwise"):
         storage.load(name, DOMAIN)
@@ -120,7 +120,7 @@ def test_the_level_follows_from_the_data_and_must_be_theirs():
         UserError, match=f"is of {LEVEL}, not of GoToLocalS7N5: use --level {LEVEL}"
     ):
         command_line.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
-    assert storage.described("no/such/set-v0").level is None
+    assert storage.describe_dataset("no/such/set-v0").level is None
 
 
 def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):

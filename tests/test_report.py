@@ -6,7 +6,7 @@ from pathlib import Path
 from experiments import report
 from experiments.common import figures
 from experiments.tables import babyai, puzzles
-from leapjax.configuration import configuration_hash
+from leapjax.configuration import hash_config
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
 from tests.programs import with_options
@@ -24,7 +24,7 @@ def row(
         "first_episode_seed": config.test_seed, "episodes": config.episodes,
         "successes": round(rate * config.episodes), "mean_length": mean_length,
         "train_steps": 0 if played else config.training.steps,
-        "hash": configuration_hash(config, seed),
+        "hash": hash_config(config, seed),
     }  # fmt: skip
 
 
@@ -42,7 +42,7 @@ def cells(table, level):
 
 
 def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_again():
-    found = cells(babyai.success(ROWS), "S8N7")
+    found = cells(babyai.compare_settings(ROWS), "S8N7")
     assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
     assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
     assert found[5] == "-"
@@ -55,7 +55,7 @@ def test_settings_are_kept_apart():
         row(played=True, executed=3, rate=1.0, mean_length=4.0),
         row(played=True, executed=1, rate=0), row(played=True, iterations=1, rate=0),
     ]  # fmt: skip
-    found = cells(babyai.success([*ROWS, *others]), "S8N7")
+    found = cells(babyai.compare_settings([*ROWS, *others]), "S8N7")
     assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
 
 
@@ -65,7 +65,7 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
         row(method="bc", name="paper", rate=0.2), row("PickUpLoc"),
         row(method="dt", steps=1, rate=1.0),  # not the preset's
     ]  # fmt: skip
-    lines = babyai.methods(rows).splitlines()[2:]
+    lines = babyai.compare_methods(rows).splitlines()[2:]
     found = {line[2]: line[3:] for line in ([c.strip() for c in x.split("|")] for x in lines)}
     assert list(found) == ["the paper", "preset paper", "preset leapjax"]  # of one level
     assert found["the paper"][:-1] == [
@@ -74,13 +74,13 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     told = [cell.split("%")[0] for cell in found["preset leapjax"]]
     assert told[:-1] == ["-", "**95.0", *"-----", "90.0"]
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
-    names, found = babyai.COMPARED, babyai.success_by_method(rows)
-    figures.methods_by_level(found, names, tmp_path / "methods.png")
+    names, found = babyai.COMPARED, babyai.compute_success_by_method(rows)
+    figures.draw_methods(found, names, tmp_path / "methods.png")
     assert (tmp_path / "methods.png").stat().st_size > 5_000
     everywhere = [row(level, method="bc", rate=0.5) for level in LEVELS]
-    aggregated = babyai.aggregates([*everywhere, row("PickUpLoc")])
+    aggregated = babyai.compute_aggregates([*everywhere, row("PickUpLoc")])
     assert list(aggregated) == ["LEAP, the paper's numbers", "bc, leapjax"]  # not of one level
-    figures.intervals(aggregated, tmp_path / "aggregate.png")
+    figures.draw_intervals(aggregated, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 
 
@@ -92,7 +92,7 @@ def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
         "domain": domain, "level": level, "method": method, "preset": "leapjax", "seed": seed,
         "first_episode_seed": config.test_seed, "episodes": 100, "successes": round(100 * rate),
         "iterations": config.planner.iterations, "train_steps": config.training.steps,
-        "hash": configuration_hash(config, seed),
+        "hash": hash_config(config, seed),
     }  # fmt: skip
 
 
@@ -108,15 +108,15 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
     assert [report.is_used(row) for row in rows] == [True] * 6 + [False]
     columns = ["Star3x5, learned", "Sudoku4x6, rules", "Sudoku4x6, learned and rules"]
     lines = [[cell.strip() for cell in line.split("|")[1:-1]]
-             for line in puzzles.searches(rows, columns).splitlines()[2:]]  # fmt: skip
+             for line in puzzles.compare_searches(rows, columns).splitlines()[2:]]  # fmt: skip
     found = {tuple(line[:2]): [cell.split(" ")[0] for cell in line[2:]] for line in lines}
     assert found["most certain first", "T"] == ["95.0%", "-", "70.0%"]
     assert found["Gibbs sampling, random order", "2 T"] == ["30.0%", "-", "-"]
     assert found["all at once", "1"] == ["-", "60.0%", "-"]
-    by_passes = puzzles.success_by_passes(rows)
+    by_passes = puzzles.group_by_passes(rows)
     assert by_passes["Star3x5, learned"] == {
         "most certain first": {5: {"successes": 190, "episodes": 200}},
         "Gibbs sampling, random order": {10: {"successes": 30, "episodes": 100}},
     }
-    figures.iterations_by_level(by_passes, tmp_path / "searches.png")
+    figures.draw_iterations(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0

@@ -107,11 +107,11 @@ def test_an_object_that_names_a_field_twice(tmp_path):
 )
 def test_measurements_that_no_table_can_show(tmp_path, name, change, says):
     path = tmp_path / f"{name}.json"
-    values = measured.read(ROOT / "results" / path.name)
+    values = measured.read_measured(ROOT / "results" / path.name)
     change(values)
     path.write_text(json.dumps(values))
     with pytest.raises(UserError, match=says):
-        measured.read(path)
+        measured.read_measured(path)
 
 
 def test_a_row_is_json_or_refused(tmp_path):

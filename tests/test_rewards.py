@@ -9,10 +9,10 @@ import pytest
 
 from leapjax import batching
 from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, returns
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domain import Scaling
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
 from tests.programs import only_long
@@ -156,10 +156,12 @@ def test_the_return_that_is_wanted_is_less_by_what_was_given():
     """In units that do not saturate; where a demonstration tells the rest, that is taken."""
     domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
     settings = dt.Settings(target_return=10.0)
-    wanted = returns.wanted(Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings))
+    compute = returns.condition_on_target(
+        Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings)
+    )
     context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 2.0]), return_so_far=3.0)
-    np.testing.assert_allclose(wanted(context), np.array([10, 9, 7]) / 4)
-    np.testing.assert_allclose(wanted(context, jnp.float32(5)), np.array([8, 7, 5]) / 4)
+    np.testing.assert_allclose(compute(context), np.array([10, 9, 7]) / 4)
+    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([8, 7, 5]) / 4)
 
 
 @pytest.mark.parametrize("name", ["bc", "dt", "bcq", "iql", "mopo", "cql", "qr_dqn", "rem"])

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from leapjax.agents import bc, cql, leap
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.agents.batches import run_batches
-from leapjax.agents.learning import Setup, TrainingConfig
 from leapjax.data import windows
 from leapjax.domain import Augmentations
 from leapjax.domains.babyai.encoders import state_tokens as babyai
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from tests import toy
 from tests.parameters import random_state
 from tests.programs import only_long
@@ -25,7 +25,7 @@ from tests.quick import quick_jit
 
 CONTEXT, HORIZON, RUN = 2, 3, 4
 MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0.0)
-TRAINING = TrainingConfig(steps=10, batch=12, run=RUN, windows="step")
+TRAINING = TrainingConfig(steps=10, batch=12, consecutive=RUN, windows="step")
 
 
 class StateTokens(Encoder):
@@ -45,7 +45,7 @@ DOMAIN = toy.DOMAIN._replace(
 
 
 def setup(run=RUN, domain=DOMAIN, **settings) -> Setup:
-    training = dataclasses.replace(TRAINING, run=run)
+    training = dataclasses.replace(TRAINING, consecutive=run)
     chosen = leap.Settings(masking="each", **settings)
     return Setup(domain, CONTEXT, HORIZON, MODEL, training, chosen)
 
@@ -124,10 +124,10 @@ def test_a_run_is_augmented_as_a_whole(data):
 
 
 def test_where_runs_win_nothing_they_are_refused():
-    with pytest.raises(ValueError, match="batch of 12 windows is not made of runs of 5"):
-        dataclasses.replace(TRAINING, run=5)
-    with pytest.raises(ValueError, match="run"):
-        dataclasses.replace(TRAINING, run=0)
+    with pytest.raises(ValueError, match="batch of 12 windows is not a multiple of 5"):
+        dataclasses.replace(TRAINING, consecutive=5)
+    with pytest.raises(ValueError, match="consecutive"):
+        dataclasses.replace(TRAINING, consecutive=0)
     model = dataclasses.replace(MODEL, architecture="leapjax")
     single = setup()._replace(horizon=1)
     for method, made in (
@@ -135,8 +135,10 @@ def test_where_runs_win_nothing_they_are_refused():
         (bc.BC, single._replace(settings=bc.Settings())),
         (cql.CQL, single._replace(settings=cql.Settings())),
     ):
-        with pytest.raises(UserError, match="runs of 4 windows: only LEAP with architecture paper"):
+        with pytest.raises(
+            UserError, match="4 consecutive windows: only LEAP with architecture paper"
+        ):
             method.make_agent(made, None)
     encoders = {"paper": lambda model, context: babyai.StateTokens(7, model.width)}
-    with pytest.raises(UserError, match="runs of 4 windows without repeated states"):
+    with pytest.raises(UserError, match="4 consecutive windows without repeated states"):
         leap.make_agent(setup(domain=DOMAIN._replace(encoders=encoders), repeat_state=False))

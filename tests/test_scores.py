@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from experiments import report
-from experiments.tables.cells import outcomes
+from experiments.tables.cells import collect_outcomes
 from leapjax import scores
 from leapjax.scores import (
     aggregate,
@@ -98,12 +98,12 @@ def test_intervals_contain_the_truth_as_often_as_they_say(seeds, rate, correlati
 
 def test_the_default_correlation_is_that_of_the_recorded_episodes():
     """Pooled over the settings of BabyAI that have several seeds."""
-    rows = report.rows_of(ROOT, "babyai")
+    rows = report.read_rows(ROOT, "babyai")
     by_setting = {}
     for row in rows:
         setting = {**row["configuration"], "seed": None}
         by_setting.setdefault(json.dumps(setting, sort_keys=True), []).append(row)
-    found = [outcomes(of) for of in by_setting.values() if len(of) > 1]
+    found = [collect_outcomes(of) for of in by_setting.values() if len(of) > 1]
     matrices = [each for each in found if isinstance(each, np.ndarray)]
     assert len(matrices) > 50
     _, levels, rest = np.sum([variance_components(each) for each in matrices], axis=0)

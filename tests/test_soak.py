@@ -9,12 +9,12 @@ import jax.numpy as jnp
 
 from leapjax import batching, planners, rollouts, sharding, training
 from leapjax.agents import leap
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.running import results
 from tests.programs import only_long, toy_row
 

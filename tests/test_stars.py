@@ -1,7 +1,5 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,21 +8,20 @@ from PIL import Image
 
 from experiments import star_animation, stars
 from experiments.common import searches
-from leapjax.agents.learning import Setup
+from leapjax.agents.base import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.domain import Settings, make
 from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
-from leapjax.energy import from_total
 from leapjax.errors import UserError
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
-from tests.programs import only_long, with_options
+from tests.programs import only_long
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
@@ -213,21 +210,6 @@ def test_presets_and_data_that_there_are_not(capsys):
     domain.demonstrations.check(states, "here")
     with pytest.raises(UserError, match="here: goal run from 50 to 50, expected 0 to 49"):
         domain.demonstrations.check(states._replace(goal=np.full(5, 50)), "here")
-
-
-@pytest.mark.parametrize("horizon", [2, 5])
-def test_what_judges_no_open_plan_is_animated_without_filling(horizon, tmp_path):
-    """And plans that are shorter or longer than the way are, too."""
-    star = Star(2, 3)
-    other = {"horizon": horizon, "iterations": 2}
-    config = with_options(find_preset("stars", "Star2x3", "classifier", "leapjax"), other)
-    num_actions = StarAdapter(star).num_actions
-    energy = from_total(lambda p, context: (), lambda p, m, plan: 0.0 * plan.sum(), num_actions)
-    run = SimpleNamespace(config=config, domain=SimpleNamespace(level="Star2x3"), seed=0)
-    planner = SimpleNamespace(energy=energy, params=(), specification=SimpleNamespace(context=0))
-    star_animation.animate(planner, run, [0], tmp_path / "plan.gif")
-    with Image.open(tmp_path / "plan.gif") as animation:
-        assert animation.width == star_animation.side_of(star)  # one planner
 
 
 @only_long

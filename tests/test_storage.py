@@ -141,7 +141,7 @@ def test_observations_of_another_world_are_refused(minari_folder):
 
 def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
     name = "leapjax/GoToLocalS7N5/bot-5-seed0-v1"
-    assert storage.dataset_id(LEVEL, 5, 0) == name.replace("v1", "v2")
+    assert storage.name_dataset(LEVEL, 5, 0) == name.replace("v1", "v2")
     save(saved, name)
     assert "earlier version" in refused(name)
     save(saved, name.replace("v1", "v2"))
@@ -172,7 +172,7 @@ def killed_save(patched, name, calls, demonstrations):
 def test_a_killed_save_leaves_nothing_under_the_name(moment, local_demonstrations, minari_folder):
     killed_save(*moment, 1, local_demonstrations)
     assert any(minari_folder.glob(f"{writing.SCRATCH}*"))  # what a killed program leaves behind
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Minari warns of what is no data set
         assert list(minari.list_local_datasets()) == []
@@ -186,7 +186,7 @@ def test_a_killed_save_leaves_what_was_there(saved):
     killed_save(MinariStorage, "update_metadata", 1, saved[:1])
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
     killed_save(Path, "rename", 2, saved[:1])  # between two names: the next save mends it
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
     save(saved[:1], "leapjax/other-v0")
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
@@ -220,7 +220,7 @@ def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
     monkeypatch.setattr(MinariStorage, "update_metadata", full)
     with pytest.raises(UserError, match="cannot write the data set .*No space left on device"):
         save(local_demonstrations)
-    assert not storage.exists(NAME)
+    assert not storage.has_dataset(NAME)
 
 
 @pytest.mark.parametrize("path", ["file", "", "file/sets"])
@@ -229,17 +229,17 @@ def test_a_folder_of_data_sets_that_cannot_be(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", path)
     with pytest.raises(UserError, match="MINARI_DATASETS_PATH"):
-        storage.exists(NAME)
+        storage.has_dataset(NAME)
 
 
 @pytest.mark.parametrize("name", ["leapjax/none-v0", "no such name!", "leapjax/GoToLocalS7N5"])
 def test_a_missing_data_set(saved, name):
     assert "no Minari data set" in refused(name)
-    assert storage.exists(NAME) and not storage.exists("a" * 300)
+    assert storage.has_dataset(NAME) and not storage.has_dataset("a" * 300)
 
 
 def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
-    ours, theirs = storage.dataset_id(LEVEL, 1, 0), "my/own-v0"
+    ours, theirs = storage.name_dataset(LEVEL, 1, 0), "my/own-v0"
     for name in (ours, theirs):
         (minari_folder / name / "data").mkdir(parents=True)
         assert "cannot be read" in refused(name)
@@ -469,7 +469,7 @@ def test_a_frame_of_another_size_is_not_unpacked(minari_folder, monkeypatch, sha
 def test_a_users_data_set_without_seeds(local_demonstrations):
     given = local_demonstrations[0]
     states, steps = given.observations._asdict(), len(given.actions)
-    other_data_set(storage.observation_space(LEVEL.blank), states)
+    other_data_set(storage.make_observation_space(LEVEL.blank), states)
     expected = given._replace(
         actions=np.zeros(steps, np.int32), rewards=np.arange(steps, dtype=np.float32),
         terminated=False, truncated=True, seed=storage.UNKNOWN_SEED,
@@ -477,9 +477,20 @@ def test_a_users_data_set_without_seeds(local_demonstrations):
     assert_same(storage.load(NAME, LEVEL).demonstrations, [expected])
 
 
+def test_minigrids_own_observations_need_a_seed(local_demonstrations):
+    states = local_demonstrations[0].observations
+    mission = ["go to it"] * len(states.pose)
+    given = {"image": states.grid, "direction": states.pose[:, 2], "mission": mission}
+    picture = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8)
+    words = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
+    space = gym.spaces.Dict(image=picture, direction=gym.spaces.Discrete(4), mission=words)
+    other_data_set(space, given)
+    assert "can be used, only 1 without the seed of their reset" in refused()
+
+
 def test_every_level_has_a_cache_of_its_own():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
-    ids = [storage.dataset_id(LEVEL._replace(level=level.name), 500, 0) for level in known]
-    ids += [storage.dataset_id(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
+    ids = [storage.name_dataset(LEVEL._replace(level=level.name), 500, 0) for level in known]
+    ids += [storage.name_dataset(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
     shared = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
     assert not shared

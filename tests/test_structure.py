@@ -13,8 +13,8 @@ import pytest
 import leapjax
 from experiments import report
 from leapjax import types
-from leapjax.agents.learning import TrainingConfig
-from leapjax.models.trajectory import ModelConfig
+from leapjax.agents.base import TrainingConfig
+from leapjax.models.config import ModelConfig
 from leapjax.running import jax_setup, results
 from tests.programs import LONG, ROOT
 
@@ -62,13 +62,13 @@ def test_the_readme_snippets_run():
 
 
 def test_the_tables_are_what_the_rows_say():
-    documents = report.documents(ROOT)
+    documents = report.make_documents(ROOT)
     for path, text in documents.items():
         assert path.read_text() == text, f"{path}: run python -m experiments.report"
 
 
 def test_no_row_is_stale():
-    rows = report.rows_of(ROOT, *report.EXPERIMENTS)
+    rows = report.read_rows(ROOT, *report.EXPERIMENTS)
     stale = [row for row in rows if not report.is_used(row)]
     assert not [(row["level"], row["preset"], row["hash"]) for row in stale]
 

@@ -220,19 +220,6 @@ def test_mirrors_and_turns_are_a_group_and_move_agent_and_goal_with_the_grid(sta
     same(turned.instruction, state.instruction)
 
 
-@settings(max_examples=40, deadline=None)
-@given(any_observation, st.permutations(range(6)), st.permutations([KEY, BALL, BOX]))
-def test_renaming_back_is_the_identity(state, colours, order):
-    objects = dict(zip((KEY, BALL, BOX), order, strict=True))
-    there = recolouring(np.array(colours), objects)
-    back = recolouring(np.argsort(colours), {new: old for old, new in objects.items()})
-    renamed = rename(state, there)
-    assert_same_observation(rename(renamed, back), state)
-    uncoloured = (state.grid[..., 0] < 4) | (state.grid[..., 0] > 7)
-    same(np.asarray(renamed.grid)[uncoloured], state.grid[uncoloured])
-    same(rename(state._replace(carried=np.zeros(2, np.int32)), there).carried, [0, 0])
-
-
 restate_ids = jax.jit(symmetries.restate)
 
 

@@ -10,13 +10,15 @@ import optax
 import pytest
 
 from leapjax import schedules, sharding, training
-from leapjax.agents import leap, learning
-from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Setup, TrainingConfig
+from leapjax.agents import leap
+from leapjax.agents.base import Setup, TrainingConfig
+from leapjax.agents.batches import make_blank_steps, window_batches
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import make_update
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import Augmentations, blank_context
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
@@ -232,7 +234,7 @@ def test_a_loss_that_is_not_finite_names_its_step(bad, step):
 
 def test_weight_decay_leaves_embeddings_norms_and_biases():
     config = TrainingConfig(steps=100, warmup=0, learning_rate=0.5, weight_decay=0.1)
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {
         "dense": {"kernel": jnp.ones((2, 2)), "bias": jnp.ones(2)},
         "norm": {"scale": jnp.ones(2)},
@@ -246,7 +248,7 @@ def test_weight_decay_leaves_embeddings_norms_and_biases():
 
 def learning_rates(config: TrainingConfig) -> np.ndarray:
     """What each step really moves: Adam's update of a constant gradient is the rate itself."""
-    optimizer = learning.make_optimizer(config)
+    optimizer = make_optimizer(config)
     params = {"bias": jnp.zeros(())}
 
     def step(state, _):
@@ -276,7 +278,7 @@ def test_a_short_run_warms_up_for_a_tenth_of_it_at_most(steps):
 def test_gradients_are_clipped_by_their_global_norm():
     # Adam forgets the scale of a gradient, so look at what it remembers of the first.
     config = TrainingConfig(steps=10, warmup=0, clip=1.0)
-    optimizer, params = learning.make_optimizer(config), {"bias": jnp.zeros(2)}
+    optimizer, params = make_optimizer(config), {"bias": jnp.zeros(2)}
     for gradient, clipped in ([0.3, 0.4], [0.3, 0.4]), ([30.0, 40.0], [0.6, 0.8]):
         _, state = optimizer.update({"bias": jnp.array(gradient)}, optimizer.init(params), params)
         moment = optax.tree.get(state, "mu")["bias"] / (1 - config.betas[0])
@@ -312,7 +314,7 @@ def test_a_step_split_over_devices_is_the_step_of_one(fsdp, data):
     assert mesh.size == 8
     data = sharding.replicate(data, mesh)
     agent = leap.make_agent(setup(), mesh)
-    begin, step = training.compile_ahead(agent, mesh, learning.blank_steps(toy.DOMAIN))
+    begin, step = training.compile_ahead(agent, mesh, make_blank_steps(toy.DOMAIN))
     state, key = begin(0)
     rows = step.draw(key, state.step, data)
     assert_identical(rows, drawn)
@@ -386,7 +388,7 @@ def average_agent(mesh) -> Agent:
         extra = {"average": jnp.ones((SIZE, SIZE))}
         return TrainState(params, optimizer.init(params), jnp.int32(0), extra)
 
-    update = learning.make_update(loss, optimizer, mesh, next_extra)
+    update = make_update(loss, optimizer, mesh, next_extra)
     return Agent(init, lambda key, data: data, update, None)
 
 

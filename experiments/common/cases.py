@@ -20,7 +20,7 @@ from rich.table import Table
 
 from leapjax import checkpoints, files, pretrained, rollouts
 from leapjax.batching import compile_planner
-from leapjax.configuration import AnyConfig, configuration_hash
+from leapjax.configuration import AnyConfig, hash_config
 from leapjax.data import seeds, windows
 from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
@@ -41,13 +41,13 @@ from leapjax.running.programs import PLANS_TOGETHER
 from leapjax.running.results import Row
 from leapjax.running.run import Experiment, find_folder, open_run
 from leapjax.running.train import train
-from leapjax.serialization import differences
+from leapjax.serialization import find_differences
 from leapjax.types import Energy
 
 Change = Callable[[AnyConfig], AnyConfig]
 
 
-def unchanged(config: AnyConfig) -> AnyConfig:
+def keep_config(config: AnyConfig) -> AnyConfig:
     """Returns a configuration as it is."""
     return config
 
@@ -61,7 +61,7 @@ class Model(NamedTuple):
     """
 
     level: str
-    change: Change = unchanged
+    change: Change = keep_config
 
 
 def alone(energies: Sequence[Energy]) -> Energy:
@@ -75,7 +75,7 @@ class Way(NamedTuple):
     name: str
     method: str = "leap"
     minimise: Callable[[Sequence[Energy]], Energy] = alone
-    # (energies of the case's models) -> what the planner minimises; see `described`
+    # (energies of the case's models) -> what the planner minimises; see `describe_function`
     search: Callable[[Any], PlannerConfig] = lambda trained: trained
     # (settings that it was trained with) -> settings of how it searches
     executed: int | None = None  # actions before replanning; None: all
@@ -84,13 +84,13 @@ class Way(NamedTuple):
     explores: bool = False  # coming back costs: beyond what the paper asks for
 
 
-def drawn_at(temperature: float) -> Callable[[Any], PlannerConfig]:
+def draw_at(temperature: float) -> Callable[[Any], PlannerConfig]:
     """The search of a way: as trained, but for the temperature that actions are drawn at."""
     return lambda trained: dataclasses.replace(trained, temperature=temperature)
 
 
 # Who takes the likeliest of single actions walks to and fro, and noise leads out of it.
-NOISE = drawn_at(4.0)
+NOISE = draw_at(4.0)
 
 
 class Case(NamedTuple):
@@ -101,7 +101,7 @@ class Case(NamedTuple):
     level: str
     ways: Sequence[Way]
     adapter: Callable[[str], Adapter] | None = None
-    # makes one of a level; its `violations`, a number, are counted over all episodes; `described`
+    # (level) -> adapter; rows sum its `violations`; see `describe_function`
 
 
 class Analysis(NamedTuple):
@@ -111,7 +111,7 @@ class Analysis(NamedTuple):
     cases: Sequence[Case]
     domain: str = "babyai"
     timed: bool = False  # what a plan costs is part of the comparison: take it on an idle machine
-    change: Change = unchanged  # of every model's configuration, for tests
+    change: Change = keep_config  # of every model's configuration, for tests
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +156,7 @@ def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
     given = shell.read_arguments(arguments)
     module = f"experiments.{analysis.name}"
     about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
-    about += f"\n\nThe cases: {_names(analysis.cases)}."
+    about += f"\n\nThe cases: {_join_names(analysis.cases)}."
     options = shell.parse(Options, module, given, description=about)
     return shell.run_interruptible_program(
         module,
@@ -183,7 +183,7 @@ class Work(NamedTuple):
 
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
     """Every case, method and seed asked for, and their table."""
-    wanted = check(analysis, options)
+    wanted = choose_cases(analysis, options)
     jax_setup.start()
     versions = results.find_versions()
     work = Work(analysis, options, versions, Console(markup=False), interruption)
@@ -191,13 +191,13 @@ def run_all(analysis: Analysis, options: Options, interruption: Interruption) ->
         files.check_writable(where)
     rows: list[Row] = []
     for case in wanted:
-        for method in methods_of(case):
+        for method in list_methods(case):
             for seed in options.seeds:
                 rows += run_case(work, case, method, seed)
-    work.console.print(table(rows))
+    work.console.print(make_table(rows))
 
 
-def check(analysis: Analysis, options: Options) -> list[Case]:
+def choose_cases(analysis: Analysis, options: Options) -> list[Case]:
     """The cases that are asked for.
 
     Raises:
@@ -221,22 +221,22 @@ def check(analysis: Analysis, options: Options) -> list[Case]:
             if name not in possible:
                 expected = ", ".join(sorted(possible))
                 raise UserError(f"--{option} {name}: expected some of {expected}")
-    wanted = [case._replace(ways=ways_of(case, options)) for case in wanted]
+    wanted = [case._replace(ways=select_ways(case, options)) for case in wanted]
     if not any(case.ways for case in wanted):
         raise UserError("--methods, --ways: none of these ways is of one of these methods")
     for case in wanted:
-        for method in methods_of(case):
+        for method in list_methods(case):
             for seed in options.seeds:
-                for config in configurations(analysis, case, method, seed, options):
+                for config in make_configs(analysis, case, method, seed, options):
                     limits.check(config)
     return wanted
 
 
-def _names(cases: Sequence[Case]) -> str:
+def _join_names(cases: Sequence[Case]) -> str:
     return ", ".join(case.name for case in cases)
 
 
-def ways_of(case: Case, options: Options) -> list[Way]:
+def select_ways(case: Case, options: Options) -> list[Way]:
     """The ways of a case that are asked for."""
     return [
         way
@@ -246,12 +246,12 @@ def ways_of(case: Case, options: Options) -> list[Way]:
     ]
 
 
-def methods_of(case: Case) -> list[str]:
+def list_methods(case: Case) -> list[str]:
     """The methods that a case has ways of, in their order."""
     return list(dict.fromkeys(way.method for way in case.ways))
 
 
-def training_config(
+def make_training_config(
     analysis: Analysis, model: Model, method: str, seed: int, options: Options
 ) -> AnyConfig:
     """The configuration of a run of `experiments.babyai` that trains a model."""
@@ -262,19 +262,19 @@ def training_config(
     return dataclasses.replace(config, seeds=(seed,), runs=options.runs, pictures=False)
 
 
-def configurations(
+def make_configs(
     analysis: Analysis, case: Case, method: str, seed: int, options: Options
 ) -> list[AnyConfig]:
     """What each of a case's models is trained with, of one method."""
-    return [training_config(analysis, model, method, seed, options) for model in case.models]
+    return [make_training_config(analysis, model, method, seed, options) for model in case.models]
 
 
 def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     """The rows of one case, method and training seed."""
     analysis, options = work.analysis, work.options
-    settings = configurations(analysis, case, method, seed, options)
+    settings = make_configs(analysis, case, method, seed, options)
     ways = {
-        row_name(analysis, case, way, settings, seed, options): way
+        hash_row(analysis, case, way, settings, seed, options): way
         for way in case.ways
         if way.method == method
     }
@@ -282,16 +282,18 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     found = {row["hash"]: row for row in results.read(work.rows)}
     rows = found if options.record and not options.force else {}
     missing = [name for name in ways if name not in rows]
-    models = models_of(work, case, method, seed) if missing else []
+    models = load_models(work, case, method, seed) if missing else []
     for name in missing:
         # A sum of models may have one of them twice.
-        seconds = sum(map(training_seconds, {run_folder(each, seed) for each in settings}))
+        seconds = sum(
+            map(read_training_seconds, {find_run_folder(each, seed) for each in settings})
+        )
         said, episodes = play(case, ways[name], models, seed, options, work.interruption)
         row = {
             "experiment": analysis.name,
             "hash": name,
             "domain": analysis.domain,
-            "trained": [configuration_hash(each, seed) for each in settings],
+            "trained": [hash_config(each, seed) for each in settings],
             "train_seconds": round(seconds, 3),
             "versions": work.versions,
             **said,
@@ -305,7 +307,7 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
     return [rows[name] for name in ways]
 
 
-def row_name(
+def hash_row(
     analysis: Analysis,
     case: Case,
     way: Way,
@@ -319,58 +321,61 @@ def row_name(
     setting that is added later changes no name.
     """
     search = way.search(settings[0].planner)
-    planner = differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
+    planner = find_differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
     asked = {
-        "minimise": described(way.minimise), "remembers": way.remembers,
-        "adapter": described(case.adapter),
+        "minimise": describe_function(way.minimise), "remembers": way.remembers,
+        "adapter": describe_function(case.adapter),
     }  # fmt: skip
-    plain = {"minimise": described(alone), "remembers": False, "adapter": None}
+    plain = {"minimise": describe_function(alone), "remembers": False, "adapter": None}
     named = {
         "experiment": analysis.name, "case": case.name, "way": way.name, "method": way.method,
         "level": case.level, "seed": seed, "executed": way.executed,
         "episodes": options.episodes, "first": options.played[0],
         "planner": {"kind": type(search).__name__, **planner},
-        "trained": [configuration_hash(each, seed) for each in settings],
-        **differences(asked, plain),
+        "trained": [hash_config(each, seed) for each in settings],
+        **find_differences(asked, plain),
     }  # fmt: skip
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def described(what: Any) -> Any:
-    """A function as its name and all that it is bound to (`functools.partial`), for JSON."""
+def describe_function(what: Any) -> Any:
+    """Returns a function's name, and the values that `functools.partial` binds, for JSON.
+
+    The hashes of recorded rows hold these names: a function that has rows keeps its name.
+    """
     if isinstance(what, functools.partial):
-        bound = {name: described(each) for name, each in what.keywords.items()}
-        return [described(what.func), *map(described, what.args), bound]
+        bound = {name: describe_function(each) for name, each in what.keywords.items()}
+        return [describe_function(what.func), *map(describe_function, what.args), bound]
     if isinstance(what, tuple):
-        return [described(each) for each in what]
+        return [describe_function(each) for each in what]
     return what.__qualname__ if callable(what) else what
 
 
-def models_of(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
+def load_models(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
     """The models of a case, of one method, trained where they are not there yet."""
-    wanted = configurations(work.analysis, case, method, seed, work.options)
-    return [trained(work, config, seed) for config in wanted]
+    wanted = make_configs(work.analysis, case, method, seed, work.options)
+    return [load_or_train(work, config, seed) for config in wanted]
 
 
-def training_of(config: AnyConfig) -> Experiment:
+def make_experiment(config: AnyConfig) -> Experiment:
     """The program whose runs are used, or made."""
     return Experiment(config.domain, config.domain)
 
 
-def run_folder(config: AnyConfig, seed: int) -> Path:
+def find_run_folder(config: AnyConfig, seed: int) -> Path:
     """Where a model is, or will be."""
-    return find_folder(training_of(config), config, seed)
+    return find_folder(make_experiment(config), config, seed)
 
 
-def training_seconds(folder: Path) -> float:
+def read_training_seconds(folder: Path) -> float:
     """How long the training of a run has taken, stops and continuations included."""
     metrics = read_metrics(folder)
     return metrics[-1]["seconds"] if metrics else 0.0
 
 
-def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
+def load_or_train(work: Work, config: AnyConfig, seed: int) -> Pretrained:
     """A model, trained where it is not there yet."""
-    training, folder = training_of(config), run_folder(config, seed)
+    training, folder = make_experiment(config), find_run_folder(config, seed)
     # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
         with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
@@ -383,13 +388,13 @@ def trained(work: Work, config: AnyConfig, seed: int) -> Pretrained:
         return train(run, load_demonstrations(run))
 
 
-def domain_of(level: str, models: Sequence[Pretrained]) -> Domain:
+def make_played_domain(level: str, models: Sequence[Pretrained]) -> Domain:
     """A level that models are asked to plan on."""
     specification = models[0].specification
     return find_domain(specification.domain).make(level, specification.domain_settings)
 
 
-def asked(
+def make_planner(
     domain: Domain, way: Way, models: Sequence[Pretrained], search: PlannerConfig
 ) -> Pretrained:
     """The models of a case as one planner for a level, which minimises what a way says."""
@@ -418,7 +423,7 @@ def play(
     """What one way of asking gives, and its episodes."""
     specification = models[0].specification
     search = way.search(specification.planner)
-    domain = domain_of(case.level, models)
+    domain = make_played_domain(case.level, models)
     adapters: list[Adapter] = []
     compile_seconds = 0.0
 
@@ -428,7 +433,7 @@ def play(
 
     def episodes(config: PlannerConfig) -> Episodes:
         nonlocal compile_seconds
-        planner = asked(domain, way, models, config)
+        planner = make_planner(domain, way, models, config)
         begun = time.perf_counter()
         planner.compile(options.episodes, way.executed)
         compile_seconds += time.perf_counter() - begun
@@ -474,7 +479,7 @@ def play(
     return row, found
 
 
-def rows_of_way(
+def select_rows(
     analysis: Analysis, rows: Sequence[Row], case: Case, way: Way, preset: str
 ) -> list[Row]:
     """The rows of a way to plan as it is today, one for each training seed."""
@@ -483,13 +488,13 @@ def rows_of_way(
         if (row["case"], row["way"], row["preset"]) != (case.name, way.name, preset):
             continue
         options = Options(preset=preset)
-        settings = configurations(analysis, case, way.method, row["seed"], options)
-        if row["hash"] == row_name(analysis, case, way, settings, row["seed"], options):
+        settings = make_configs(analysis, case, way.method, row["seed"], options)
+        if row["hash"] == hash_row(analysis, case, way, settings, row["seed"], options):
             found.append(row)
     return found
 
 
-def table(rows: Sequence[Row]) -> Table:
+def make_table(rows: Sequence[Row]) -> Table:
     """The rows for a terminal; below, the mean over training seeds if there are several."""
     shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
 

@@ -13,7 +13,7 @@ from leapjax.types import Plan
 Step = tuple[int, Transition]  # an action, and what came of it
 
 
-def watched(
+def watch_episode(
     adapter: Adapter,
     planner: Pretrained,
     context: int,

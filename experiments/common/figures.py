@@ -17,14 +17,14 @@ from leapjax.running import plots
 from leapjax.running.results import Row
 
 
-def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
+def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
     """Success rate against planning iterations, a panel for each level.
 
     Args:
         rows: by level, label of the line, and number of iterations.
         path: to write.
     """
-    figure, axes = _panels(len(rows), columns=4, width=2.7 if len(rows) > 1 else 5)
+    figure, axes = _make_panels(len(rows), columns=4, width=2.7 if len(rows) > 1 else 5)
     labels = list(dict.fromkeys(label for by_label in rows.values() for label in by_label))
     drawn: dict[str, Line2D] = {}  # one of each label, for the legend
     for axis, (level, by_label) in zip(axes, rows.items(), strict=False):
@@ -49,7 +49,7 @@ def iterations_by_level(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], pat
     plots.save(figure, path)
 
 
-def methods_by_level(
+def draw_methods(
     rates: Mapping[str, Mapping[str, Mapping[str, float]]], names: Sequence[str], path: Path
 ) -> None:
     """Success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
@@ -59,7 +59,7 @@ def methods_by_level(
         names: of all methods, in order.
         path: to write.
     """
-    figure, axes = _panels(len(rates), columns=3, width=4.5)
+    figure, axes = _make_panels(len(rates), columns=3, width=4.5)
     for axis, (level, by_whom) in zip(axes, rates.items(), strict=False):
         width = 0.8 / len(by_whom)
         for index, (whose, by_method) in enumerate(by_whom.items()):
@@ -74,7 +74,7 @@ def methods_by_level(
     plots.save(figure, path)
 
 
-def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
+def draw_intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
     """Aggregate scores with their intervals, one below the other (Agarwal et al., 2021).
 
     Args:
@@ -92,7 +92,7 @@ def intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
     plots.save(figure, path)
 
 
-def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
+def draw_landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Energies of good and bad plans over training, and of plans over iterations.
 
     Args:
@@ -124,7 +124,7 @@ def landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
     plots.save(figure, path)
 
 
-def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+def draw_energies(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """The mean energy of each trajectory against its return, both from 0 to 1.
 
     Args:
@@ -147,7 +147,7 @@ def energy_against_reward(found: Mapping[str, Mapping[str, Any]], path: Path) ->
     plots.save(figure, path)
 
 
-def _panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
+def _make_panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
     """A figure of so many panels of success, at most `columns` side by side, one for each level."""
     columns = min(columns, max(1, count))
     lines = max(1, -(-count // columns))

@@ -14,7 +14,7 @@ Frame = tuple[Image.Image, int]  # a picture, and for how many milliseconds it i
 def save_animation(frames: Sequence[Frame], path: Path) -> None:
     """Writes frames as a GIF that repeats, atomically."""
     first, *others = [image for image, _ in frames]
-    with files.whole(path) as scratch:
+    with files.write_whole(path) as scratch:
         first.save(
             scratch, save_all=True, append_images=others, loop=0, optimize=True,
             duration=[milliseconds for _, milliseconds in frames],
@@ -28,7 +28,7 @@ def save_sheet(pictures: Sequence[Image.Image], columns: int, path: Path) -> Non
     sheet = Image.new("RGB", (width * columns, height * -(-len(pictures) // columns)), "white")
     for index, picture in enumerate(pictures):
         sheet.paste(picture, (width * (index % columns), height * (index // columns)))
-    with files.whole(path) as scratch:
+    with files.write_whole(path) as scratch:
         sheet.save(scratch)
 
 

@@ -44,7 +44,7 @@ BEST_OF_MANY = Search(
 )  # fmt: skip
 
 
-def searches(config: AnyConfig) -> list[AnyConfig]:
+def list_searches(config: AnyConfig) -> list[AnyConfig]:
     """Every way to plan that a method can; those of one action at a time have none."""
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
-from experiments.common.cases import Analysis, rows_of_way
-from experiments.tables.cells import milliseconds, rate, table
+from experiments.common.cases import Analysis, select_rows
+from experiments.tables.cells import compute_milliseconds, format_rate, make_table
 from leapjax.running.results import Row
 
 ANALYSES = {
@@ -19,15 +19,15 @@ EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "
 ERRANDS = ("constraints-errand", "constraints-detour")
 
 
-def uses(row: Row) -> bool:
+def is_used(row: Row) -> bool:
     """Whether a row is in a table."""
     of = ANALYSES[row["experiment"]]
     return any(
-        rows_of_way(of, [row], case, way, row["preset"]) for case in of.cases for way in case.ways
+        select_rows(of, [row], case, way, row["preset"]) for case in of.cases for way in case.ways
     )
 
 
-def compared(
+def compare_ways(
     of: Analysis, rows: Sequence[Row], ways: Sequence[str] = (), cases: Sequence[str] = ()
 ) -> str:
     """Success of some ways to plan, of both presets, beside the paper's number.
@@ -43,30 +43,32 @@ def compared(
         if cases and not case.name.startswith(tuple(cases)):
             continue
         for way in case.ways:
-            found = [rows_of_way(of, rows, case, way, preset) for preset in PRESETS]
+            found = [select_rows(of, rows, case, way, preset) for preset in PRESETS]
             if any(found) and (not ways or way.name in ways):
                 planner = way.name
                 if not way.name.startswith(way.method):
                     planner = f"{way.method}: {way.name}"
                 paper = "-" if way.paper is None else f"{way.paper:.1f}%"
-                lines.append([case.name, planner, paper, *(_cell(of, mine) for mine in found)])
-    return table(
+                lines.append(
+                    [case.name, planner, paper, *(_format_cell(of, mine) for mine in found)]
+                )
+    return make_table(
         " | ".join(["case", "planner", "paper", *(f"`{each}`" for each in PRESETS)]), lines
     )
 
 
-def _cell(of: Analysis, rows: Sequence[Row]) -> str:
+def _format_cell(of: Analysis, rows: Sequence[Row]) -> str:
     """Success of rows, one for each seed; what a plan costs, and violations if there are any."""
-    cell = rate(rows)
+    cell = format_rate(rows)
     if rows and of.timed:
-        cell += f", {milliseconds(rows):.1f} ms"
+        cell += f", {compute_milliseconds(rows):.1f} ms"
     violations = sum(row["violations"] or 0 for row in rows)
     if violations:
         cell += f", {violations / sum(row['episodes'] for row in rows):.2f} violations"
     return cell
 
 
-def landscape(found: Sequence[Row]) -> str:
+def compare_energies(found: Sequence[Row]) -> str:
     """Energies of good and bad plans at the end of training, and of plans being refined."""
     shares = [name for each in found[:1] for name in each["training"][-1] if name != "step"]
     lines = []
@@ -76,4 +78,4 @@ def landscape(found: Sequence[Row]) -> str:
         passes = [f"{planned[0]:.2f}", f"{planned[-1]:.2f}"]
         lines.append([each["level"], f"`{each['preset']}`", *energies, *passes])
     titles = [f"{share.removeprefix('random_')}% random" for share in shares]
-    return table(" | ".join(["level", "preset", *titles, "plans, N = 1", "last"]), lines)
+    return make_table(" | ".join(["level", "preset", *titles, "plans, N = 1", "last"]), lines)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.atari import data_name, game_of
-from experiments.tables.cells import Columns, listed, table
+from experiments.atari import name_data, parse_game
+from experiments.tables.cells import Columns, list_rows, make_table
 from experiments.tables.settings import Setting, select
 from leapjax import scores
 from leapjax.domains.atari.domain import LONGEST
@@ -26,23 +26,23 @@ COLUMNS = {
     "random": Setting("leapjax", "random"),
 }
 # At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
-RUNS = {"training": {"run": 16}, "domain_settings": {"max_steps": LONGEST}}
+CONSECUTIVE = {"training": {"consecutive": 16}, "domain_settings": {"max_steps": LONGEST}}
 LARGE = {
-    "LEAP": Setting("paper", changes=RUNS),
+    "LEAP": Setting("paper", changes=CONSECUTIVE),
     "LEAP without return": Setting(
-        "paper", changes={**RUNS, "method_settings": {"returns": False}}
+        "paper", changes={**CONSECUTIVE, "method_settings": {"returns": False}}
     ),
 }
 COLD = {title: setting.searching(temperature=0.1) for title, setting in LARGE.items()}
 USED = (*COLUMNS.values(), *LARGE.values(), *COLD.values())
 
 
-def uses(row: Row) -> bool:
+def is_used(row: Row) -> bool:
     """Whether a row is in a table."""
     return any(setting.has(row) for setting in USED)
 
 
-def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
+def compare_scores(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
     """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
 
     With the standard error, and the mean score of the games that were learned from.
@@ -57,18 +57,20 @@ def played(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         }
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         few = data.get(name, ())
-        many = data.get(data_name(name, PAPER_TRANSITIONS), ())
+        many = data.get(name_data(name, PAPER_TRANSITIONS), ())
         found = {"paper": papers}
-        found["ours"], found["score"] = _scores(rows, name, COLUMNS, few)
-        found["ours, preset `paper`"], found["its score"] = _scores(rows, name, LARGE, many)
-        found["the same, temperature 0.1"], found["that score"] = _scores(rows, name, COLD, many)
+        found["ours"], found["score"] = _format_scores(rows, name, COLUMNS, few)
+        found["ours, preset `paper`"], found["its score"] = _format_scores(rows, name, LARGE, many)
+        found["the same, temperature 0.1"], found["that score"] = _format_scores(
+            rows, name, COLD, many
+        )
         for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])
-    return table("game | | " + " | ".join(columns), lines)
+    return make_table("game | | " + " | ".join(columns), lines)
 
 
-def _scores(
+def _format_scores(
     rows: Sequence[Row],
     level: str,
     settings: Mapping[str, Setting],
@@ -76,14 +78,14 @@ def _scores(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """By column: normalised scores, and as they are, of settings and of the games learned from."""
     found = select(rows, [level], settings)
-    cells = {title: _mean_score(of) for (_, title), of in found.items() if of}
+    cells = {title: _compute_mean_score(of) for (_, title), of in found.items() if of}
     game = GAMES[level]
     scale = game.human - game.random
     normal = {
-        title: _with_error(game.normalised(mean), error and 100 * error / scale)
+        title: _format_with_error(game.normalised(mean), error and 100 * error / scale)
         for title, (mean, error) in cells.items()
     }
-    raw = {title: _with_error(*each) for title, each in cells.items()}
+    raw = {title: _format_with_error(*each) for title, each in cells.items()}
     if cells and games:
         reached = float(np.mean([each["score"] for each in games]))
         normal |= {"the data": f"{game.normalised(reached):.1f}"}
@@ -91,7 +93,7 @@ def _scores(
     return normal, raw
 
 
-def _mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
+def _compute_mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
     """The mean score of rows, one for each seed, and its standard error.
 
     Of several seeds the larger of two: from the spread of their means, which a few seeds may
@@ -108,20 +110,20 @@ def _mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
     return float(means.mean()), max(scores.standard_error(means) or 0.0, of_games)
 
 
-def _with_error(mean: float, error: float | None) -> str:
+def _format_with_error(mean: float, error: float | None) -> str:
     return f"{mean:.1f}" if error is None else f"{mean:.1f} ± {error:.1f}"
 
 
-def data(found: Mapping[str, Any]) -> str:
+def describe_data(found: Mapping[str, Any]) -> str:
     """What the demonstrators reached, whose games are learned from."""
     lines = []
     for game in GAMES:
-        for name in sorted(each for each in found if game_of(each) == game):
-            lines.append([name, *_reached(found[name])])
-    return table("game | games | transitions | mean score | range | by random actions", lines)
+        for name in sorted(each for each in found if parse_game(each) == game):
+            lines.append([name, *_describe_reached(found[name])])
+    return make_table("game | games | transitions | mean score | range | by random actions", lines)
 
 
-def _reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
+def _describe_reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
     """How many there are, and their scores."""
     reached = np.array([game["score"] for game in games])
     by_noise = {
@@ -137,14 +139,14 @@ def _reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def energy(found: Mapping[str, Any]) -> str:
+def compare_energies(found: Mapping[str, Any]) -> str:
     """How energies of trajectories and their rewards are correlated."""
     lines = [
         [name, str(len(of["energies"])), f"{of['correlation']:.2f}", f"{of['p_value']:.1g}"]
         for name in GAMES
         if (of := found.get(name))
     ]
-    return table("game | trajectories | rank correlation of energy and reward | p", lines)
+    return make_table("game | trajectories | rank correlation of energy and reward | p", lines)
 
 
 # States that are encoded for a decision while playing. Of 26, preset `paper` reads the new one and
@@ -152,7 +154,7 @@ def energy(found: Mapping[str, Any]) -> str:
 ENCODED = {"leapjax": 1, "paper": STACK}
 
 
-def encoding(row: Row) -> list[str]:
+def describe_encoding(row: Row) -> list[str]:
     """What is encoded while playing: states a second, GFLOP/s, their fraction of the peak."""
     states = row["batch"] * ENCODED[row["preset"]] / row["encoding_seconds"]
     gflops = row["encoding_flops"] / row["encoding_seconds"] / 1e9
@@ -160,7 +162,7 @@ def encoding(row: Row) -> list[str]:
     return [f"{states:,.0f}", f"{gflops:.0f}", "-" if peak is None else f"{gflops / peak:.0%}"]
 
 
-def decisions(rows: Sequence[Row]) -> str:
+def compare_decisions(rows: Sequence[Row]) -> str:
     """What decisions are made of in games that are played together, in milliseconds."""
 
     def milliseconds(part: str) -> Callable[[Row], str]:
@@ -177,8 +179,8 @@ def decisions(rows: Sequence[Row]) -> str:
         "past encoded anew": milliseconds("anew"),
         "emulator": milliseconds("playing"),
         "decisions/s": rate,
-        "states encoded/s": lambda row: encoding(row)[0],
-        "encoder GFLOP/s": lambda row: encoding(row)[1],
-        "of the peak": lambda row: encoding(row)[2],
+        "states encoded/s": lambda row: describe_encoding(row)[0],
+        "encoder GFLOP/s": lambda row: describe_encoding(row)[1],
+        "of the peak": lambda row: describe_encoding(row)[2],
     }
-    return listed(rows, columns)
+    return list_rows(rows, columns)

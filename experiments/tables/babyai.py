@@ -4,8 +4,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.paper import paper_success
-from experiments.tables.cells import mean_rate, outcomes, rate, table, with_interval
+from experiments.paper import list_success
+from experiments.tables.cells import (
+    collect_outcomes,
+    compute_mean_rate,
+    format_rate,
+    format_with_interval,
+    make_table,
+)
 from experiments.tables.settings import Setting, select
 from leapjax import scores
 from leapjax.domains.babyai.levels import LEVELS
@@ -52,12 +58,12 @@ USED = (
 )
 
 
-def uses(row: Row) -> bool:
+def is_used(row: Row) -> bool:
     """Whether a row is in a table."""
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
-def success(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> str:
+def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> str:
     """Success of the paper's LEAP and of some settings, by level, and the interquartile mean.
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.
@@ -70,20 +76,20 @@ def success(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> 
     lines = [
         [
             level,
-            f"{paper_success(level)['leap']:.1f}%",
-            *(rate(found[level, title]) for title in settings),
+            f"{list_success(level)['leap']:.1f}%",
+            *(format_rate(found[level, title]) for title in settings),
         ]
         for level in LEVELS
     ]
-    middles = [middle(rows, setting) for setting in settings.values()]
-    cells = ["-" if each is None else with_interval(*each) for each in middles]
-    lines.append(["interquartile mean", f"{middle_of_paper():.1f}%", *cells])
-    return table(" | ".join(["level", "paper", *settings]), lines)
+    middles = [compute_middle(rows, setting) for setting in settings.values()]
+    cells = ["-" if each is None else format_with_interval(*each) for each in middles]
+    lines.append(["interquartile mean", f"{compute_paper_middle():.1f}%", *cells])
+    return make_table(" | ".join(["level", "paper", *settings]), lines)
 
 
-def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
     """The interquartile means of the paper's LEAP, and of what has rows on every level."""
-    paper = middle_of_paper()
+    paper = compute_paper_middle()
     executed = "`leapjax`, `--executed 3`"
     named = {"random": SETTINGS["random"]} | {
         f"{method}, {preset.removeprefix('preset ')}": setting
@@ -92,37 +98,41 @@ def aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
         if method != "random"
     }
     named[f"leap, {executed}"] = SETTINGS[executed]
-    found = {title: middle(rows, setting) for title, setting in named.items()}
+    found = {title: compute_middle(rows, setting) for title, setting in named.items()}
     known = {title: each for title, each in found.items() if each is not None}
     return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
 
 
-def middle_of_paper() -> float:
+def compute_paper_middle() -> float:
     """The interquartile mean of the paper's LEAP, in percent."""
-    papers = np.array([paper_success(level)["leap"] for level in LEVELS])
+    papers = np.array([list_success(level)["leap"] for level in LEVELS])
     return float(scores.interquartile_mean(papers))
 
 
-def middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
+def compute_middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
     """The interquartile mean of a setting over all levels, and its interval, in percent."""
     levels = select(rows, LEVELS, {"": setting}).values()
     if not all(levels):
         return None
-    mean, (low, high) = scores.aggregate([outcomes(of) for of in levels])
+    mean, (low, high) = scores.aggregate([collect_outcomes(of) for of in levels])
     return 100 * mean, 100 * low, 100 * high
 
 
-def iterations(rows: Sequence[Row]) -> str:
+def compare_iterations(rows: Sequence[Row]) -> str:
     """Success rates against the number of iterations, of training seed 0."""
     lines = [
-        [level, title, *(f"{mean_rate([of[n]]):.1f}%" if n in of else "" for n in ITERATIONS)]
-        for level, by_title in success_by_iterations(rows).items()
+        [
+            level,
+            title,
+            *(f"{compute_mean_rate([of[n]]):.1f}%" if n in of else "" for n in ITERATIONS),
+        ]
+        for level, by_title in group_by_iterations(rows).items()
         for title, of in by_title.items()
     ]
-    return table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
+    return make_table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
 
 
-def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
     """Rows of training seed 0 by level, title of the setting, and N."""
     first = select([row for row in rows if row["seed"] == 0], LEVELS, BY_ITERATIONS)
     found: dict[str, dict[str, dict[int, Row]]] = {}
@@ -134,29 +144,29 @@ def success_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, 
     return found
 
 
-def methods(rows: Sequence[Row]) -> str:
+def compare_methods(rows: Sequence[Row]) -> str:
     """Success rates of every method: the paper's, and those of both presets; the best in bold."""
     lines = []
-    for level, by_preset in rows_by_method(rows).items():
-        theirs = paper_success(level)
+    for level, by_preset in group_by_method(rows).items():
+        theirs = list_success(level)
         cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
-        lines.append([level, "the paper", *_compared(theirs, cells)])
+        lines.append([level, "the paper", *_mark_best(theirs, cells)])
         for preset, by_method in by_preset.items():
-            ours = {name: mean_rate(of) for name, of in by_method.items()}
-            cells = {name: rate(of) for name, of in by_method.items()}
+            ours = {name: compute_mean_rate(of) for name, of in by_method.items()}
+            cells = {name: format_rate(of) for name, of in by_method.items()}
             if cells:
-                lines.append([level, preset, *_compared(ours, cells)])
-    return table("level | | " + " | ".join(COMPARED), lines)
+                lines.append([level, preset, *_mark_best(ours, cells)])
+    return make_table("level | | " + " | ".join(COMPARED), lines)
 
 
-def _compared(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
+def _mark_best(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
     """The cell of every method, those of the best rate in bold."""
     best = max(rates.values(), default=None)
     bold = {name: f"**{cell}**" for name, cell in cells.items() if rates[name] == best}
     return [{**cells, **bold}.get(name, "-") for name in COMPARED]
 
 
-def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
+def group_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
     """Rows by level, preset and method, of levels where there are some of a baseline."""
     found: dict[str, dict[str, dict[str, list[Row]]]] = {}
     for level in LEVELS:
@@ -169,19 +179,19 @@ def rows_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Ro
     return found
 
 
-def success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+def compute_success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Success in percent by level, whose numbers they are, and method."""
     return {
-        level: {"the paper": paper_success(level)}
+        level: {"the paper": list_success(level)}
         | {
-            preset: {name: mean_rate(of) for name, of in by_method.items()}
+            preset: {name: compute_mean_rate(of) for name, of in by_method.items()}
             for preset, by_method in by_preset.items()
         }
-        for level, by_preset in rows_by_method(rows).items()
+        for level, by_preset in group_by_method(rows).items()
     }
 
 
-def price(rows: Sequence[Row], measured: Sequence[Row]) -> str:
+def compare_prices(rows: Sequence[Row], measured: Sequence[Row]) -> str:
     """Milliseconds of planning for each action, with preset `leapjax`.
 
     Args:
@@ -197,7 +207,7 @@ def price(rows: Sequence[Row], measured: Sequence[Row]) -> str:
     known = [row for row in rows if row["seed"] == 0 and (row["level"], row["method"]) in speeds]
     methods = [name for name in COMPARED if name != "random"]
     lines = []
-    for level, by_preset in rows_by_method(known).items():
+    for level, by_preset in group_by_method(known).items():
         first = {name: cell(row) for name, (row,) in by_preset["preset leapjax"].items()}
         lines.append([level, *(first.get(name, "-") for name in methods)])
-    return table("level | " + " | ".join(methods), lines)
+    return make_table("level | " + " | ".join(methods), lines)

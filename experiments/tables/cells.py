@@ -10,18 +10,18 @@ from leapjax.running.results import Row
 Columns = Mapping[str, str | Callable[[Row], str]]
 
 
-def rate(rows: Sequence[Row]) -> str:
+def format_rate(rows: Sequence[Row]) -> str:
     """Mean success of some rows, one for each seed, with its interval and how many there are."""
     if not rows:
         return "-"
-    _, (low, high) = scores.aggregate([outcomes(rows)])
-    said = with_interval(mean_rate(rows), 100 * low, 100 * high)
+    _, (low, high) = scores.aggregate([collect_outcomes(rows)])
+    said = format_with_interval(compute_mean_rate(rows), 100 * low, 100 * high)
     if rows[0]["method"] == "rules":  # nothing was trained
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
 
 
-def outcomes(rows: Sequence[Row]) -> scores.Outcomes:
+def collect_outcomes(rows: Sequence[Row]) -> scores.Outcomes:
     """Returns the outcomes of some rows, one for each seed: of every episode if all are recorded.
 
     They must be of the same levels, too; otherwise only the counts are used.
@@ -33,23 +33,23 @@ def outcomes(rows: Sequence[Row]) -> scores.Outcomes:
     return [row["successes"] for row in rows], [row["episodes"] for row in rows]
 
 
-def with_interval(mean: float, low: float, high: float) -> str:
+def format_with_interval(mean: float, low: float, high: float) -> str:
     """A mean and its interval, in percent."""
     return f"{mean:.1f}% [{low:.1f}, {high:.1f}]"
 
 
-def mean_rate(rows: Sequence[Row]) -> float:
+def compute_mean_rate(rows: Sequence[Row]) -> float:
     """Mean success of some rows, in percent."""
     return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
 
 
-def milliseconds(rows: Sequence[Row]) -> float:
+def compute_milliseconds(rows: Sequence[Row]) -> float:
     """What a plan costs, hundreds at once."""
     plans = sum(row["plans"] for row in rows)
     return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
 
 
-def listed(rows: Sequence[Row], columns: Columns) -> str:
+def list_rows(rows: Sequence[Row], columns: Columns) -> str:
     """A table in Markdown with a line for each row.
 
     Args:
@@ -60,10 +60,10 @@ def listed(rows: Sequence[Row], columns: Columns) -> str:
         [cell.format(**row) if isinstance(cell, str) else cell(row) for cell in columns.values()]
         for row in rows
     ]
-    return table(" | ".join(columns), lines)
+    return make_table(" | ".join(columns), lines)
 
 
-def table(header: str, lines: Sequence[Sequence[str]]) -> str:
+def make_table(header: str, lines: Sequence[Sequence[str]]) -> str:
     """A table in Markdown; the titles of its columns are separated by bars."""
     columns = header.count("|") + 1
     rows = [f"| {header} |", "| " + " | ".join(["---"] * columns) + " |"]

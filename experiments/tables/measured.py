@@ -24,9 +24,9 @@ from leapjax.running.schema import (
 
 PART = {"part": str, "ms": POSITIVE, "gflop": AMOUNT}
 TRAINING = {
-    "level": str, "preset": str, "run": SEVERAL, "steps": COUNT, "steps_per_second": POSITIVE,
-    "flops_per_step": AMOUNT, "gflops": AMOUNT, "fraction_of_peak": AMOUNT,
-    "training_seconds": AMOUNT, "parts": Each(PART),
+    "level": str, "preset": str, "consecutive": SEVERAL, "steps": COUNT,
+    "steps_per_second": POSITIVE, "flops_per_step": AMOUNT, "gflops": AMOUNT,
+    "fraction_of_peak": AMOUNT, "training_seconds": AMOUNT, "parts": Each(PART),
 }  # fmt: skip
 PLANNING = {
     "preset": str, "horizon": SEVERAL, "iterations": SEVERAL, "batch": SEVERAL,
@@ -66,7 +66,7 @@ MEASURED: dict[str, Schema] = {
 }
 
 
-def read(path: Path) -> Any:
+def read_measured(path: Path) -> Any:
     """The measurements in a file, which its name says the kind of.
 
     Raises:
@@ -78,13 +78,13 @@ def read(path: Path) -> Any:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path} is not valid JSON ({first_line(error)})") from None
-    wrong = find_problem(found, MEASURED[path.stem]) or _contradiction(path.stem, found)
+    wrong = find_problem(found, MEASURED[path.stem]) or _find_contradiction(path.stem, found)
     if wrong:
         raise UserError(f"{path}: {wrong}")
     return found
 
 
-def _contradiction(name: str, found: Any) -> str | None:
+def _find_contradiction(name: str, found: Any) -> str | None:
     """What parts say against each other."""
     if name == "quality":
         for row in found:

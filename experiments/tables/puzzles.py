@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
-from experiments.tables.cells import rate, table
+from experiments.tables.cells import format_rate, make_table
 from experiments.tables.settings import Setting, select
 from leapjax.presets import find_preset
 from leapjax.running.results import Row
@@ -23,25 +23,25 @@ PAYING = (
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
 
 
-def uses(row: Row) -> bool:
+def is_used(row: Row) -> bool:
     """Whether a row is in a table."""
-    return bool(rows_by_search([row])) or any(
-        of for _, by_count in rows_by_arms([row]) for of in by_count
+    return bool(group_by_search([row])) or any(
+        of for _, by_count in group_by_arms([row]) for of in by_count
     )
 
 
-def searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> str:
+def compare_searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> str:
     """Success of a few ways to search with one energy, by level and energy."""
-    found = rows_by_search(rows)
+    found = group_by_search(rows)
     lines = []
     for each in zip(*(found[column] for column in columns), strict=True):
         name, passes, _ = each[0]
         if (name, passes) in PAYING:
-            lines.append([name, passes, *(rate(of) for _, _, of in each)])
-    return table(" | ".join(["search", "passes", *columns]), lines)
+            lines.append([name, passes, *(format_rate(of) for _, _, of in each)])
+    return make_table(" | ".join(["search", "passes", *columns]), lines)
 
 
-def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
+def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
     """By level and what is minimised: name, passes and rows of each way.
 
     Each has the same ways to search, whether there are rows or not.
@@ -62,11 +62,11 @@ def rows_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[R
     return found
 
 
-def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
     """By level, name of the search, and number of passes: rows of what was learned, added up."""
     added: dict[str, dict[str, dict[int, Row]]] = {}
     planned = [row for row in rows if row["method"] == "leap"]
-    for level, ways in rows_by_search(planned).items():
+    for level, ways in group_by_search(planned).items():
         for name, _, of in ways if level.endswith(LEARNED) else []:
             if of:
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
@@ -74,17 +74,17 @@ def success_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]
     return added
 
 
-def arms(rows: Sequence[Row]) -> str:
+def compare_arms(rows: Sequence[Row]) -> str:
     """Success on star graphs of other numbers of arms than were learned."""
     lines = [
-        [name, *map(rate, by_count)]
-        for name, by_count in rows_by_arms(rows)
+        [name, *map(format_rate, by_count)]
+        for name, by_count in group_by_arms(rows)
         if sum(map(bool, by_count)) > 1
     ]
-    return table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
+    return make_table(" | ".join(["planner, passes", *(f"{n} arms" for n in ARMS)]), lines)
 
 
-def rows_by_arms(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
+def group_by_arms(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
     """By search: rows of what learned graphs of three arms, for each of `ARMS` it was played on."""
     horizon = find_preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
     levels = [f"Star{count}x{horizon}" for count in ARMS]

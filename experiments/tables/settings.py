@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from leapjax.configuration import change, configuration_hash
+from leapjax.configuration import change, hash_config
 from leapjax.presets import find_preset
 from leapjax.running.results import Row
 
@@ -38,11 +38,13 @@ class Setting:
         if (row["method"], row["preset"]) != (self.method, self.preset):
             return False
         of = row["domain"], row["level"], self.method, self.preset
-        return row["hash"] in _hashes(*of, json.dumps(self.changes, sort_keys=True), row["seed"])
+        return row["hash"] in _hash_setting(
+            *of, json.dumps(self.changes, sort_keys=True), row["seed"]
+        )
 
 
 @functools.cache  # many rows are asked whether they are of the same settings
-def _hashes(
+def _hash_setting(
     domain: str, level: str, method: str, preset: str, changes: str, seed: int
 ) -> tuple[str, str]:
     """Returns the hashes of a configuration: of its training, and of its checkpoint played again.
@@ -51,7 +53,7 @@ def _hashes(
     """
     config = change(find_preset(domain, level, method, preset), **json.loads(changes))
     again = dataclasses.replace(config, checkpoint=Path())
-    return configuration_hash(config, seed), configuration_hash(again, seed)
+    return hash_config(config, seed), hash_config(again, seed)
 
 
 def select(

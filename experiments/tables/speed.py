@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from experiments.tables.cells import Columns, listed, table
+from experiments.tables.cells import Columns, list_rows, make_table
 from leapjax.running.results import Row
 
 
-def speed(rows: Sequence[Row]) -> str:
+def compare_speed(rows: Sequence[Row]) -> str:
     """Plans per second at batch 256 and alone."""
 
     def plan(row: Row) -> tuple:
@@ -20,20 +20,20 @@ def speed(rows: Sequence[Row]) -> str:
         "of the matrix-multiply peak": "{fraction_of_peak:.0%}",
         "one alone": lambda row: alone.get(plan(row), "-"),
     }
-    return listed([row for row in rows if row["batch"] == 256], columns)
+    return list_rows([row for row in rows if row["batch"] == 256], columns)
 
 
-def planning(rows: Sequence[Row]) -> str:
+def list_planning(rows: Sequence[Row]) -> str:
     """Every measurement of planning."""
     columns: Columns = {
         "preset": "`{preset}`", "T, N": "{horizon}, {iterations}", "batch": "{batch}",
         "plans/s": "{plans_per_second:,.0f}", "GFLOP/s": "{gflops:.0f}",
         "peak": "{peak_gflops:.0f}", "fraction": "{fraction_of_peak:.0%}",
     }  # fmt: skip
-    return listed([row for row in rows if row["batch"] in (1, 16, 256, 1024)], columns)
+    return list_rows([row for row in rows if row["batch"] in (1, 16, 256, 1024)], columns)
 
 
-def quality(rows: Sequence[Row]) -> str:
+def compare_quality(rows: Sequence[Row]) -> str:
     """What each way to search gives and costs, for each planner: success, steps, ms per plan."""
 
     def cell(row: Row) -> str:
@@ -43,15 +43,16 @@ def quality(rows: Sequence[Row]) -> str:
     found = {(row["variant"], f"{row['level']}, `{row['preset']}`"): cell(row) for row in rows}
     variants, planners = (dict.fromkeys(key[i] for key in found) for i in (0, 1))
     lines = [[name, *(found.get((name, of), "-") for of in planners)] for name in variants]
-    return table(" | ".join(["search", *planners]), lines)
+    return make_table(" | ".join(["search", *planners]), lines)
 
 
-def training(rows: Sequence[Row]) -> str:
+def list_training(rows: Sequence[Row]) -> str:
     """Every measurement of training."""
     columns: Columns = {
         "level": "{level}",
         "preset": lambda row: (
-            f"`{row['preset']}`" + (f", `--run {row['run']}`" if row["run"] > 1 else "")
+            f"`{row['preset']}`"
+            + (f", `--consecutive {row['consecutive']}`" if row["consecutive"] > 1 else "")
         ),
         "ms/step": lambda row: f"{1e3 / row['steps_per_second']:.0f}",
         "GFLOP/step": lambda row: f"{row['flops_per_step'] / 1e9:.1f}",
@@ -59,10 +60,10 @@ def training(rows: Sequence[Row]) -> str:
         "of the peak": "{fraction_of_peak:.0%}",
         "a run": "{training_seconds:,.0f} s for {steps:,} steps",
     }
-    return listed(rows, columns)
+    return list_rows(rows, columns)
 
 
-def parts(rows: Sequence[Row]) -> str:
+def list_parts(rows: Sequence[Row]) -> str:
     """Where the time of a step goes, of every measurement of training."""
 
     def cell(part: Row) -> str:
@@ -75,4 +76,4 @@ def parts(rows: Sequence[Row]) -> str:
         for row in rows
     ]  # fmt: skip
     names = [part["part"] for part in rows[0]["parts"]] if rows else []
-    return table(" | ".join(["level", "preset", "step", *names]), lines)
+    return make_table(" | ".join(["level", "preset", "step", *names]), lines)

@@ -1,25 +1,26 @@
-"""What agents draw from demonstrations: windows, as they are or as a method needs them."""
+"""How agents draw training batches from demonstrations, augmented as the domain says."""
 
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from leapjax.agents.learning import Setup
+from leapjax.agents.base import Setup
 from leapjax.data import windows
 from leapjax.data.windows import Steps
 from leapjax.domain import Augmentation, Domain
 from leapjax.errors import UserError
-from leapjax.types import TransitionWindow, Window
+from leapjax.types import Demonstration, TransitionWindow, Window
 
 
 def window_batches(
     setup: Setup, cut: Callable[[Steps, jax.Array, int, int, int], Window] = windows.window
 ) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of windows `[B, ...]`, augmented as the domain says.
+    """Makes an agent's `batch`: (key, steps) -> augmented windows `[B, ...]`.
 
     Args:
-        setup: what it is made from.
+        setup: arguments of `make_agent`.
         cut: (steps, index, K, T, end action) -> window: `windows.window` or
             `windows.unrolled_window`.
     """
@@ -27,7 +28,7 @@ def window_batches(
     def window(steps: Steps, index: jax.Array) -> Window:
         return cut(steps, index, setup.context, setup.horizon, setup.domain.num_actions - 1)
 
-    _check_single(setup)
+    _check_no_runs(setup)
 
     def batch(key: jax.Array, steps: Steps) -> Window:
         return _draw(setup, window, key, steps)[0]
@@ -36,9 +37,10 @@ def window_batches(
 
 
 def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
-    """An agent's `batch` of runs of S windows, `[B / S, S, ...]`, each augmented as a whole.
+    """Makes an agent's `batch`: (key, steps) -> runs of S consecutive windows `[B / S, S, ...]`.
 
-    A run that gets to the end of its demonstration stays at its last window.
+    All windows of a run are augmented alike. A run that reaches the end of its demonstration
+    repeats the last window.
     """
     domain, training = setup.domain, setup.training
 
@@ -47,34 +49,24 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
 
     def batch(key: jax.Array, steps: Steps) -> Window:
         step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
-        count = training.batch // training.run
+        count = training.batch // training.consecutive
         starts = windows.sample_steps(step_key, steps, count, training.windows)
-        ahead = jnp.minimum(jnp.arange(training.run), steps.remaining[starts][:, None] - 1)
+        ahead = jnp.minimum(jnp.arange(training.consecutive), steps.remaining[starts][:, None] - 1)
         each = jax.vmap(window, in_axes=(None, 0))
-        drawn = jax.vmap(each, in_axes=(None, 0))(steps, starts[:, None] + ahead)
-        return _augmented(domain, keys, drawn, lambda each: jax.vmap(each, in_axes=(None, 0)))
+        runs = jax.vmap(each, in_axes=(None, 0))(steps, starts[:, None] + ahead)
+        return _augment(domain, keys, runs, lambda augment: jax.vmap(augment, in_axes=(None, 0)))
 
     return batch
 
 
-def _check_single(setup: Setup) -> None:
-    """Refuses runs of windows, where nothing is won by them."""
-    if setup.training.run > 1:
-        raise UserError(
-            f"runs of {setup.training.run} windows: only LEAP with architecture paper encodes the "
-            "states of windows in a row once",
-            "run",
-        )
-
-
 def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
-    """An agent's `batch` of transitions `[B, ...]`, augmented as the domain says."""
+    """Makes an agent's `batch`: (key, steps) -> augmented transitions `[B, ...]`."""
 
     def window(steps: Steps, index: jax.Array) -> Window:
         end = setup.domain.num_actions - 1
         return windows.transition_window(steps, index, setup.context, end)
 
-    _check_single(setup)
+    _check_no_runs(setup)
 
     def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
         drawn, indices = _draw(setup, window, key, steps)
@@ -83,28 +75,50 @@ def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionW
     return batch
 
 
+def make_blank_steps(domain: Domain) -> Steps:
+    """Makes one blank step of a domain, to compile training before there are data."""
+    states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)
+    actions, rewards = np.zeros(1, np.int32), np.zeros(1, np.float32)
+    blank = Demonstration(states, actions, rewards, True, False, 0)
+    return windows.concatenate([blank], domain.augmentations.extras)
+
+
+def _check_no_runs(setup: Setup) -> None:
+    """Checks that windows are drawn alone: other methods gain nothing from runs."""
+    if setup.training.consecutive > 1:
+        raise UserError(
+            f"{setup.training.consecutive} consecutive windows: only LEAP with architecture paper "
+            "encodes the states of windows in a row once",
+            "consecutive",
+        )
+
+
 def _draw(
     setup: Setup, window: Callable[[Steps, jax.Array], Window], key: jax.Array, steps: Steps
 ) -> tuple[Window, jax.Array]:
-    """Windows `[B, ...]`, augmented, and the indices `[B]` of their steps."""
+    """Draws augmented windows `[B, ...]`; also returns the indices `[B]` of their steps."""
     domain, training = setup.domain, setup.training
     step_key, *keys = jax.random.split(key, 1 + len(domain.augmentations.functions))
     indices = windows.sample_steps(step_key, steps, training.batch, training.windows)
     drawn = jax.vmap(window, in_axes=(None, 0))(steps, indices)
-    return _augmented(domain, keys, drawn), indices
+    return _augment(domain, keys, drawn), indices
 
 
-def _augmented(
+def _augment(
     domain: Domain,
     keys: Sequence[jax.Array],
-    drawn: Window,
-    of_example: Callable[[Augmentation], Augmentation] = lambda augment: augment,
+    examples: Window,
+    lift: Callable[[Augmentation], Augmentation] = lambda augment: augment,
 ) -> Window:
-    """Examples `[B, ...]` as a domain augments them: the last augmentation first, by its key.
+    """Augments a batch, with the domain's last augmentation first.
 
-    `of_example` makes an augmentation of an example from one of a window.
+    Args:
+        domain: has the augmentations.
+        keys: key of each augmentation.
+        examples: windows or runs of windows, `[B, ...]`.
+        lift: turns an augmentation of a window into one of an example.
     """
-    count = drawn.actions.shape[0]
+    count = examples.actions.shape[0]
     for augment, key in reversed(list(zip(domain.augmentations.functions, keys, strict=True))):
-        drawn = jax.vmap(of_example(augment))(jax.random.split(key, count), drawn)
-    return drawn
+        examples = jax.vmap(lift(augment))(jax.random.split(key, count), examples)
+    return examples

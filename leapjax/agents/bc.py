@@ -8,8 +8,8 @@ import dataclasses
 
 from jax.sharding import Mesh
 
+from leapjax.agents.base import Method, Setup
 from leapjax.agents.imitation import make_imitator
-from leapjax.agents.learning import Method, Setup
 from leapjax.types import Agent
 
 

@@ -11,10 +11,14 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from leapjax.agents import learning, losses
+from leapjax.agents import losses
+from leapjax.agents.acting import make_acting_energy, make_encode_next
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.q_learning import encode_around, look_around
+from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.models.policy import Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -38,15 +42,15 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_types(self)
-        learning.check_shares(self, "threshold", "discount", "target_rate")
+        check_within(self, 0, 1, "threshold", "discount", "target_rate")
         check_within(self, 0, LARGEST, "logit_penalty")
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """BCQ as an `Agent`; its energy is minus the Q-values of the actions that are likely."""
     settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
-    module = setup.policy(("q", choices), ("behaviour", choices))
-    optimizer = learning.make_optimizer(setup.training)
+    module = setup.make_policy(("q", choices), ("behaviour", choices))
+    optimizer = make_optimizer(setup.training)
 
     def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens=tokens)
@@ -76,13 +80,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         loss = losses.mean_where(errors + settings.logit_penalty * squares, known) + cloning
         return loss, {"accuracy": accuracy, "value": losses.mean_where(estimates, known)}
 
-    init = learning.make_init(
-        setup, module, learning.say_all, optimizer, target=lambda params: params
-    )
-    mean_loss = learning.average_loss(setup, transition_loss, encode_around(module))
-    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
-    energy = learning.acting_energy(setup, say, likely)
-    encode_next = learning.make_encode_next(setup, module, say)
+    init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
+    mean_loss = average_loss(setup, transition_loss, encode_around(module))
+    update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
+    energy = make_acting_energy(setup, say, likely)
+    encode_next = make_encode_next(setup, module, say)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 

@@ -10,11 +10,14 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents import learning
+from leapjax.agents.acting import make_encode
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss, make_window_encoder
 from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import make_init, make_update
 from leapjax.energy import classifier
-from leapjax.models.trajectory import SequenceClassifier
+from leapjax.models.lstm import SequenceClassifier
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
 
@@ -26,8 +29,8 @@ class Settings:
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """The classifier as an `Agent`; it has no use for the transformer's settings."""
     sizes = setup.sizes
-    module = SequenceClassifier(setup.model, sizes, setup.encoder())
-    optimizer = learning.make_optimizer(setup.training)
+    module = SequenceClassifier(setup.model, sizes, setup.make_encoder())
+    optimizer = make_optimizer(setup.training)
 
     def encode(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="encode")
@@ -38,7 +41,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         # As for every energy: the end action, the last one, is never the first of a plan.
         return jnp.where(actions[0] == sizes.num_actions - 1, jnp.inf, result)
 
-    energy = classifier(learning.context_encoder(encode, setup), degree, sizes.num_actions)
+    energy = classifier(make_encode(setup, encode), degree, sizes.num_actions)
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
@@ -51,9 +54,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         assert isinstance(found, jax.Array)
         return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
 
-    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
-    update = learning.make_update(mean_loss, optimizer, mesh)
-    init = learning.make_init(setup, module, _encode_and_judge, optimizer)
+    mean_loss = average_loss(setup, window_loss, make_window_encoder(module))
+    update = make_update(mean_loss, optimizer, mesh)
+    init = make_init(setup, module, _encode_and_judge, optimizer)
     return Agent(init, window_batches(setup), update, energy)
 
 

@@ -9,8 +9,8 @@ import dataclasses
 from jax.sharding import Mesh
 
 from leapjax.agents import returns
+from leapjax.agents.base import Method, Setup
 from leapjax.agents.imitation import make_imitator
-from leapjax.agents.learning import Method, Setup
 from leapjax.checks import check_types
 from leapjax.types import Agent
 
@@ -31,7 +31,7 @@ class Settings:
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """Decision Transformer as an `Agent`."""
-    return make_imitator(setup, mesh, returns.wanted(setup))
+    return make_imitator(setup, mesh, returns.condition_on_target(setup))
 
 
 DT = Method(Settings, make_agent, rewards=True)

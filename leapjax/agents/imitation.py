@@ -1,14 +1,18 @@
-"""What BC and DT share: an agent that learns which action was taken, of every state."""
+"""The agent that BC and DT share: it learns which action the demonstrator took in every state."""
 
 from typing import Any
 
 import jax
 from jax.sharding import Mesh
 
-from leapjax.agents import learning, losses
+from leapjax.agents import losses
+from leapjax.agents.acting import make_acting_energy, make_encode_next
+from leapjax.agents.base import Setup
+from leapjax.agents.batch_loss import average_loss, make_window_encoder
 from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Setup
-from leapjax.agents.returns import Returns, nothing_wanted
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.returns import ComputeReturns, omit_returns
+from leapjax.agents.update import make_init, make_update
 from leapjax.models.policy import PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -16,44 +20,47 @@ from leapjax.types import Agent, Context, Params, PyTree, Window
 def make_imitator(
     setup: Setup,
     mesh: Mesh | None,
-    wanted: Returns | None = None,
+    compute_returns: ComputeReturns | None = None,
 ) -> Agent:
-    """An agent whose energy is minus the logits of the next action.
+    """Makes an agent whose energy is minus the logits of the next action.
 
     Args:
-        setup: what it is made from.
-        mesh: of devices to train on; None for one device.
-        wanted: the returns that the action is conditioned on; None: on nothing else.
+        setup: arguments of `make_agent`.
+        mesh: devices to train on; None for one device.
+        compute_returns: returns to go that the network is conditioned on; None: it has no such
+            input.
     """
-    choices = setup.domain.num_actions - 1  # the end action is not chosen
-    module = setup.policy(("logits", choices), conditioned=wanted is not None)
-    wanted = wanted or nothing_wanted
-    optimizer = learning.make_optimizer(setup.training)
+    choices = setup.domain.num_actions - 1  # all but the end action
+    module = setup.make_policy(("logits", choices), conditioned=compute_returns is not None)
+    compute_returns = compute_returns or omit_returns
+    optimizer = make_optimizer(setup.training)
 
-    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
-        return module.apply(params, context, returns=wanted(context), tokens=tokens)
+    def apply(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+        return module.apply(params, context, returns=compute_returns(context), tokens=tokens)
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Cross-entropy of the actions of one context and of the one that followed."""
+        """Returns the cross-entropy of a context's actions and of the next action."""
         del extra
-        said: Any = module.apply(
+        outputs: Any = module.apply(
             params, window.context, deterministic=False, rngs={"dropout": key},
-            returns=wanted(window.context, window.return_to_go), tokens=tokens,
+            returns=compute_returns(window.context, window.return_to_go), tokens=tokens,
         )  # fmt: skip
-        logits = said["logits"]  # [P, A - 1]
+        logits = outputs["logits"]  # [P, A - 1]
         taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)
         loss, accuracy = losses.imitation(logits, *taken)
         return loss, {"accuracy": accuracy}
 
     def touch(module: PolicyModel, context: Context, actions: jax.Array) -> jax.Array:
         del actions
-        return module(context, returns=wanted(context))["logits"]
+        return module(context, returns=compute_returns(context))["logits"]
 
-    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
-    update = learning.make_update(mean_loss, optimizer, mesh)
-    init = learning.make_init(setup, module, touch, optimizer)
-    energy = learning.acting_energy(setup, say)
-    encode_next = learning.make_encode_next(setup, module, say)
-    return Agent(init, window_batches(setup), update, energy, encode_next)
+    mean_loss = average_loss(setup, window_loss, make_window_encoder(module))
+    return Agent(
+        init=make_init(setup, module, touch, optimizer),
+        batch=window_batches(setup),
+        update=make_update(mean_loss, optimizer, mesh),
+        energy=make_acting_energy(setup, apply),
+        encode_next=make_encode_next(setup, module, apply),
+    )

@@ -14,9 +14,13 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents import learning, losses
+from leapjax.agents import losses
+from leapjax.agents.acting import make_acting_energy, make_encode_next
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
@@ -47,7 +51,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_types(self)
-        learning.check_shares(self, "expectile", "discount", "target_rate")
+        check_within(self, 0, 1, "expectile", "discount", "target_rate")
         check_within(self, 0, LARGEST, "inverse_temperature", "largest_weight")
 
 
@@ -88,9 +92,9 @@ class Networks(nn.Module):
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """IQL as an `Agent`; its energy is minus the policy's logits."""
     settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
-    critic = setup.policy(("value", 1), ("q1", choices), ("q2", choices))
-    module = Networks(setup.policy(("logits", choices)), critic)
-    optimizer = learning.make_optimizer(setup.training)
+    critic = setup.make_policy(("value", 1), ("q1", choices), ("q2", choices))
+    module = Networks(setup.make_policy(("logits", choices)), critic)
+    optimizer = make_optimizer(setup.training)
 
     def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens, method="act")
@@ -133,13 +137,13 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             "advantage": losses.mean_where(least - value, known),
         }
 
-    init = learning.make_init(setup, module, learning.say_all, optimizer, target=_critic)
-    mean_loss = learning.average_loss(setup, transition_loss, encode)
-    update = learning.make_update(
-        mean_loss, optimizer, mesh, learning.follow(settings.target_rate, _critic)
+    init = make_init(setup, module, apply_to_context, optimizer, target=_critic)
+    mean_loss = average_loss(setup, transition_loss, encode)
+    update = make_update(
+        mean_loss, optimizer, mesh, follow_parameters(settings.target_rate, _critic)
     )
-    energy = learning.acting_energy(setup, say)
-    encode_next = learning.make_encode_next(setup, module, say)
+    energy = make_acting_energy(setup, say)
+    encode_next = make_encode_next(setup, module, say)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 

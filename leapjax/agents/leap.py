@@ -7,15 +7,18 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax import schedules
-from leapjax.agents import learning, returns
+from leapjax.agents import returns
+from leapjax.agents.acting import make_encode, make_encode_next
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss, make_window_encoder
 from leapjax.agents.batches import run_batches, window_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import make_init, make_update
 from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.errors import UserError
-from leapjax.models import trajectory
-from leapjax.models.trajectory import Model
+from leapjax.models.masked import MaskedModel, build_masked_model
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
 
@@ -56,11 +59,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """
     sizes, masking = setup.sizes, setup.settings.masking
     conditioned = setup.settings.returns
-    module = trajectory.build(
-        setup.model, sizes, setup.encoder(), conditioned, setup.settings.repeat_state
+    module = build_masked_model(
+        setup.model, sizes, setup.make_encoder(), conditioned, setup.settings.repeat_state
     )
-    to_go = returns.wanted(setup) if conditioned else returns.nothing_wanted
-    optimizer = learning.make_optimizer(setup.training)
+    to_go = returns.condition_on_target(setup) if conditioned else returns.omit_returns
+    optimizer = make_optimizer(setup.training)
     mask, pad = mask_token(sizes.num_actions), pad_token(sizes.num_actions)
     last = sizes.num_actions - 1  # the end action
 
@@ -77,7 +80,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         assert isinstance(result, jax.Array)
         return allowed(result)
 
-    energy = pseudo_likelihood(learning.context_encoder(encode, setup), logits, sizes.num_actions)
+    energy = pseudo_likelihood(make_encode(setup, encode), logits, sizes.num_actions)
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
@@ -145,25 +148,25 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.apply(params, jax.vmap(windows.joined)(runs), method="encode_batch")
 
     # To the other architecture, what a state is depends on the window that it is seen in.
-    in_runs = setup.training.run > 1 and setup.model.architecture == "paper"
+    in_runs = setup.training.consecutive > 1 and setup.model.architecture == "paper"
     if in_runs and not setup.settings.repeat_state:
         raise UserError(
-            f"runs of {setup.training.run} windows without repeated states: windows in a row have "
-            "different later states; drop one",
-            "run",
+            f"{setup.training.consecutive} consecutive windows without repeated states: "
+            "windows in a row have different later states; drop one",
+            "consecutive",
             "repeat_state",
         )
-    example = (run_loss, encode_runs) if in_runs else (window_loss, learning.encode_windows(module))
-    mean_loss = learning.average_loss(setup, *example)
-    update = learning.make_update(mean_loss, optimizer, mesh)
+    example = (run_loss, encode_runs) if in_runs else (window_loss, make_window_encoder(module))
+    mean_loss = average_loss(setup, *example)
+    update = make_update(mean_loss, optimizer, mesh)
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
-    def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
+    def touch(module: MaskedModel, context: Context, actions: jax.Array) -> jax.Array:
         memory: PyTree = module.encode(context, returns=to_go(context))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
-    init = learning.make_init(setup, module, touch, optimizer)
-    encode_next = learning.make_encode_next(setup, module, encode)
+    init = make_init(setup, module, touch, optimizer)
+    encode_next = make_encode_next(setup, module, encode)
     return Agent(init, batch, update, energy, encode_next)
 
 

@@ -19,9 +19,13 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from leapjax.agents import iql, learning, losses
+from leapjax.agents import iql, losses
+from leapjax.agents.acting import make_acting_energy, make_encode_next
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_at_least, check_within
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -47,7 +51,7 @@ class Settings(iql.Settings):
         super().__post_init__()
         check_at_least(self, 2, "members", most=100)
         check_at_least(self, 1, "rollout", most=1000)
-        learning.check_shares(self, "real_share")
+        check_within(self, 0, 1, "real_share")
         check_within(self, 0, LARGEST, "penalty")
 
 
@@ -152,9 +156,9 @@ def disagreement(predicted: Predicted) -> jax.Array:
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """MOPO as an `Agent`; its energy is minus the policy's logits."""
     settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
-    trunk = setup.policy(("features", setup.model.width))
+    trunk = setup.make_policy(("features", setup.model.width))
     module = Networks(trunk, choices, settings.members)
-    optimizer = learning.make_optimizer(setup.training)
+    optimizer = make_optimizer(setup.training)
 
     def call(params: Params, method: str, *inputs: Any, **options: Any) -> Any:
         return module.apply(params, *inputs, method=method, **options)
@@ -253,13 +257,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             "disagreement": differ,
         }
 
-    init = learning.make_init(
-        setup, module, learning.say_all, optimizer, target=lambda params: params
-    )
-    mean_loss = learning.average_loss(setup, transition_loss, encode)
-    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
-    energy = learning.acting_energy(setup, say)
-    encode_next = learning.make_encode_next(setup, module, say)
+    init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
+    mean_loss = average_loss(setup, transition_loss, encode)
+    update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
+    energy = make_acting_energy(setup, say)
+    encode_next = make_encode_next(setup, module, say)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 

@@ -7,15 +7,19 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents import learning, losses
+from leapjax.agents import losses
+from leapjax.agents.acting import make_encode
+from leapjax.agents.base import Method, Setup
+from leapjax.agents.batch_loss import average_loss, make_window_encoder
 from leapjax.agents.batches import window_batches
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
 from leapjax.energy import autoregressive
 from leapjax.errors import UserError
 from leapjax.models.alternating import AlternatingModel
-from leapjax.models.trajectory import MOST_LAYERS
+from leapjax.models.config import MOST_LAYERS
 from leapjax.planners import BeamConfig
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
@@ -44,8 +48,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             f"encodes each state of a plan by itself, so its horizon is at most {MOST_LAYERS}",
             "horizon",
         )
-    module = AlternatingModel(setup.model, sizes, setup.encoder())
-    optimizer = learning.make_optimizer(setup.training)
+    module = AlternatingModel(setup.model, sizes, setup.make_encoder())
+    optimizer = make_optimizer(setup.training)
 
     def encode(params: Params, context: Context) -> PyTree:
         return module.apply(params, context, method="begin")
@@ -60,7 +64,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         goes_on = jnp.where(jnp.arange(sizes.num_actions) == last, 0.0, -jnp.inf)
         return jnp.where(ended[positions, None], goes_on, result)
 
-    energy = autoregressive(learning.context_encoder(encode, setup), logits, sizes.num_actions)
+    energy = autoregressive(make_encode(setup, encode), logits, sizes.num_actions)
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
@@ -82,9 +86,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         loss = cloning + setup.settings.state_weight * error
         return loss, {"accuracy": accuracy, "state_error": error}
 
-    mean_loss = learning.average_loss(setup, window_loss, learning.encode_windows(module))
-    update = learning.make_update(mean_loss, optimizer, mesh)
-    init = learning.make_init(setup, module, _encode_and_score, optimizer)
+    mean_loss = average_loss(setup, window_loss, make_window_encoder(module))
+    update = make_update(mean_loss, optimizer, mesh)
+    init = make_init(setup, module, _encode_and_score, optimizer)
     return Agent(init, window_batches(setup, windows.unrolled_window), update, energy)
 
 

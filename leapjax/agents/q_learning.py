@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents import learning, losses
+from leapjax.agents import losses
+from leapjax.agents.acting import make_acting_energy, make_encode_next
+from leapjax.agents.base import Setup
+from leapjax.agents.batch_loss import EncodeExamples, average_loss
 from leapjax.agents.batches import transition_batches
-from leapjax.agents.learning import EncodeExamples, Setup
-from leapjax.checks import check_types
+from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
+from leapjax.checks import check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import PolicyModel, Said
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
@@ -34,7 +38,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_types(self)
-        learning.check_shares(self, "discount", "target_rate")
+        check_within(self, 0, 1, "discount", "target_rate")
 
 
 class Judged(NamedTuple):
@@ -107,8 +111,8 @@ def make_agent(
         values: of what is said, `[P, W]`: the Q-values, `[P, A - 1]`.
     """
     settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
-    module = setup.policy(("q", width))
-    optimizer = learning.make_optimizer(setup.training)
+    module = setup.make_policy(("q", width))
+    optimizer = make_optimizer(setup.training)
 
     def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens=tokens)
@@ -136,11 +140,9 @@ def make_agent(
             "value": losses.mean_where(losses.of_action(q, taken), known),
         }
 
-    init = learning.make_init(
-        setup, module, learning.say_all, optimizer, target=lambda params: params
-    )
-    mean_loss = learning.average_loss(setup, transition_loss, encode_around(module))
-    update = learning.make_update(mean_loss, optimizer, mesh, learning.follow(settings.target_rate))
-    energy = learning.acting_energy(setup, say, lambda said: values(said["q"]))
-    encode_next = learning.make_encode_next(setup, module, say)
+    init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
+    mean_loss = average_loss(setup, transition_loss, encode_around(module))
+    update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
+    energy = make_acting_energy(setup, say, lambda said: values(said["q"]))
+    encode_next = make_encode_next(setup, module, say)
     return Agent(init, transition_batches(setup), update, energy, encode_next)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
-from leapjax.agents.learning import Method, Setup
+from leapjax.agents.base import Method, Setup
 from leapjax.agents.q_learning import Judged, Returns
 from leapjax.checks import check_at_least
 from leapjax.types import Agent

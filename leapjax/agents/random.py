@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import Method, Setup, untrained
+from leapjax.agents.base import Method, Setup, make_untrained_agent
 from leapjax.energy import single_action
 from leapjax.types import Agent, Context, Params, PyTree
 
@@ -26,7 +26,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return ()
 
     energy = single_action(encode, lambda params, memory: jnp.zeros(choices), choices + 1)
-    return untrained(energy)
+    return make_untrained_agent(energy)
 
 
 RANDOM = Method(Settings, make_agent)

@@ -1,38 +1,43 @@
-"""Returns to go, which Decision Transformer and LEAP can be asked for (Chen et al., 2021)."""
+"""Returns to go, on which Decision Transformer and LEAP can be conditioned (Chen et al., 2021)."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from leapjax.agents.learning import Setup
+from leapjax.agents.base import Setup
 from leapjax.types import Context
 
-Returns = Callable[..., jax.Array | None]
-# (context, what a demonstration gave from its state on, or nothing while acting) -> [K + 1]; or
-# None, for a network that is not conditioned on them
+ComputeReturns = Callable[..., jax.Array | None]
+# (context, return to go of the demonstration's current state; None while acting) -> the returns
+# to go [K + 1] that the network is conditioned on, or None
 
 
-def wanted(setup: Setup) -> Returns:
-    """What a network is conditioned on: at the past states and the current one.
+def condition_on_target(setup: Setup) -> ComputeReturns:
+    """Makes the returns to go of a conditioned network, at the past states and the current one.
 
-    While acting it is the target return, less what the episode has given so far.
+    While acting, the current return to go is the target return minus the return so far.
     """
 
-    def returns(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
+    def compute(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
         if return_to_go is None:
             return_to_go = setup.settings.target_return - context.return_so_far
-        return returns_to_go(context, return_to_go) / setup.domain.scaling.returns
+        return compute_returns_to_go(context, return_to_go) / setup.domain.scaling.returns
 
-    return returns
+    return compute
 
 
-def nothing_wanted(context: Context, return_to_go: jax.Array | None = None) -> None:
-    """Of a network that is not conditioned on returns."""
+def omit_returns(context: Context, return_to_go: jax.Array | None = None) -> None:
+    """Returns None, for a network that is not conditioned on returns."""
     del context, return_to_go
 
 
-def returns_to_go(context: Context, now: jax.Array) -> jax.Array:
-    """`[K + 1]`: what was to come at the past states and the current one, given `now []`."""
+def compute_returns_to_go(context: Context, current: jax.Array) -> jax.Array:
+    """Returns the returns to go `[K + 1]` at the past states and the current one.
+
+    Args:
+        context: holds the rewards `[K]` of the past steps.
+        current: return to go `[]` at the current state.
+    """
     later = jnp.cumsum(context.rewards[::-1])[::-1]
-    return now + jnp.append(later, 0.0)
+    return current + jnp.append(later, 0.0)

@@ -4,7 +4,7 @@ import dataclasses
 
 from jax.sharding import Mesh
 
-from leapjax.agents.learning import Method, Setup, untrained
+from leapjax.agents.base import Method, Setup, make_untrained_agent
 from leapjax.errors import UserError
 from leapjax.types import Agent
 
@@ -26,7 +26,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             f"{setup.domain.level} has no rules that are written as an energy: use another method",
             "method",
         )
-    return untrained(setup.domain.rules)
+    return make_untrained_agent(setup.domain.rules)
 
 
 RULES = Method(Settings, make_agent, everywhere=False)

@@ -12,7 +12,7 @@ from leapjax.checkpoints.parameters import (
     restore_params,
     save_params,
 )
-from leapjax.checkpoints.paths import check_path, newest
+from leapjax.checkpoints.paths import check_path, find_newest
 from leapjax.checkpoints.states import Checkpoints
 
 __all__ = [
@@ -20,8 +20,8 @@ __all__ = [
     "Unfinished",
     "check_identity",
     "check_path",
+    "find_newest",
     "hush_orbax",
-    "newest",
     "restore_params",
     "save_params",
 ]

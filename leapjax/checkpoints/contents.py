@@ -8,7 +8,7 @@ import numpy as np
 import tensorstore
 
 from leapjax.errors import UserError
-from leapjax.serialization import IDENTITY, identity_digest
+from leapjax.serialization import IDENTITY, hash_identity
 from leapjax.types import PyTree
 
 ITEM = "default"  # Orbax's name for the only item of a checkpoint
@@ -44,7 +44,7 @@ def read_identity(checkpoint: Path) -> np.ndarray:
     kvstore = _open_store(checkpoint).spec().to_json()
     array = tensorstore.open(
         {"driver": "zarr", "kvstore": {**kvstore, "path": f"{IDENTITY}/"}},
-        dtype=tensorstore.uint8, shape=identity_digest("").shape, open=True,
+        dtype=tensorstore.uint8, shape=hash_identity("").shape, open=True,
     )  # fmt: skip
     return array.result().read().result()
 

@@ -18,7 +18,7 @@ from leapjax.checkpoints.contents import (
 )
 from leapjax.checkpoints.damage import describe_damage
 from leapjax.checkpoints.logs import hush_orbax
-from leapjax.checkpoints.paths import newest, to_absolute
+from leapjax.checkpoints.paths import find_newest, to_absolute
 from leapjax.checkpoints.sealing import check_same, seal, unseal
 from leapjax.checkpoints.states import Checkpoints
 from leapjax.errors import UserError
@@ -133,7 +133,7 @@ def _find_steps(folder: Path) -> list[int]:
     Raises:
         UserError: there are none.
     """
-    steps = newest(folder)
+    steps = find_newest(folder)
     if not steps:
         raise UserError(f"no checkpoint in {folder}: expected a folder that a run has written")
     return steps

@@ -32,7 +32,7 @@ def check_path(folder: Path) -> None:
     raise UserError(f"{path} cannot hold checkpoints ({taken}): choose another folder")
 
 
-def newest(folder: Path) -> list[int]:
+def find_newest(folder: Path) -> list[int]:
     """Returns the steps of the checkpoints in a folder, the newest first.
 
     Raises:

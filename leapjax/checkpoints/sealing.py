@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from leapjax.errors import UserError
-from leapjax.serialization import IDENTITY, identity_digest
+from leapjax.serialization import IDENTITY, hash_identity
 from leapjax.types import PyTree
 
 
@@ -19,7 +19,7 @@ def seal(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
     return {
         **parts,
         "digests": {name: _hash_arrays(part) for name, part in parts.items()},
-        IDENTITY: identity_digest(identity),
+        IDENTITY: hash_identity(identity),
     }
 
 
@@ -44,7 +44,7 @@ def check_same(saved: np.ndarray, identity: str, checkpoint: Path) -> None:
     Raises:
         UserError: the checkpoint was saved with another identity.
     """
-    if not np.array_equal(saved, identity_digest(identity)):
+    if not np.array_equal(saved, hash_identity(identity)):
         raise UserError(
             f"the checkpoint {checkpoint} is of another configuration than the one beside it: it "
             "was copied here from another run, or the specification was changed; put back what "

@@ -62,7 +62,7 @@ class Checkpoints:
     @property
     def latest(self) -> int | None:
         """Step of the newest checkpoint, or None."""
-        return processes.first_does(lambda: self._manager.latest_step())
+        return processes.run_on_first(lambda: self._manager.latest_step())
 
     def save(self, state: TrainState) -> None:
         """Writes a state in the background.
@@ -81,7 +81,7 @@ class Checkpoints:
                 self._manager.save(int(values.step), args=arguments)
             self._saved = int(values.step)
 
-        processes.first_does(write)
+        processes.run_on_first(write)
 
     def restore(
         self, like: TrainState, skipped: Callable[[str], Any] = warnings.warn
@@ -104,7 +104,7 @@ class Checkpoints:
             found.extend(self._read(blank, skipped))
             return bool(found)
 
-        if not processes.first_does(read):
+        if not processes.run_on_first(read):
             return None
         values = processes.broadcast(found[0] if found else blank)
         return sharding.place(values, jax.tree.map(lambda leaf: leaf.sharding, like))

@@ -21,12 +21,12 @@ def test_seeds(first: int, episodes: int) -> range:
     Raises:
         UserError: none, or seeds that training or validation may use.
     """
-    return _within(first, episodes, 0, VALIDATION_START, "test")
+    return _make_range(first, episodes, 0, VALIDATION_START, "test")
 
 
 def validation_seeds(first: int, episodes: int) -> range:
     """Level seeds on which choices are made."""
-    return _within(first, episodes, VALIDATION_START, TRAINING_START, "validation")
+    return _make_range(first, episodes, VALIDATION_START, TRAINING_START, "validation")
 
 
 def training_seeds(seed: int) -> Iterator[int]:
@@ -55,7 +55,7 @@ def check_disjoint(demonstrations: list[int], episodes: range) -> None:
         )
 
 
-def _within(first: int, episodes: int, low: int, high: int, kind: str) -> range:
+def _make_range(first: int, episodes: int, low: int, high: int, kind: str) -> range:
     """So many level seeds from `low + first` on.
 
     Raises:

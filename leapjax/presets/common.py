@@ -5,10 +5,10 @@ from types import MappingProxyType
 from typing import Any
 
 from leapjax.agents import leap
-from leapjax.agents.learning import TrainingConfig
+from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import AnyConfig, Config
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
 
 UNTRAINED = ("random", "rules")  # these methods learn nothing

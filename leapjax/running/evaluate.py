@@ -31,7 +31,7 @@ def evaluate(run: Run, planner: Pretrained) -> Episodes:
             run.interruption.check()
             meter.update(over, f"success {good}/{over}")
 
-        part = processes.together(lambda: play(mine, progress=progress))
+        part = processes.run_together(lambda: play(mine, progress=progress))
     arrays = [x.tolist() for x in part[:4]]
     parts = [
         Episodes(*(np.array(x) for x in lists), *counts)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Runs every level, method and seed of a command line, each to a row beside the paper's."""
+"""Runs every level, method and seed of a command line; each makes a row."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ import jax
 from rich.console import Console
 
 from leapjax import files, processes
-from leapjax.configuration import AnyConfig, configuration_hash
+from leapjax.configuration import AnyConfig, hash_config
 from leapjax.errors import UserError
 from leapjax.running import jax_setup, results, shell
 from leapjax.running.command_line import parse
@@ -22,7 +22,7 @@ from leapjax.running.trained import add_rules, load_trained
 
 
 def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
-    """Runs every level and seed asked for; the exit code."""
+    """Runs every level, method and seed of a command line; returns the exit code."""
     given = shell.read_arguments(arguments)
     return shell.run_interruptible_program(
         experiment.module, given, lambda interruption: run_all(experiment, given, interruption)
@@ -30,7 +30,7 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> int:
 
 
 def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Interruption) -> None:
-    """Every level and seed of a command line; the failure of one comes after all others."""
+    """Runs every level, method and seed; raises the first failure after all others have run."""
     configs = parse(experiment.domain, arguments, experiment.config, experiment.module)
     jax_setup.start(configs[0].cluster)
     versions = results.find_versions()  # of the code that runs, whatever is committed meanwhile
@@ -60,10 +60,10 @@ def finish(
     console: Console,
     interruption: Interruption,
 ) -> results.Row:
-    """Returns the row of one level and one seed; runs it where it is not recorded yet."""
-    rows, name = locate_rows(experiment, config), configuration_hash(config, seed)
-    # Read even where nothing is looked for: a damaged file is better found now than after the run.
-    known = processes.first_does(lambda: results.find(rows, name))
+    """Returns the row of one level and one seed; runs it if it is not recorded."""
+    rows, name = locate_rows(experiment, config), hash_config(config, seed)
+    # Always read: a damaged file raises here, before hours of work.
+    known = processes.run_on_first(lambda: results.find(rows, name))
     if config.record and not config.force and known is not None:
         console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
         return known
@@ -77,7 +77,7 @@ def finish(
 
 
 def check_start(run: Run) -> None:
-    """Refuses what would fail after hours of work.
+    """Checks, before hours of work, what would fail after them.
 
     Raises:
         UserError: fewer episodes than processes, or a folder that cannot be written to.
@@ -87,11 +87,11 @@ def check_start(run: Run) -> None:
             f"--episodes {run.config.episodes}: fewer than the {jax.process_count()} processes"
         )
     for where in (run.rows.parent, run.config.runs):
-        processes.first_does(functools.partial(files.check_writable, where))
+        processes.run_on_first(functools.partial(files.check_writable, where))
 
 
 def complete(run: Run, versions: Mapping[str, str]) -> results.Row:
-    """Does a run, from demonstrations to its row."""
+    """Runs every step from the demonstrations to the row; returns the row."""
     if run.config.checkpoint is None:
         data = load_demonstrations(run)
         planner = train(run, data)
@@ -103,24 +103,24 @@ def complete(run: Run, versions: Mapping[str, str]) -> results.Row:
 
 
 def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:
-    """The other ways to plan with what a run has learned, if it has learned anything.
+    """Returns configurations that plan in other ways with the parameters of a run.
 
     Raises:
-        UserError: the run is recorded, and one of them is not, but what was learned is not here.
+        UserError: the folder of the run is missing, and one of these configurations has no row.
     """
-    if config.checkpoint is not None:
+    if config.checkpoint is not None or experiment.searches is None:
         return []
     folder = find_folder(experiment, config, seed)
     others = experiment.searches(config)
     found = [dataclasses.replace(o, checkpoint=folder, pictures=False) for o in others]
 
-    def out_of_reach() -> int:
+    def count_unreachable() -> int:
         if folder.is_dir():
             return 0
         known = {row["hash"] for row in results.read(locate_rows(experiment, config))}
-        return sum(configuration_hash(each, seed) not in known for each in found)
+        return sum(hash_config(each, seed) not in known for each in found)
 
-    count = processes.first_does(out_of_reach)
+    count = processes.run_on_first(count_unreachable)
     if count:
         raise UserError(
             f"{config.level}, seed {seed}, is recorded, and {count} of {len(found)} ways to search "

@@ -1,4 +1,4 @@
-"""Writes what a run has come to: a row, its episodes, pictures."""
+"""Writes the results of a run: its row, episodes and pictures."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from leapjax import processes, scores
-from leapjax.configuration import resolved
+from leapjax.configuration import list_settings
 from leapjax.pretrained import Pretrained
 from leapjax.rollouts import Episodes
 from leapjax.running import plots, results
@@ -23,10 +23,10 @@ def record(
     """Writes the row of a run, its episodes and its pictures; returns the row.
 
     Args:
-        run: that has come to its end.
-        planner: that it made.
-        episodes: that the planner played.
-        versions: of the code that ran.
+        run: a finished run.
+        planner: planner of the run.
+        episodes: held-out episodes that the planner played.
+        versions: versions of the code that ran.
     """
     config, folder, experiment = run.config, run.folder, run.experiment
     row = make_row(run, planner, episodes) | {"versions": dict(versions)}
@@ -42,14 +42,14 @@ def record(
                 experiment.animate(planner, run, run.played[:3], folder / "plan.gif")
             run.console.print(f"pictures: {folder}", highlight=False)
 
-    processes.first_does(write)
+    processes.run_on_first(write)
     run.console.print(results.summarize(row))
     return row
 
 
 def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
-    """The JSON row of a finished run."""
-    config, lengths = run.config, episodes.lengths
+    """Makes the JSON row of a finished run."""
+    config, paper, lengths = run.config, run.experiment.paper, episodes.lengths
     return {
         "experiment": run.experiment.name,
         "domain": config.domain,
@@ -78,16 +78,16 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
         "plans": episodes.plans,
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
-        "paper_success": run.experiment.paper(config.level, config.method),
+        "paper_success": paper and paper(config.level, config.method),
         **describe_success(run),
         "date": results.format_date(),
         "hash": run.name,
-        "configuration": resolved(config, run.seed),
+        "configuration": list_settings(config, run.seed),
     }
 
 
 def describe_success(run: Run) -> dict[str, Any]:
-    """What success means in a row, and how well the data do by it, where that is not plain."""
+    """Returns the fields of a row that define success, if the domain has a criterion for it."""
     config, criterion = run.config, run.domain.demonstrations.criterion
     if criterion is None:
         return {}

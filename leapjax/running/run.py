@@ -1,4 +1,4 @@
-"""A run: a level, a method and a seed, with all that its steps share."""
+"""A run: one level, one method and one seed, with the values that its steps share."""
 
 import contextlib
 import dataclasses
@@ -13,10 +13,10 @@ from leapjax import files, processes
 from leapjax.configuration import (
     AnyConfig,
     Config,
-    configuration_hash,
-    episode_seeds,
+    choose_episode_seeds,
+    hash_config,
+    list_settings,
     make_domain,
-    resolved,
     specify,
 )
 from leapjax.domain import Domain
@@ -27,65 +27,55 @@ from leapjax.running.loggers import About, Log
 from leapjax.running.programs import BackgroundPrograms
 
 
-def no_searches(config: AnyConfig) -> Sequence[AnyConfig]:
-    """Returns no further ways to plan."""
-    del config
-    return ()
-
-
-def no_numbers(level: str, method: str) -> float | None:
-    """Returns None: nobody has published a success rate."""
-    del level, method
-    return None
-
-
 class Experiment(NamedTuple):
-    """What one program adds to the steps that all of them share.
+    """What one program adds to the steps that all programs share.
 
     Attributes:
-        name: of its module, and of its file of rows.
-        domain: by name.
-        searches: (configuration) -> how else to plan with what was trained, a row for each.
-        animate: (planner, run, level seeds, path): draws plans being refined and executed.
-        iterations: draw success against the number of iterations.
-        config: `Config`, or a subclass: what its users call the options.
-        paper: (level, method) -> the paper's success, in percent.
-        package: of its module.
+        name: name of its module and of its file of rows.
+        domain: name of its domain.
+        searches: (configuration) -> configurations that plan in other ways with the trained
+            parameters; each makes a row. None if there are no other ways.
+        animate: (planner, run, level seeds, path): draws plans that are refined and executed.
+        iterations: whether to draw success against the number of iterations.
+        config: `Config`, or a subclass with the program's own names of options.
+        paper: (level, method) -> the paper's success, in percent, or None; None if the paper has
+            no such experiment.
+        package: package of its module.
     """
 
     name: str
     domain: str
-    searches: Callable[[AnyConfig], Sequence[AnyConfig]] = no_searches
+    searches: Callable[[AnyConfig], Sequence[AnyConfig]] | None = None
     animate: "Callable[[Pretrained, Run, Sequence[int], Path], None] | None" = None
     iterations: bool = True
     config: type[AnyConfig] = Config
-    paper: Callable[[str, str], float | None] = no_numbers
+    paper: Callable[[str, str], float | None] | None = None
     package: str = "experiments"
 
     @property
     def module(self) -> str:
-        """The module of its program."""
+        """The module of the program."""
         return f"{self.package}.{self.name}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What every step of a run needs.
+    """Values that the steps of a run share.
 
     Attributes:
-        experiment: that it is of.
-        config: its configuration.
+        experiment: the experiment that the run belongs to.
+        config: configuration of the run.
         domain: the level that is played.
-        specification: of the planner that it makes.
-        folder: where it leaves what it makes.
+        specification: specification of the planner that the run makes.
+        folder: folder for checkpoints, metrics and pictures.
         played: level seeds of the episodes that measure success.
-        console: for progress.
-        interruption: asks it to stop.
-        opened: closes what steps open, at the end of the run.
-        plays: whether its planner will act; if not, nothing is compiled for that.
-        log: takes measurements as they are made.
-        programs: what it compiles.
-        seconds: where the time went, filled in by each step.
+        console: prints progress.
+        interruption: tells the run to stop.
+        opened: closes at the end of the run what its steps open.
+        plays: whether the planner will play; if not, the run compiles no plans.
+        log: receives measurements as they are made.
+        programs: compiles the programs of the run in the background.
+        seconds: seconds that each part of the run took; the steps fill it in.
     """
 
     experiment: Experiment
@@ -112,11 +102,11 @@ class Run:
     @property
     def name(self) -> str:
         """The hash that names the run and its row."""
-        return configuration_hash(self.config, self.seed)
+        return hash_config(self.config, self.seed)
 
     @property
     def rows(self) -> Path:
-        """The file that its row goes to."""
+        """The file of the run's row."""
         return locate_rows(self.experiment, self.config)
 
 
@@ -133,20 +123,20 @@ def open_run(
     """Opens a run of one level and one seed, with its loggers; closes all that its steps open.
 
     Args:
-        experiment: that it is of.
-        config: its configuration.
-        seed: of the training.
-        console: for progress.
-        interruption: asks it to stop.
-        played: level seeds that it may not learn from; None for those of the configuration.
-        plays: whether its planner will act.
+        experiment: the experiment that the run belongs to.
+        config: configuration of the run.
+        seed: training seed.
+        console: prints progress.
+        interruption: tells the run to stop.
+        played: level seeds that the run may not learn from; None for the configuration's.
+        plays: whether the planner will play.
     """
     domain = make_domain(config)
     with contextlib.ExitStack() as opened:
         run = Run(
             experiment, config, domain, specify(config, seed, domain),
             find_folder(experiment, config, seed),
-            episode_seeds(config) if played is None else played,
+            choose_episode_seeds(config) if played is None else played,
             console, interruption, opened, plays,
         )  # fmt: skip
         if processes.is_first():
@@ -156,22 +146,22 @@ def open_run(
 
 
 def _describe(run: Run) -> About:
-    """What loggers are told of a run; makes its folder."""
+    """Describes a run to its loggers; makes the folder of the run."""
     files.check_writable(run.folder)
     run.folder.mkdir(parents=True, exist_ok=True)
     before = metrics.read_metrics(run.folder)
     done = int(before[-1]["step"]) if before else 0
-    return About(run.folder, run.name, resolved(run.config, run.seed), done)
+    return About(run.folder, run.name, list_settings(run.config, run.seed), done)
 
 
 def locate_rows(experiment: Experiment, config: AnyConfig) -> Path:
-    """The file that rows go to."""
+    """Returns the file of an experiment's rows."""
     return results.choose_folder(config.record, config.runs) / f"{experiment.name}.jsonl"
 
 
 def find_folder(experiment: Experiment, config: AnyConfig, seed: int) -> Path:
-    """Where a run leaves what it makes."""
+    """Returns the folder of a run, which need not exist."""
     level = re.sub(r"[^\w.-]", "-", config.level)  # ids of environments may have a slash
     of = f"{level}-{config.method}-{config.preset}-seed{seed}"
-    label = f"{experiment.name}-{of}-{configuration_hash(config, seed)}"
+    label = f"{experiment.name}-{of}-{hash_config(config, seed)}"
     return config.runs / ("evaluations" if config.checkpoint else "") / label

@@ -23,23 +23,23 @@ from leapjax.running.run import Run
 from leapjax.types import Demonstration, Energy, Params, TrainState
 
 Watch = Callable[[Energy, Params], dict[str, float]]
-REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
+REPORT_SECONDS = 5.0  # at most between reports, which save checkpoints and see signals
 
 
 def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -> Pretrained:
     """Trains, or goes on where the run stopped; the training curve is in its folder.
 
     Args:
-        run: to do. Other processes are kept out of its folder until it is closed.
-        data: to train on.
-        watch: measures more of what is being learned, whenever progress is reported.
+        run: run to train; its folder is locked until it is closed.
+        data: demonstrations to train on.
+        watch: (energy, parameters) -> further measurements for each report of progress.
 
     Raises:
         UserError: the folder is of another run or of other data, or another process works in it.
         Interrupted: the run was asked to stop; its newest state is saved.
     """
     run = learn_statistics(run, data)
-    processes.first_does(lambda: run.opened.enter_context(files.only_process_in(run.folder)))
+    processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
     steps: Any = (
@@ -55,23 +55,25 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         jax.block_until_ready(step.draw(key, state.step, steps))
     run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
-    processes.first_does(lambda: files.check_room(folder, 3 * size))  # two and the next
-    saved = Checkpoints(folder / pretrained.CHECKPOINTS, pretrained.identity(run.specification))
+    processes.run_on_first(lambda: files.check_room(folder, 3 * size))  # two and the next
+    saved = Checkpoints(
+        folder / pretrained.CHECKPOINTS, pretrained.describe_identity(run.specification)
+    )
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
     # Not before: what does not fit the run that is there leaves it as it is.
-    processes.first_does(lambda: pretrained.save_specification(folder, run.specification))
+    processes.run_on_first(lambda: pretrained.save_specification(folder, run.specification))
     metrics: Metrics = []
     if restored is not None:
         state = restored
         metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
         console.print(f"continuing at step {int(state.step)} of {total}")
     if not total and restored is None:
-        saved.save(state)  # there is nothing to learn: what a method begins with is all of it
+        saved.save(state)  # the method does not learn: its first state is its last
 
     before = metrics[-1]["seconds"] if metrics else 0.0
     begun = last_saved = time.perf_counter()
     with (
-        run.interruption.deferred(),
+        run.interruption.defer_signals(),
         contextlib.closing(saved),
         Meter(console, "training", total, int(state.step)) as meter,
     ):
@@ -89,7 +91,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
             for number in filter(None, signals):
                 run.interruption.adopt(number)
             if done == total or any(signals) or any(dues):
-                processes.first_does(lambda: write_metrics(folder, metrics))
+                processes.run_on_first(lambda: write_metrics(folder, metrics))
                 saved.save(now)
                 last_saved = time.perf_counter()
             return any(signals)
@@ -103,7 +105,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
 
 
 def learn_statistics(run: Run, data: Sequence[Demonstration]) -> Run:
-    """Returns a run whose network knows the statistics of what it learns from, if it needs any."""
+    """Returns a run with the statistics of its data, if its network needs them."""
     statistics = measure_statistics(run.domain, data)
     return dataclasses.replace(
         run,

@@ -8,15 +8,15 @@ environment of the data, and `sources` makes what does not exist yet.
 
 from leapjax.data.storage.datasets import (
     UNKNOWN_SEED,
-    dataset_id,
-    datasets_folder,
-    described,
-    exists,
+    describe_dataset,
+    find_datasets_folder,
+    has_dataset,
+    name_dataset,
 )
 from leapjax.data.storage.episodes import check_demonstration
-from leapjax.data.storage.reading import load, reasons
-from leapjax.data.storage.sources import find_source, no_demonstrator
-from leapjax.data.storage.spaces import observation_space
+from leapjax.data.storage.reading import describe_dropped, load
+from leapjax.data.storage.sources import explain_no_demonstrator, find_source
+from leapjax.data.storage.spaces import make_observation_space
 from leapjax.data.storage.writing import save
 from leapjax.domain import Described
 
@@ -24,14 +24,14 @@ __all__ = [
     "UNKNOWN_SEED",
     "Described",
     "check_demonstration",
-    "dataset_id",
-    "datasets_folder",
-    "described",
-    "exists",
+    "describe_dataset",
+    "describe_dropped",
+    "explain_no_demonstrator",
+    "find_datasets_folder",
     "find_source",
+    "has_dataset",
     "load",
-    "no_demonstrator",
-    "observation_space",
-    "reasons",
+    "make_observation_space",
+    "name_dataset",
     "save",
 ]

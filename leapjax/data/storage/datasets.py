@@ -15,7 +15,7 @@ FORMAT = 2  # raise it whenever the content of a demonstration changes: old cach
 UNKNOWN_SEED = -1  # the seed of an episode whose data do not say it: no test level has it
 
 
-def dataset_id(domain: Domain, count: int, seed: int) -> str:
+def name_dataset(domain: Domain, count: int, seed: int) -> str:
     """Returns the id under which `count` demonstrations for a training seed are cached."""
     return f"leapjax/{domain.level}/bot-{count}-seed{seed}-v{FORMAT}"
 
@@ -26,7 +26,7 @@ def find_version(name: str) -> int | None:
     return int(found[1]) if found else None
 
 
-def datasets_folder() -> Path:
+def find_datasets_folder() -> Path:
     """Returns Minari's folder of data sets; makes it if it does not exist.
 
     Raises:
@@ -50,23 +50,23 @@ def check_writable() -> None:
     Raises:
         UserError: it cannot; names the folder.
     """
-    root = datasets_folder()
+    root = find_datasets_folder()
     if not os.access(root, os.W_OK):
         raise UserError(f"cannot write to {root}: name another folder in MINARI_DATASETS_PATH")
 
 
-def exists(name: str) -> bool:
+def has_dataset(name: str) -> bool:
     """Returns whether the local Minari folder has a data set with this id."""
     # A folder without data is a namespace: others may be below it.
     try:
-        return (datasets_folder() / name / "data").exists()
+        return (find_datasets_folder() / name / "data").exists()
     except OSError:  # not a possible name of a file, or not readable
         return False
 
 
-def described(name: str) -> Described:
+def describe_dataset(name: str) -> Described:
     """Reads what the metadata of a data set say about its environment; unknown fields are None."""
-    path = datasets_folder() / name / "data" / "metadata.json"
+    path = find_datasets_folder() / name / "data" / "metadata.json"
     try:
         metadata = json.loads(files.read_text(path))
         count = metadata.get("total_episodes")

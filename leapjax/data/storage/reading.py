@@ -16,10 +16,10 @@ from leapjax.checks import check_integer
 from leapjax.data.storage.datasets import (
     FORMAT,
     UNKNOWN_SEED,
-    datasets_folder,
-    described,
-    exists,
+    describe_dataset,
+    find_datasets_folder,
     find_version,
+    has_dataset,
 )
 from leapjax.data.storage.episodes import (
     STEPWISE,
@@ -50,9 +50,9 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     Raises:
         UserError: the data set is missing, damaged or empty, or does not fit the domain.
     """
-    if not exists(name):
+    if not has_dataset(name):
         raise UserError(
-            f"no Minari data set {name!r} in {datasets_folder()}: "
+            f"no Minari data set {name!r} in {find_datasets_folder()}: "
             "check the id with `minari list local`"
         )
     version = find_version(name)
@@ -66,7 +66,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     with _explain_damage(name):
         metadata = read_metadata(folder)
         outlines = inspect_dataset(folder, metadata)
-        recorded = described(name)._replace(spaces=read_spaces(metadata, domain))
+        recorded = describe_dataset(name)._replace(spaces=read_spaces(metadata, domain))
         domain.demonstrations.check_environment(recorded, f"the Minari data set {name!r}")
     for index, outline in enumerate(outlines):
         check_outline(outline, domain, _name_episode(index, name))
@@ -86,12 +86,12 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     compare_with_play(name, recorded, domain, found)
     collection = Collection(found, dropped)
     if not found:
-        only = f" that can be used, only {reasons(collection)}" if dropped else ""
+        only = f" that can be used, only {describe_dropped(collection)}" if dropped else ""
         raise UserError(f"the Minari data set {name!r} has no episodes{only}")
     return collection
 
 
-def reasons(collection: Collection) -> str:
+def describe_dropped(collection: Collection) -> str:
     """Describes how many episodes were dropped, for which reasons."""
     return ", ".join(f"{count} {reason}" for reason, count in collection.dropped.items())
 

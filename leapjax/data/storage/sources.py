@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from leapjax.data.storage.datasets import check_writable, dataset_id, exists
-from leapjax.data.storage.reading import load, reasons
+from leapjax.data.storage.datasets import check_writable, has_dataset, name_dataset
+from leapjax.data.storage.reading import describe_dropped, load
 from leapjax.data.storage.writing import save
 from leapjax.domain import Collection, Domain, Source
 from leapjax.errors import UserError
@@ -26,9 +26,9 @@ def find_source(domain: Domain, count: int, seed: int) -> Source:
     def make(name: str, progress: Callable[[int], None]) -> str:
         check_writable()
         if collect is None:
-            raise UserError(no_demonstrator(domain))
+            raise UserError(explain_no_demonstrator(domain))
         collection = collect(count, seed, progress)
-        dropped = reasons(collection)
+        dropped = describe_dropped(collection)
         summary = f"{count} demonstrations of {domain.level}"
         summary += f"; dropped: {dropped}" if dropped else ""
         save(name, collection, domain, summary)
@@ -37,7 +37,7 @@ def find_source(domain: Domain, count: int, seed: int) -> Source:
     def load_all(name: str, seed: int) -> Collection:
         del seed
         loaded = load(name, domain, count)
-        found, dropped = len(loaded.demonstrations), reasons(loaded)
+        found, dropped = len(loaded.demonstrations), describe_dropped(loaded)
         if found < count:
             also = f" that can be used ({dropped})" if dropped else ""
             raise UserError(
@@ -46,10 +46,10 @@ def find_source(domain: Domain, count: int, seed: int) -> Source:
             )
         return loaded
 
-    default = dataset_id(domain, count, seed)
-    return Source(default, exists, make, load_all, count, "demonstrations")
+    default = name_dataset(domain, count, seed)
+    return Source(default, has_dataset, make, load_all, count, "demonstrations")
 
 
-def no_demonstrator(domain: Domain) -> str:
+def explain_no_demonstrator(domain: Domain) -> str:
     """Returns the message for a domain that has no demonstrator."""
     return f"{domain.level} has no demonstrator: name a Minari data set of it to train on"

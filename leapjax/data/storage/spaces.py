@@ -12,7 +12,7 @@ from leapjax.types import PyTree
 SPACES = ("observation_space", "action_space")  # keys of the metadata
 
 
-def observation_space(blank: PyTree) -> gym.Space:
+def make_observation_space(blank: PyTree) -> gym.Space:
     """Makes the Minari space of observations that have the shapes and types of `blank`."""
     if isinstance(blank, np.ndarray):
         low, high = -np.inf, np.inf
@@ -21,17 +21,19 @@ def observation_space(blank: PyTree) -> gym.Space:
         elif np.issubdtype(blank.dtype, np.integer):
             low, high = np.iinfo(blank.dtype).min, np.iinfo(blank.dtype).max
         return gym.spaces.Box(low, high, blank.shape, blank.dtype.type)
-    return gym.spaces.Dict({name: observation_space(x) for name, x in name_parts(blank).items()})
+    return gym.spaces.Dict(
+        {name: make_observation_space(x) for name, x in name_parts(blank).items()}
+    )
 
 
 def read_spaces(metadata: dict[str, Any], domain: Domain) -> dict[str, gym.Space]:
     """Reads the spaces of an inspected data set, by part: `observation` and `action`.
 
-    Leaves out the space of observations if `observation_space` made it: it says no more than the
-    shapes and types, which are checked anyway.
+    Leaves out the space of observations if `make_observation_space` made it: it says no more than
+    the shapes and types, which are checked anyway.
     """
     found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
-    if found["observation"] == observation_space(domain.blank):
+    if found["observation"] == make_observation_space(domain.blank):
         del found["observation"]
     return found
 

@@ -15,8 +15,8 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from leapjax import files
-from leapjax.data.storage.datasets import datasets_folder, exists
-from leapjax.data.storage.spaces import name_parts, observation_space
+from leapjax.data.storage.datasets import find_datasets_folder, has_dataset
+from leapjax.data.storage.spaces import make_observation_space, name_parts
 from leapjax.domain import Collection, Domain
 from leapjax.errors import UserError, first_line
 from leapjax.types import Demonstration, PyTree
@@ -54,11 +54,11 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
         )
         for index, demonstration in enumerate(collection.demonstrations)
     ]
-    root = datasets_folder()
+    root = find_datasets_folder()
     try:
-        with files.only_process_in(root / LOCK, wait=True):
+        with files.lock_folder(root / LOCK, wait=True):
             final = get_dataset_path(name)
-            if final.exists() and not exists(name):
+            if final.exists() and not has_dataset(name):
                 raise UserError(f"{name!r} is a folder of data sets: name another")
             files.check_room(root, _estimate_bytes(collection.demonstrations))
             for left_over in root.glob(f"{SCRATCH}*"):  # of killed programs
@@ -106,7 +106,7 @@ def _write_folder(
     folder.mkdir()
     storage = MinariStorage.new(
         folder / "data",
-        observation_space=observation_space(domain.blank),
+        observation_space=make_observation_space(domain.blank),
         action_space=gym.spaces.Discrete(domain.num_actions - 1),
         jpeg_encoding=False,  # grids are symbols, not pictures
     )

@@ -19,16 +19,16 @@ from leapjax.domain import (
     Source,
 )
 from leapjax.domains.atari import replay
-from leapjax.domains.atari.augmentation import mirrored, shifted
+from leapjax.domains.atari.augmentation import mirror_window
 from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
 from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.extras import report_missing
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 
-LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
+LONGEST = 5_000  # decisions of a game of preset `leapjax`, as in its demonstrations
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
 MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
 TOKENS = 4  # of a state, of our encoder
@@ -40,38 +40,34 @@ class Settings:
 
     Attributes:
         transitions: Transitions to learn from; whole games are sampled until there are so many.
-        replay_run: Number of the DQN-Replay run to learn from; the published data have five of each
-            game.
+        dqn_seed: Seed of the DQN whose games to learn from; DQN-Replay has 1 to 5 of each game.
         sticky: Probability that the game repeats the last action in place of the new one.
         max_steps: Decisions after which a game is cut off.
         features: Features of the first convolution; the others have twice as many.
         mirror: Mirror every other training window, left and right exchanged.
-        shift: Pixels by which all frames of a training window may be shifted at random, at most.
     """
 
     transitions: int = 50_000
-    replay_run: int = 1
+    dqn_seed: int = 1
     sticky: float = 0.0
     max_steps: int = MAX_STEPS
     features: int = 32
     mirror: bool = False
-    shift: int = 0
 
     def __post_init__(self) -> None:
         check_types(self)
         check_at_least(self, 1, "transitions")
-        check_at_least(self, 1, "replay_run", most=MAX_TRAINING_SEED)  # each has seeds of its own
+        check_at_least(self, 1, "dqn_seed", most=MAX_TRAINING_SEED)  # each has games of its own
         check_at_least(self, 1, "features", most=10_000)
         check_at_least(self, 1, "max_steps", most=MOST_STEPS)
-        check_at_least(self, 0, "shift", most=WIDTH - 1)
         check_within(self, 0, 1, "sticky")
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """A game by its name.
+    """Makes a game by its name.
 
     Raises:
-        UserError: there is none, or ale-py is not installed.
+        UserError: the game is unknown, or ale-py is not installed.
     """
     game = find_game(name)
     with report_missing("atari"):
@@ -90,8 +86,7 @@ def make(name: str, settings: Settings) -> Domain:
         del context
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 
-    mirror = functools.partial(mirrored, mirror=game.mirror, actions=game.actions)
-    shift = functools.partial(shifted, most=settings.shift)
+    mirror = functools.partial(mirror_window, mirror=game.mirror, actions=game.actions)
     return Domain(
         level=name,
         make_adapter=make_adapter,
@@ -100,7 +95,7 @@ def make(name: str, settings: Settings) -> Domain:
         blank=np.zeros((HEIGHT, WIDTH), np.uint8),
         encoders={"paper": state_tokens, "leapjax": current_tokens},
         demonstrations=Demonstrations(source=make_source(game, settings)),
-        augmentations=Augmentations([mirror] * settings.mirror + [shift] * (settings.shift > 0)),
+        augmentations=Augmentations([mirror] * settings.mirror),
         scaling=Scaling(returns=game.return_scale),
         signature={"actions": list(game.actions)},
     )
@@ -108,31 +103,32 @@ def make(name: str, settings: Settings) -> Domain:
 
 def make_source(game: Game, settings: Settings) -> Source:
     """Makes the source of a game's trajectories, counted in transitions."""
-    count, run = settings.transitions, settings.replay_run
+    count, dqn_seed = settings.transitions, settings.dqn_seed
 
     def load(where: str, seed: int) -> Collection:
         from leapjax.domains.atari.demonstrators.collect import find_shards  # noqa: PLC0415  (ale-py is optional)
 
-        ours = find_shards(Path(where), game, count, run)
-        found = replay.read(Path(where), game, count, seed, run, ours)
+        ours = find_shards(Path(where), game, count, dqn_seed)
+        found = replay.read(Path(where), game, count, seed, dqn_seed, ours)
         held = sum(len(each.actions) for each in found.demonstrations)
         if held < count:
             raise UserError(
-                f"{where} holds {held} transitions of {game.name}, fewer than --transitions "
-                f"{count}: use --transitions {held}"
+                f"{where} holds {held} transitions of {game.name}, fewer than {count}: ask for "
+                f"{held}",
+                "transitions",
             )
         return found
 
     def write(where: str, progress: Callable[[int], None]) -> str:
         from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (so)
 
-        collect(Path(where), game, count, run, LONGEST, progress=progress)
+        collect(Path(where), game, count, dqn_seed, LONGEST, progress=progress)
         return f"{count} transitions of {game.name} in {where}"
 
     def exists(where: str) -> bool:
         from leapjax.domains.atari.demonstrators.collect import is_whole  # noqa: PLC0415  (so)
 
-        return is_whole(Path(where), game, count, run, LONGEST)
+        return is_whole(Path(where), game, count, dqn_seed, LONGEST)
 
     return Source(FOLDER, exists, write, load, count, "transitions")
 

@@ -42,7 +42,7 @@ def collect(
     folder: Path,
     game: Game,
     transitions: int,
-    run: int,
+    dqn_seed: int,
     longest: int,
     workers: int | None = None,
     progress: Callable[[int], None] = lambda done: None,
@@ -53,9 +53,9 @@ def collect(
         folder: of all games.
         game: to play.
         transitions: smallest number of transitions, in whole games.
-        run: number of the run, from 1; other runs have other games.
+        dqn_seed: number from 1 that names the folder as DQN-Replay does; each has other games.
         longest: decisions after which a game is cut off: see `replay.Episode`.
-        workers: number of processes; None for one on each core.
+        workers: number of processes; as many as cores by default.
         progress: called with the number of transitions so far.
 
     Returns:
@@ -65,49 +65,54 @@ def collect(
         UserError: the folder holds files that were not made here, of another game, of another
             length or by another demonstrator, or a process died.
     """
-    logs = replay.replay_logs(folder, game, run)
+    logs = replay.replay_logs(folder, game, dqn_seed)
     workers = workers or len(os.sched_getaffinity(0))
-    with files.only_process_in(logs):
+    with files.lock_folder(logs):
         _claim(logs)
         files.check_room(logs, transitions * BYTES)
-        made = read_manifests(folder, game, run, transitions, longest)
+        made = read_manifests(folder, game, dqn_seed, transitions, longest)
         if count_transitions(made) < transitions:  # else start no process
             waiting = (
-                n for n in itertools.count() if read_manifest(folder, game, run, n, longest) is None
+                n
+                for n in itertools.count()
+                if read_manifest(folder, game, dqn_seed, n, longest) is None
             )
             with start_workers(workers) as pool:
                 running: list[Future[Manifest]] = []
                 while count_transitions(made) < transitions:
                     running = [each for each in running if not is_finished(each)]
                     for _ in range(workers - len(running)):
-                        shard = folder, game.name, run, next(waiting), longest
+                        shard = folder, game.name, dqn_seed, next(waiting), longest
                         running.append(pool.submit(make_shard, *shard))
                     time.sleep(POLL)
-                    made = read_manifests(folder, game, run, transitions, longest, made)
+                    made = read_manifests(folder, game, dqn_seed, transitions, longest, made)
                     progress(min(count_transitions(made), transitions))
     progress(transitions)
     files.write_text(logs.parent / "manifest.json", json.dumps(made, indent=1) + "\n")
     return made
 
 
-def is_whole(folder: Path, game: Game, transitions: int, run: int, longest: int) -> bool:
+def is_whole(folder: Path, game: Game, transitions: int, dqn_seed: int, longest: int) -> bool:
     """Returns whether `collect` has already made all transitions.
 
     Raises:
-        UserError: the files are not those that `collect` would make.
+        UserError: `collect` would make other files.
     """
-    return count_transitions(read_manifests(folder, game, run, transitions, longest)) >= transitions
+    return (
+        count_transitions(read_manifests(folder, game, dqn_seed, transitions, longest))
+        >= transitions
+    )
 
 
-def find_shards(folder: Path, game: Game, transitions: int, run: int) -> range | None:
+def find_shards(folder: Path, game: Game, transitions: int, dqn_seed: int) -> range | None:
     """Returns the numbers of the first files that hold so many transitions.
 
-    Returns None if the files were not made here, or hold too few.
+    Returns `None` if the files were not made here, or hold too few.
 
     Raises:
-        UserError: the files are of another game or run.
+        UserError: the files are of another game or `dqn_seed`.
     """
-    made = read_manifests(folder, game, run, transitions)
+    made = read_manifests(folder, game, dqn_seed, transitions)
     return range(len(made)) if count_transitions(made) >= transitions else None
 
 
@@ -120,17 +125,17 @@ def _claim(logs: Path) -> None:
     theirs = [path.name for path in logs.glob("*_ckpt.*.gz")]
     if theirs and not (logs / MARK).exists() and not any(logs.glob("manifest.*.json")):
         raise UserError(
-            f"{logs} holds files that were not made here, such as {min(theirs)}: learn from them "
-            "with --demonstrations, or make others in another --folder"
+            f"{logs} holds files that were not made here, such as {min(theirs)}: name "
+            "this folder of demonstrations to learn from them, or make others in another one"
         )
     files.write_text(logs / MARK, "")
 
 
-def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> Manifest:
+def make_shard(folder: Path, name: str, dqn_seed: int, number: int, longest: int) -> Manifest:
     """Plays the games of one file and writes it; returns its manifest."""
     game = find_game(name)
-    logs = replay.replay_logs(folder, game, run)
-    first = TRAINING_START + run * TRAINING_STRIDE + number * GAMES
+    logs = replay.replay_logs(folder, game, dqn_seed)
+    first = TRAINING_START + dqn_seed * TRAINING_STRIDE + number * GAMES
     played: list[replay.Episode] = []
     games: list[dict[str, Any]] = []
     while sum(len(episode.actions) for episode in played) < SHARD:
@@ -146,7 +151,7 @@ def make_shard(folder: Path, name: str, run: int, number: int, longest: int) -> 
         )  # fmt: skip
     replay.write_shard(logs, number, played)
     manifest = {
-        "game": name, "run": run, "shard": number, "longest": longest,
+        "game": name, "run": dqn_seed, "shard": number, "longest": longest,
         **playing.describe_rules(game), "games": games,
         "versions": {each: metadata.version(each) for each in ("leapjax", "ale-py", "numpy")},
     }  # fmt: skip

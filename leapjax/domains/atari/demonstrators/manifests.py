@@ -20,22 +20,22 @@ def manifest_path(logs: Path, number: int) -> Path:
 
 
 def read_manifest(
-    folder: Path, game: Game, run: int, number: int, longest: int | None = None
+    folder: Path, game: Game, dqn_seed: int, number: int, longest: int | None = None
 ) -> Manifest | None:
-    """Reads the manifest of a file that was made here; returns None if it was not.
+    """Reads the manifest of a file; returns `None` if the file was not made here.
 
     Args:
         folder: of all games.
         game: to expect.
-        run: to expect.
+        dqn_seed: to expect.
         number: of the file.
-        longest: decisions of a game, to check that the file equals one that would be made now;
-            None to skip this check.
+        longest: decisions of a game, to check that the file would be made alike now; not checked
+            by default.
 
     Raises:
-        UserError: the manifest is damaged, of another game or run, or fails the check.
+        UserError: the manifest is damaged, of another game or `dqn_seed`, or fails the check.
     """
-    logs = replay.replay_logs(folder, game, run)
+    logs = replay.replay_logs(folder, game, dqn_seed)
     path = manifest_path(logs, number)
     if not path.exists() or not replay.has_shard(logs, number):
         return None
@@ -43,13 +43,13 @@ def read_manifest(
         manifest = json.loads(files.read_text(path))
         count_transitions([manifest])
         noises = [each["noise"] for each in manifest["games"]]
-        of = manifest["game"], manifest.get("run", run)
+        of = manifest["game"], manifest.get("run", dqn_seed)
     except (ValueError, KeyError, TypeError, RecursionError):
         raise UserError(f"{path} is damaged: remove it, and its games are played again") from None
-    if of != (game.name, run):
+    if of != (game.name, dqn_seed):
         raise UserError(
-            f"{logs} holds games of {of[0]}, run {of[1]}, not of {game.name}, run {run}: give the "
-            "folder its own name again, or name another one"
+            f"{logs} holds games of {of[0]}, seed {of[1]}, not of {game.name}, seed {dqn_seed}: "
+            "give the folder its own name again, or name another one"
         )
     if longest is None:
         return manifest
@@ -82,7 +82,7 @@ def read_manifest(
 def read_manifests(
     folder: Path,
     game: Game,
-    run: int,
+    dqn_seed: int,
     transitions: int,
     longest: int | None = None,
     before: Sequence[Manifest] = (),
@@ -92,14 +92,14 @@ def read_manifests(
     Args:
         folder: of all games.
         game: to expect.
-        run: to expect.
+        dqn_seed: to expect.
         transitions: number of transitions after which to stop.
         longest: as in `read_manifest`.
         before: the first manifests, if they were read already.
     """
     made = list(before)
     while count_transitions(made) < transitions:
-        manifest = read_manifest(folder, game, run, len(made), longest)
+        manifest = read_manifest(folder, game, dqn_seed, len(made), longest)
         if manifest is None:
             break
         made.append(manifest)

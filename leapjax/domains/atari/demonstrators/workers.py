@@ -29,8 +29,8 @@ def start_workers(count: int) -> Iterator[ProcessPoolExecutor]:
         yield pool
     except BrokenProcessPool:
         raise UserError(
-            "a process that played games has ended, perhaps for want of memory: start the same "
-            "command again, perhaps with fewer --workers, and it goes on"
+            "a process that played games has ended, perhaps for want of memory: start it "
+            "again, perhaps with fewer workers, and it goes on"
         ) from None
     finally:
         # Do not wait for unfinished files: without their manifests they are made again.

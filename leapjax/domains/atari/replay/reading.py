@@ -22,14 +22,14 @@ def read(
     game: Game,
     transitions: int,
     seed: int,
-    run: int = 1,
+    dqn_seed: int = 1,
     shards: Sequence[int] | None = None,
 ) -> Collection:
     """Samples whole trajectories nearly as the Decision Transformer's loader does.
 
     A random shard at a time gives up to ten trajectories, from where the last visit ended, until
     there are enough; docs/deviations.md lists the differences. Padding is left out. Data of other
-    makers may have none; then the first trajectory of a shard may be cut, and counts as cut.
+    makers may lack it; then the first trajectory of a shard may be cut, and counts as cut.
 
     The frames are unpacked once into a memory-mapped file beside the data, or in the user's cache
     folder if the data are read-only. Until a shard changes, later calls with the same arguments
@@ -40,8 +40,8 @@ def read(
         game: to read.
         transitions: smallest number of transitions; all, if there are fewer.
         seed: of the sampling.
-        run: number of the run; DQN-Replay has five of each game.
-        shards: numbers of the shards to read; None for all.
+        dqn_seed: seed of the DQN that played; DQN-Replay has 1 to 5 of each game.
+        shards: numbers of the shards to read; all by default.
 
     Returns:
         The trajectories, in the order of the visits, and the number of cut trajectories in the
@@ -55,7 +55,7 @@ def read(
     """
     if transitions < 1:
         raise UserError(f"transitions must be at least 1, got {transitions}")
-    logs = find_logs(folder, game, run)
+    logs = find_logs(folder, game, dqn_seed)
     numbers = find_shards(logs, shards)
     key = _name_conversion(logs, numbers, transitions, seed)
     beside, cached = _find_places(logs.parent)
@@ -67,7 +67,7 @@ def read(
         place = cached
         if (place / key).is_dir():
             return load_conversion(place / key)
-    with files.only_process_in(place, wait=True):
+    with files.lock_folder(place, wait=True):
         if not (place / key).is_dir():  # another process may have made it meanwhile
             convert(logs, choose_trajectories(logs, numbers, transitions, seed), game, place / key)
     return load_conversion(place / key)
@@ -81,10 +81,10 @@ def _name_conversion(logs: Path, numbers: list[int], transitions: int, seed: int
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _find_places(run: Path) -> tuple[Path, Path]:
-    """Returns two folders for conversions of a run: beside the data, and in the user's cache."""
-    name = hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16]
-    return run / "leapjax", files.cache_folder() / "dqn-replay" / name
+def _find_places(folder: Path) -> tuple[Path, Path]:
+    """Returns two folders for conversions: beside the data of a DQN, and in the user's cache."""
+    name = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
+    return folder / "leapjax", files.find_cache_folder() / "dqn-replay" / name
 
 
 def _is_writable(place: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The files of DQN-Replay: what a shard consists of, and where it is."""
+"""The files of DQN-Replay: the parts of a shard, and their paths."""
 
 import gzip
 import re
@@ -38,9 +38,9 @@ class Episode(NamedTuple):
     rewards: np.ndarray
 
 
-def replay_logs(folder: Path, game: Game, run: int) -> Path:
-    """Returns the folder of a run's shards."""
-    return folder / game.name / str(run) / "replay_logs"
+def replay_logs(folder: Path, game: Game, dqn_seed: int) -> Path:
+    """Returns the folder of the shards of one DQN."""
+    return folder / game.name / str(dqn_seed) / "replay_logs"
 
 
 def has_shard(folder: Path, number: int) -> bool:
@@ -53,20 +53,19 @@ def part_path(logs: Path, part: str, number: int) -> Path:
     return logs / f"{part}_ckpt.{number}.gz"
 
 
-def find_logs(folder: Path, game: Game, run: int) -> Path:
-    """Finds the folder of a run's shards.
+def find_logs(folder: Path, game: Game, dqn_seed: int) -> Path:
+    """Finds the folder of the shards of one DQN.
 
     Raises:
         UserError: it does not exist; says what does, and how to get data.
     """
-    logs = replay_logs(folder, game, run)
+    logs = replay_logs(folder, game, dqn_seed)
     if logs.is_dir():
         return logs
-    other = "" if run == 1 else f" --replay-run {run}"
     expected = (
         f"expected the shards of DQN-Replay in {logs}: copy them from "
         "gs://atari-replay-datasets, or make such data with "
-        f"`python -m experiments.atari collect --game {game.name}{other}`"
+        "leapjax.domains.atari.demonstrators.collect"
     )
     if not folder.is_dir():
         raise UserError(f"no folder {folder}; {expected}")
@@ -74,9 +73,11 @@ def find_logs(folder: Path, game: Game, run: int) -> Path:
         others = [name for name in GAMES if (folder / name).is_dir()]
         only = f", only of {', '.join(others)}" if others else ""
         raise UserError(f"no data of {game.name} in {folder}{only}; {expected}")
-    runs = sorted(path.parent.name for path in (folder / game.name).glob("*/replay_logs"))
-    only = f", only {', '.join(runs)}" if runs else ""
-    raise UserError(f"no run {run} of {game.name} in {folder}{only}; {expected}")
+    seeds = sorted(path.parent.name for path in (folder / game.name).glob("*/replay_logs"))
+    only = f", only {', '.join(seeds)}" if seeds else ""
+    raise UserError(
+        f"no DQN of seed {dqn_seed} of {game.name} in {folder}{only}; {expected}", "dqn_seed"
+    )
 
 
 def find_shards(logs: Path, chosen: Sequence[int] | None) -> list[int]:
@@ -84,10 +85,10 @@ def find_shards(logs: Path, chosen: Sequence[int] | None) -> list[int]:
 
     Args:
         logs: folder of the shards.
-        chosen: numbers of the shards to check; None for all in the folder.
+        chosen: numbers of the shards to check; all in the folder by default.
 
     Raises:
-        UserError: there are no shards, or a part of one is missing or empty.
+        UserError: there are no shards, or a part of a shard is missing or empty.
     """
     pattern = rf"(?:{'|'.join(map(re.escape, PARTS))})_ckpt\.(\d+)\.gz"
     found = (re.fullmatch(pattern, path.name) for path in logs.iterdir())

@@ -21,12 +21,12 @@ _LEVEL = 4  # of gzip: twice as fast as the default, and the files are hardly la
 
 
 def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
-    """Writes episodes as one shard; a killed program leaves no shard that seems complete.
+    """Writes episodes as a shard; a killed program leaves no shard that seems complete.
 
-    Clips the rewards, and adds a row of zeros in place of the last row, which nobody reads.
+    Clips the rewards, and adds a row of zeros in place of the last row, which is not read.
 
     Args:
-        folder: of the run's shards, see `replay_logs`; made if it does not exist.
+        folder: of the shards of one DQN, see `replay_logs`; made if it does not exist.
         number: of the shard; an existing one is replaced.
         episodes: at least one.
 
@@ -79,7 +79,7 @@ def _write_part(
 ) -> None:
     """Writes a part of a shard, atomically."""
     with (
-        files.whole(path) as scratch,
+        files.write_whole(path) as scratch,
         scratch.open("wb") as raw,
         gzip.GzipFile("", "wb", _LEVEL, raw, mtime=0) as file,  # the same bytes at any time
     ):
