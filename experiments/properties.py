@@ -20,18 +20,18 @@ from experiments.common.cases import Analysis, Case, Model, Way, alone, draw_at
 from leapjax.configuration import AnyConfig, change
 from leapjax.domains.babyai.adapter import ACTIONS, TURNS, BabyAIAdapter
 from leapjax.domains.babyai.constraints import (
+    count_revisits,
     goal_before_visit,
-    half_of_obstacles,
+    hide_half_of_obstacles,
+    hide_lava,
+    hide_marks,
+    hide_open_doors,
     immediate_lava,
     lava,
     left_turns,
-    revisits,
+    replace_pick_up,
     steps_to_visit,
-    told_to_go,
     turns_over,
-    without_lava,
-    without_marks,
-    without_open_doors,
 )
 from leapjax.domains.babyai.levels import find_level
 from leapjax.domains.babyai.observations import Observation
@@ -167,10 +167,10 @@ def _penalised(energies: Sequence[Energy], penalties: Sequence[Penalty], weight:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
         return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
 
-    def sees(context: Context) -> Context:
-        return without_marks(without_lava(context))
+    def hide_obstacles(context: Context) -> Context:
+        return hide_marks(hide_lava(context))
 
-    return constrain(view(energies[0], sees), penalty, partial=True)
+    return constrain(view(energies[0], hide_obstacles), penalty, partial=True)
 
 
 # What judges the next action alone: those that violate anything at once are removed.
@@ -186,7 +186,7 @@ def _explored(
     energies: Sequence[Energy], minimise: Minimise, nats: float, handling: bool
 ) -> Energy:
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
-        return nats * revisits(context, actions, handling)
+        return nats * count_revisits(context, actions, handling)
 
     return constrain(minimise(energies), penalty, partial=True)
 
@@ -220,7 +220,7 @@ def refine_once(trained: GibbsConfig) -> GibbsConfig:
 
 def halves(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
     """Two models, each of which sees one half of the obstacles."""
-    views = (functools.partial(half_of_obstacles, part=part) for part in (0, 1))
+    views = (functools.partial(hide_half_of_obstacles, part=part) for part in (0, 1))
     return compose([view(e, see) for e, see in zip(energies, views, strict=True)], weights)
 
 
@@ -232,7 +232,7 @@ def one_half(energies: Sequence[Energy]) -> Energy:
 def fetch(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
     """A model that goes to objects, which says nothing of picking up, and one that picks up."""
     go, pick_up = energies
-    return compose([neutral(view(go, told_to_go), [PICKUP]), pick_up], weights)
+    return compose([neutral(view(go, replace_pick_up), [PICKUP]), pick_up], weights)
 
 
 def only_pick_up(energies: Sequence[Energy]) -> Energy:
@@ -254,7 +254,7 @@ def _make_explorers(
         minimise: without that.
         at_once: what methods of one action minimise; None: the same.
         search: how LEAP plans.
-        handling: see `revisits`.
+        handling: see `count_revisits`.
     """
     whole, single = (penalise_revisits(m, handling) for m in (minimise, at_once or minimise))
     each = f"{name}, exploring, replanned after each action"
@@ -355,7 +355,7 @@ def _make_plain(paper: tuple[float, float, float], minimise: Minimise = alone) -
 
 def doors_as_empty(energies: Sequence[Energy]) -> Energy:
     """What the one model of a case says where open doors are shown as empty cells."""
-    return view(energies[0], without_open_doors)
+    return view(energies[0], hide_open_doors)
 
 
 def _make_without_doors(paper: tuple[float, float, float]) -> list[Way]:

@@ -26,7 +26,7 @@ from experiments.common.pictures import save_sheet
 from leapjax import files, pretrained
 from leapjax.data import seeds
 from leapjax.domains.babyai.adapter import BabyAIAdapter
-from leapjax.domains.babyai.constraints import in_half
+from leapjax.domains.babyai.constraints import find_half
 from leapjax.domains.babyai.levels import find_level
 from leapjax.domains.babyai.observations import Cell, agent_cell
 from leapjax.environments import closing
@@ -153,7 +153,10 @@ def draw_unlearned(work: Work, case_name: str, way_name: str, options: Options) 
     if case_name.startswith("composition"):  # who sees which obstacles
         state = found.adapter.observe()
         halves = [
-            ([(x, y) for x, y in np.argwhere(in_half(state.grid, state.goal, part))], colour)
+            (
+                [(x, y) for x, y in np.argwhere(find_half(state.grid, state.goal, part))],
+                colour,
+            )
             for part, colour in enumerate(HALVES)
         ]
     return draw_executed(found, case_name, halves)

@@ -19,8 +19,8 @@ from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_pla
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from leapjax.models.config import ModelConfig
     from leapjax.models.encoder import Encoder
-    from leapjax.models.trajectory import ModelConfig
 
 EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
 Encoders = Mapping[str, EncoderMaker]  # by architecture
@@ -62,7 +62,7 @@ class Recording(NamedTuple):
 
 
 class Described(NamedTuple):
-    """The environment of a data set, as its metadata describe it; None is unknown.
+    """The environment of a data set, as its metadata describe it; unknown fields are `None`.
 
     Attributes:
         level: id of the environment.
@@ -86,7 +86,7 @@ class Source(NamedTuple):
     """Where demonstrations are stored, and how they are made and read.
 
     Attributes:
-        default: the place that is used if the user names none.
+        default: the place, if the user does not name another.
         exists: (place) -> whether the demonstrations are there.
         make: (place, progress) -> a summary; makes and stores the demonstrations.
         load: (place, training seed) -> at least as many demonstrations as were asked for, or
@@ -129,8 +129,8 @@ class Demonstrations(NamedTuple):
         check_environment: (description of a data set, where) -> UserError if the data set was
             recorded in another environment.
         replay: makes a demonstration of an episode with other observations, or returns the reason
-            why it cannot; None if it does not know such observations.
-        criterion: when a recorded episode succeeds; None if only the environment can tell.
+            why it cannot; `None` if it does not know such observations.
+        criterion: when a recorded episode succeeds; `None` if only the environment can tell.
     """
 
     collect: Collect | None = None
@@ -145,7 +145,7 @@ class Augmentations(NamedTuple):
     """Random changes of training windows.
 
     Attributes:
-        functions: each (key, window) -> window; the last one is applied first.
+        functions: each (key, window) -> window; the last is applied first.
         extras: (demonstration) -> arrays `[n, ...]` that the functions need for each step; no
             model sees them.
     """
@@ -159,7 +159,7 @@ class Scaling(NamedTuple):
 
     Attributes:
         returns: divisor of returns.
-        measure: (demonstrations) -> statistics of the training data; None if encoders need none.
+        measure: (demonstrations) -> statistics of the training data; `None` if unused.
         encoders: (statistics) -> encoders that scale observations by them, or UserError if the
             statistics are of other observations.
     """
@@ -173,12 +173,12 @@ class Domain(NamedTuple):
     """One level: its environment, its actions, and how a network reads its observations.
 
     The first six fields are needed; `demonstrations` and `augmentations` matter for training.
-    All functions are pure, except `make_adapter` and those that read or write demonstrations.
+    All functions are pure, except `make_adapter` and the functions of `demonstrations`.
 
     Attributes:
         level: name of the level.
         make_adapter: makes an environment.
-        actions: names of the actions; the last one ends a plan.
+        actions: names of the actions; the last ends a plan.
         max_steps: steps of the longest episode.
         blank: an observation of zeros, as NumPy arrays: shapes and types.
         encoders: by architecture, (model, K) -> encoder of contexts.
@@ -186,10 +186,10 @@ class Domain(NamedTuple):
         augmentations: random changes of training windows.
         scaling: of returns and observations.
         rules: an energy without parameters, `()`, that is lowest for plans that obey known rules;
-            None if there are none.
+            `None` without such rules.
         signature: JSON values that a checkpoint and the level must agree on.
         made_from: name in `leapjax.domains` and settings that `make_domain` made the level from;
-            None for a domain that is not registered, whose planners cannot be saved.
+            `None` for a domain that is not registered, whose planners cannot be saved.
     """
 
     level: str
@@ -226,7 +226,7 @@ class DomainType(NamedTuple):
 
 
 def measure_statistics(domain: Domain, demonstrations: Sequence[Demonstration]) -> Statistics:
-    """Measures the statistics of training data that a level's encoders need; `()` for none."""
+    """Measures the statistics of training data that a level's encoders need, or returns `()`."""
     return domain.scaling.measure(demonstrations) if domain.scaling.measure else ()
 
 

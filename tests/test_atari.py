@@ -25,7 +25,7 @@ from leapjax.domains.atari.emulator import Emulator
 from leapjax.domains.atari.games import GAMES
 from leapjax.environments import Eager
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Origin
 from leapjax.types import Demonstration, Energy
@@ -96,8 +96,6 @@ def test_a_planner_sees_clipped_rewards_and_scores_count():
     assert adapter.score == sum(t.score for t in transitions)
 
 
-
-
 def test_success_is_the_score_of_a_gamer():
     easy = BREAKOUT._replace(human=0.0)
     over = [play(AtariAdapter(game, 0.0, 300), 0, 400)[1][-1].success for game in (easy, BREAKOUT)]
@@ -108,12 +106,12 @@ def test_success_is_the_score_of_a_gamer():
 
 def test_a_state_is_the_last_four_frames():
     given = jnp.asarray(frames(6))
-    states = np.asarray(encoders.stacked(given, 6))
+    states = np.asarray(encoders.stack_frames(given, 6))
     before = np.concatenate([np.zeros((3, 84, 84)), given])
     for index in range(6):
         same(states[index], np.moveaxis(before[index : index + 4], 0, -1))
-    same(encoders.stacked(given, 1), states[-1:])
-    same(encoders.stacked(given[:2], 1)[0], states[1])
+    same(encoders.stack_frames(given, 1), states[-1:])
+    same(encoders.stack_frames(given[:2], 1)[0], states[1])
 
 
 @pytest.mark.parametrize("architecture", ["paper", "leapjax"])
@@ -146,7 +144,7 @@ def test_as_many_states_are_encoded_while_playing_as_the_tables_say(name, past):
 
 def test_without_a_past_the_whole_frame_has_changed():
     context = window(8, context=0).context
-    shown = encoders.changes(encoders.stacked(encoders.seen(context), 1))[0]
+    shown = encoders.compute_changes(encoders.stack_frames(encoders.join_frames(context), 1))[0]
     same(shown[..., 1:3], 0)
     np.testing.assert_allclose(shown[..., 3], encoders.CHANGES * shown[..., 0], rtol=1e-5)
 
@@ -158,7 +156,7 @@ def test_every_other_window_is_in_a_mirror(name):
     ids = jnp.arange(len(game.actions) + 3)  # the end action, MASK and PAD among them
     context = drawn.context._replace(observation=past[-1], past=past[:-1], actions=ids)
     drawn = drawn._replace(context=context, actions=ids[::-1])
-    show = functools.partial(augmentation.mirrored, mirror=game.mirror, actions=game.actions)
+    show = functools.partial(augmentation.mirror_window, mirror=game.mirror, actions=game.actions)
     shown = [jax.jit(show)(jax.random.key(seed), drawn) for seed in range(40)]
     as_played = [bool((each.actions == drawn.actions).all()) for each in shown]
     assert 8 < sum(as_played) < 32

@@ -17,16 +17,16 @@ from experiments.properties import (
 from leapjax.batching import compile_planner
 from leapjax.domains.babyai.adapter import END, NUM_ACTIONS, BabyAIAdapter
 from leapjax.domains.babyai.constraints import (
+    count_revisits,
     goal_before_visit,
     immediate_lava,
     lava,
     left_turns,
-    revisits,
+    replace_pick_up,
     steps_to_visit,
-    told_to_go,
     turns_over,
 )
-from leapjax.domains.babyai.dynamics import FLOOR, FORWARD, roll, steps_to
+from leapjax.domains.babyai.dynamics import FLOOR, FORWARD, count_steps, roll
 from leapjax.domains.babyai.levels import find_level
 from leapjax.domains.babyai.vocabulary import decode
 from leapjax.energy import constrain, pseudo_likelihood
@@ -35,6 +35,7 @@ from leapjax.rollouts import History
 from leapjax.types import mask_token
 
 LEFT, RIGHT, PICKUP, MASK = 0, 1, 3, mask_token(NUM_ACTIONS)
+HANDLING = [PICKUP, FORWARD, LEFT, PICKUP, END]
 rolled = jax.jit(roll)
 steps_onto_lava = jax.jit(lava)
 
@@ -108,12 +109,12 @@ PLAN = [LEFT, FORWARD, RIGHT, END, LEFT]
         (partial(turns_over, budget=3), TURNED, PLAN, 1),  # two are remembered
         (partial(turns_over, budget=2), TURNED, [MASK, LEFT, LEFT], 0),
         # What is not chosen yet is no revisit.
-        (revisits, KEY_AHEAD, [MASK, LEFT, RIGHT], 0),
-        (revisits, KEY_AHEAD, [LEFT, MASK, RIGHT], 0),
-        (revisits, KEY_AHEAD, [LEFT, RIGHT, LEFT], 2),
+        (count_revisits, KEY_AHEAD, [MASK, LEFT, RIGHT], 0),
+        (count_revisits, KEY_AHEAD, [LEFT, MASK, RIGHT], 0),
+        (count_revisits, KEY_AHEAD, [LEFT, RIGHT, LEFT], 2),
         # Handling the thing in front can be spared; the second time nothing is there.
-        (partial(revisits, handling=False), KEY_AHEAD, [PICKUP, FORWARD, LEFT, PICKUP, END], 4),
-        (partial(revisits, handling=True), KEY_AHEAD, [PICKUP, FORWARD, LEFT, PICKUP, END], 3),
+        (partial(count_revisits, handling=False), KEY_AHEAD, HANDLING, 4),
+        (partial(count_revisits, handling=True), KEY_AHEAD, HANDLING, 3),
     ],
 )
 def test_penalties_of_plans_written_by_hand(penalty, context, plan, expected):
@@ -123,7 +124,7 @@ def test_penalties_of_plans_written_by_hand(penalty, context, plan, expected):
 def test_poses_count_as_often_as_the_agent_has_been_there():
     """As a list of the poses that it went through says, remembered, now and planned."""
     adapter, rng = BabyAIAdapter(find_level("GoToLocalS8N1")), np.random.default_rng(0)
-    count, most, revisited = jax.jit(revisits), 6, 0
+    count, most, revisited = jax.jit(count_revisits), 6, 0
     for seed in range(30):
         history = History(adapter.reset(seed), most, adapter.num_actions)
         been = [tuple(history.context().observation.pose)]
@@ -157,7 +158,7 @@ def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
         layer = [p for p in set(following) if p not in found and 0 <= min(p[:2]) <= max(p) < size]
     for cell in {pose[:2] for pose in found}:
         fewest = min(found[(*cell, direction)] for direction in range(4))
-        assert int(steps_to(jnp.array(start), jnp.array(cell))) == fewest
+        assert int(count_steps(jnp.array(start), jnp.array(cell))) == fewest
 
 
 @pytest.mark.parametrize(
@@ -248,5 +249,5 @@ def test_who_should_pick_something_up_is_told_to_go_to_it():
     adapter = BabyAIAdapter(find_level("PickUpObjMazeS4"))
     context = context_of(adapter, adapter.reset(0))
     said = decode(context.observation.instruction)
-    told = decode(np.asarray(told_to_go(context).observation.instruction))
+    told = decode(np.asarray(replace_pick_up(context).observation.instruction))
     assert said.startswith("pick up the ") and told == said.replace("pick up", "go to")

@@ -46,19 +46,19 @@ def solved(digits, side):
 
 
 def test_the_search_finds_every_board_and_no_other():
-    every = boards.solutions(np.zeros(16, np.int32), most=1000)
+    every = boards.find_solutions(np.zeros(16, np.int32), most=1000)
     assert len(every) == 288  # as is known of 4 by 4
     assert len({tuple(board) for board in every}) == 288
     assert all(solved(board, 4) for board in every)
     contradiction = np.zeros(16, np.int32)
     contradiction[[0, 3]] = 2
-    assert boards.solutions(contradiction) == []
+    assert boards.find_solutions(contradiction) == []
 
 
 def test_the_search_finds_the_solution_of_a_published_board():
     clues = "530070000600195000098000060800060003400803001700020006060000280000419005000080079"
     solution = "534678912672195348198342567859761423426853791713924856961537284287419635345286179"
-    (found,) = boards.solutions(np.array(list(clues), int))
+    (found,) = boards.find_solutions(np.array(list(clues), int))
     assert "".join(map(str, found)) == solution
 
 
@@ -69,7 +69,7 @@ def test_boards_have_so_many_clues_and_one_solution(size):
         clues, solution = boards.draw(size, seed)
         assert (clues > 0).sum() == size.clues
         assert (clues == np.where(clues > 0, solution, 0)).all() and solved(solution, size.side)
-        (only,) = boards.solutions(clues)
+        (only,) = boards.find_solutions(clues)
         np.testing.assert_array_equal(only, solution)
         seen.add(tuple(clues))
         np.testing.assert_array_equal(boards.draw(size, seed)[0], clues)
@@ -117,7 +117,7 @@ def test_a_transformed_window_is_that_of_another_board(size, cell):
         assert board.cell == cell
         rest = size.cells - cell
         assert (window.actions[rest:] == size.side).all()  # the end action
-        (solution,) = boards.solutions(board.digits)  # what is left has one solution
+        (solution,) = boards.find_solutions(board.digits)  # what is left has one solution
         np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
         assert (board.digits[:cell] > 0).all()
         clues = (board.digits[cell:] > 0).sum()

@@ -12,10 +12,10 @@ from experiments.properties import AGAIN, CASES, DETOUR_TURNS, FEW_TURNS, Watche
 from leapjax.domains.babyai import demonstrations, observations
 from leapjax.domains.babyai.adapter import END, NUM_ACTIONS, TURNS, BabyAIAdapter
 from leapjax.domains.babyai.constraints import (
-    half_of_obstacles,
-    without_lava,
-    without_marks,
-    without_open_doors,
+    hide_half_of_obstacles,
+    hide_lava,
+    hide_marks,
+    hide_open_doors,
 )
 from leapjax.domains.babyai.dynamics import FLOOR, LAVA
 from leapjax.domains.babyai.levels import LEVELS, find_level
@@ -108,14 +108,14 @@ def test_there_is_one_coloured_cell_and_turns_enough_to_visit_it(level, budget):
     adapter = WatchedErrand(level, budget)
     turns = Counter(fewest_turns(adapter, adapter.reset(seed)) for seed in EPISODES)
     assert budget // 2 < max(turns) <= budget
-    seen = without_marks(first(level, 0)[1]).observation
+    seen = hide_marks(first(level, 0)[1]).observation
     assert not cells_of(jax.device_get(seen), FLOOR)
 
 
 def test_the_planner_sees_no_lava_and_everything_else():
     _, context = first("GoToLavaHard", 3, past=2)
     lava = cells_of(context.observation, LAVA)
-    seen = without_lava(context).observation
+    seen = hide_lava(context).observation
     assert lava and not cells_of(jax.device_get(seen), LAVA)
     other = np.asarray(context.observation.grid[..., 0] != LAVA)
     np.testing.assert_array_equal(np.asarray(seen.grid)[other], context.observation.grid[other])
@@ -129,10 +129,10 @@ def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_say
     counts = from_total(lambda params, context: context, total, NUM_ACTIONS)
     _, context = first("GoToObjMazeS4", 0)
     doors = len(cells_of(context.observation, 4))
-    assert not cells_of(jax.device_get(without_open_doors(context).observation), 4)
+    assert not cells_of(jax.device_get(hide_open_doors(context).observation), 4)
     _, closed = first("GoToObjMazeS4R2Close", 0)
     closed_doors = cells_of(closed.observation, 4)
-    assert cells_of(jax.device_get(without_open_doors(closed).observation), 4) == closed_doors
+    assert cells_of(jax.device_get(hide_open_doors(closed).observation), 4) == closed_doors
     assert doors and closed_doors
     (case,) = (case for case in CASES if case.name == "generalization-hard")
     for way in case.ways:
@@ -157,7 +157,7 @@ def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():
         )
         halves = []
         for part in (0, 1):
-            seen = jax.device_get(half_of_obstacles(context, part).observation)
+            seen = jax.device_get(hide_half_of_obstacles(context, part).observation)
             halves.append({c for kind in (5, 6, 7) for c in cells_of(seen, kind)})
             assert adapter.goal in halves[-1] and len(halves[-1]) == 4
         assert halves[0] | halves[1] == objects and halves[0] & halves[1] == {adapter.goal}

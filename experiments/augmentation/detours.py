@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from experiments.augmentation.earlier_moves import prepend_moves
 from experiments.augmentation.lookalikes import draw_other, names_both
 from leapjax.domains.babyai.augmentation.words import GridWords
-from leapjax.domains.babyai.dynamics import FORWARD, passable
+from leapjax.domains.babyai.dynamics import FORWARD, find_passable
 from leapjax.domains.babyai.symmetries import EMPTY, LEFT, RIGHT
 from leapjax.types import Window
 
@@ -66,7 +66,7 @@ def _try_detour(
     filled_grid = jnp.where(filled[..., None], things, grid)
 
     def moves(grid: jax.Array) -> jax.Array:
-        free = passable(grid).at[goal[0], goal[1]].set(True)
+        free = find_passable(grid).at[goal[0], goal[1]].set(True)
         return count_moves(free, observation.pose[:2], goal)
 
     # On a path that visits no cell twice, cells without the goal are as many as moves to the goal.

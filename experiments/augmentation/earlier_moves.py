@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.domains.babyai.adapter import END
-from leapjax.domains.babyai.dynamics import FORWARD, LAVA, passable
+from leapjax.domains.babyai.dynamics import FORWARD, LAVA, find_passable
 from leapjax.domains.babyai.symmetries import DIRECTION_VECTORS, EMPTY, LEFT, RIGHT
 from leapjax.types import Window
 
@@ -35,7 +35,7 @@ def prepend_moves(
     moves = jnp.where(jax.random.bernoulli(forward_key, forward, shape), FORWARD, turns)
     observation = context.observation
     grid, pose = jnp.asarray(observation.grid), jnp.asarray(observation.pose)
-    free = passable(grid) & (grid[..., 0] != LAVA)
+    free = find_passable(grid) & (grid[..., 0] != LAVA)
     vectors = jnp.asarray(DIRECTION_VECTORS)
 
     def undo(

@@ -49,11 +49,10 @@ DOMAINS: dict[str, DomainType | Place] = {
 
 
 def find_domain(name: str) -> DomainType:
-    """The domain of that name.
+    """Finds a domain by name; imports its module.
 
     Raises:
-        UserError: there is none, and names those that there are; or it needs an extra that is not
-            installed.
+        UserError: the domain is unknown, or needs an extra that is not installed.
     """
     if name not in DOMAINS:
         raise UserError(f"unknown domain {name!r}: expected one of {', '.join(DOMAINS)}")
@@ -65,7 +64,7 @@ def find_domain(name: str) -> DomainType:
 
 
 def make_level(name: str, level: str, settings: Any) -> Domain:
-    """Makes one level of a domain, which remembers what it was made from.
+    """Makes one level of a domain; sets its `made_from`.
 
     Args:
         name: of the domain.

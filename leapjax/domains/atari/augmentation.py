@@ -9,17 +9,17 @@ from leapjax.domains.atari.games import Mirror
 from leapjax.types import Window
 
 
-def mirrored(key: jax.Array, window: Window, mirror: Mirror, actions: Sequence[str]) -> Window:
-    """A window, or with a probability of one half its reflection.
+def mirror_window(key: jax.Array, window: Window, mirror: Mirror, actions: Sequence[str]) -> Window:
+    """Reflects a window with probability one half.
 
     Args:
         key: of randomness.
-        window: as it was played.
-        mirror: the game's.
-        actions: the game's, by name.
+        window: to reflect.
+        mirror: reflection of the game.
+        actions: names of the game's actions.
     """
     names = [mirror.actions.get(name, name) for name in actions]
-    # The end of an episode, MASK and PAD come after the game's own actions, and stay.
+    # The end action, MASK and PAD follow the game's own actions, and stay.
     become = jnp.array([*map(list(actions).index, names), *range(len(names), len(names) + 3)])
     reflection = window._replace(
         context=window.context._replace(
@@ -34,7 +34,7 @@ def mirrored(key: jax.Array, window: Window, mirror: Mirror, actions: Sequence[s
 
 
 def reflect(frames: jax.Array, mirror: Mirror) -> jax.Array:
-    """Frames `[..., 84, 84]` as a mirror shows them."""
+    """Reflects frames `[..., 84, 84]`."""
     part = (..., slice(*mirror.rows), slice(*mirror.columns))
     frames = jnp.asarray(frames)
     return frames.at[part].set(jnp.flip(frames[part], mirror.axis - 2))

@@ -19,16 +19,16 @@ from leapjax.domain import (
     Source,
 )
 from leapjax.domains.atari import replay
-from leapjax.domains.atari.augmentation import mirrored
+from leapjax.domains.atari.augmentation import mirror_window
 from leapjax.domains.atari.encoders import CurrentTokens, StateTokens
 from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WIDTH, Game, find_game
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.extras import report_missing
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 
-LONGEST = 5_000  # decisions of a game of preset `leapjax`: as long as those that are learned from
+LONGEST = 5_000  # decisions of a game of preset `leapjax`, as in its demonstrations
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
 MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
 TOKENS = 4  # of a state, of our encoder
@@ -64,10 +64,10 @@ class Settings:
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """A game by its name.
+    """Makes a game by its name.
 
     Raises:
-        UserError: there is none, or ale-py is not installed.
+        UserError: the game is unknown, or ale-py is not installed.
     """
     game = find_game(name)
     with report_missing("atari"):
@@ -86,7 +86,7 @@ def make(name: str, settings: Settings) -> Domain:
         del context
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 
-    mirror = functools.partial(mirrored, mirror=game.mirror, actions=game.actions)
+    mirror = functools.partial(mirror_window, mirror=game.mirror, actions=game.actions)
     return Domain(
         level=name,
         make_adapter=make_adapter,

@@ -1,7 +1,7 @@
-"""Encoders of frames: a context to tokens, for both architectures.
+"""Encoders of frames: a context becomes tokens, for both architectures.
 
-A state is a stack of the last four frames (Mnih et al., 2015). A context holds each frame once,
-so that stacks are made here. `StateTokens` is the paper's, a token for each state of a context;
+A state is a stack of the last four frames (Mnih et al., 2015). A context holds each frame once;
+the encoders stack them. `StateTokens` is the paper's, a token for each state of a context;
 `CurrentTokens` is ours.
 """
 
@@ -15,26 +15,29 @@ from leapjax.models.transformer import dense
 from leapjax.types import Context
 
 STACK = 4  # frames that a state is made of
-# Side and stride of each layer, and its features in those of the first (paper, table 6).
+# Side, stride and features of each layer; features in multiples of the first (paper, table 6).
 Layers = tuple[tuple[int, int, int], ...]
 LAYERS: Layers = ((8, 4, 1), (4, 2, 2), (3, 1, 2))
-HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # the same for frames of half the side
+HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # for frames of half the side
 HIDDEN = 256  # units between features and tokens, of our encoder
-CHANGES = 10.0  # how much more is made of what has changed in a frame than of what has not
+CHANGES = 10.0  # weight of changes between frames; the last frame has weight 1
 
 
-def stacked(frames: jax.Array, count: int) -> jax.Array:
-    """The last `count` states of frames `[F, 84, 84]`, oldest first: `[count, 84, 84, 4]`."""
+def stack_frames(frames: jax.Array, count: int) -> jax.Array:
+    """Stacks the last `count` states of frames `[F, 84, 84]`: `[count, 84, 84, 4]`."""
     missing = max(count + STACK - 1 - frames.shape[0], 0)
     frames = jnp.pad(frames, ((missing, 0), (0, 0), (0, 0)))[-(count + STACK - 1) :]
     return jnp.stack([frames[i : i + count] for i in range(STACK)], axis=-1)
 
 
-def changes(stacks: jax.Array) -> jax.Array:
-    """Stacks `[n, 84, 84, 4]` as the last frame and what changed before it: `[n, 42, 42, 4]`.
+def compute_changes(stacks: jax.Array) -> jax.Array:
+    """Computes the last frame and the changes before it from stacks `[n, 84, 84, 4]`.
 
-    What moves is a few pixels of thousands: a network that is not shown it learns hardly anything
-    for a thousand steps (docs/lessons.md). Averages over two by two pixels.
+    Moving objects are a few pixels of thousands: a network without the changes learns hardly
+    anything for a thousand steps (docs/lessons.md). Averages over two by two pixels.
+
+    Returns:
+        `[n, 42, 42, 4]`.
     """
     x = stacks.astype(jnp.float32) / 255
     x = jnp.concatenate([x[..., -1:], CHANGES * jnp.diff(x, axis=-1)], axis=-1)
@@ -42,13 +45,19 @@ def changes(stacks: jax.Array) -> jax.Array:
     return x.reshape(count, height // 2, 2, width // 2, 2, STACK).mean(axis=(2, 4))
 
 
-def seen(context: Context) -> jax.Array:
-    """All frames of a context, oldest first: `[K + 1, 84, 84]`."""
+def join_frames(context: Context) -> jax.Array:
+    """Joins all frames of a context, oldest first: `[K + 1, 84, 84]`."""
     return jnp.concatenate([context.past, jnp.asarray(context.observation)[None]])
 
 
 class Features(nn.Module):
-    """The convolutions of the appendix: `[n, 84, 84, 4]` to `[n, 7 * 7 * 2 * features]`."""
+    """The convolutions of the appendix: `[n, 84, 84, 4]` to `[n, 7 * 7 * 2 * features]`.
+
+    Attributes:
+        layers: side, stride and multiple of features of each.
+        features: of the first convolution.
+        dtype: of the computation.
+    """
 
     layers: Layers
     features: int
@@ -67,14 +76,18 @@ class Features(nn.Module):
 
 
 class StateTokens(Encoder):
-    """A token for each state of a context: `[K + 1, D]`, as Decision Transformer has it.
+    """A token for each state of a context: `[K + 1, D]`, as in the Decision Transformer.
 
-    The first three of them see black frames before the context, so that `encode_next` encodes them
-    anew, too.
+    The first three states see black frames before the context, so `encode_next` encodes them again.
+
+    Attributes:
+        width: D, of a token.
+        features: of the first convolution.
+        dtype: of the computation.
     """
 
     width: int
-    features: int  # of the first convolution
+    features: int
     dtype: Dtype = jnp.float32
 
     def __call__(self, context: Context) -> jax.Array:  # noqa: D102
@@ -82,9 +95,9 @@ class StateTokens(Encoder):
 
     @nn.compact
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:  # noqa: D102
-        frames = seen(context)
+        frames = join_frames(context)
         cut = min(STACK - 1, len(frames) - 1)
-        states = stacked(frames, len(frames))
+        states = stack_frames(frames, len(frames))
         if known is not None:
             states = jnp.concatenate([states[:cut], states[-1:]])
         features = Features(LAYERS, self.features, self.dtype, name="features")(
@@ -97,26 +110,31 @@ class StateTokens(Encoder):
 
 
 class CurrentTokens(Encoder):
-    """A few tokens for the current state alone, and what changed before it: `[tokens, D]`.
+    """A few tokens for the current state and the changes before it: `[tokens, D]`.
 
-    Before its start an episode is taken to have stood still. Frames that a shorter context does not
-    hold are black: without a past the whole frame is what has changed.
+    Frames before an episode equal its first one. Frames that a short context does not hold are
+    black: without a past the whole frame has changed.
+
+    Attributes:
+        width: D, of a token.
+        features: of the first convolution.
+        tokens: number of tokens.
+        dtype: of the computation.
     """
 
     width: int
-    features: int  # of the first convolution
+    features: int
     tokens: int
     dtype: Dtype = jnp.float32
 
     @nn.compact
     def __call__(self, context: Context) -> jax.Array:  # noqa: D102
-        frames = seen(context)
+        frames = join_frames(context)
         past = frames.shape[0] - 1
         known = jnp.maximum(jnp.arange(past + 1), past - context.step)
         read = Features(HALVED, self.features, self.dtype, name="features")
-        features = read(changes(stacked(frames[known], 1)))
-        # Wide, not small, and normalised: what is shown to the transformer must be about positions
-        # already (docs/lessons.md).
+        features = read(compute_changes(stack_frames(frames[known], 1)))
+        # Wide and normalised: the transformer must be given positions already (docs/lessons.md).
         hidden = nn.Dense(
             HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
         )

@@ -1,7 +1,7 @@
-"""Constraints on plans in a grid world that no model has learned, and views that hide things.
+"""Constraints on plans in a grid world, and views of contexts, for models that never learned them.
 
 Each penalty is `(context, actions [T]) -> []`, for `leapjax.constrain` with `partial`: the number
-of violations in what is certain of the plan, or how far it is from what is asked for.
+of violations in the chosen actions of a plan, or its distance from a requirement.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,16 @@ import jax.numpy as jnp
 
 from leapjax.domains.babyai import vocabulary
 from leapjax.domains.babyai.adapter import END, TURNS
-from leapjax.domains.babyai.dynamics import DOOR, FLOOR, FORWARD, LAVA, OPEN, faced, roll, steps_to
+from leapjax.domains.babyai.dynamics import (
+    DOOR,
+    FLOOR,
+    FORWARD,
+    LAVA,
+    OPEN,
+    count_steps,
+    find_faced_cells,
+    roll,
+)
 from leapjax.domains.babyai.encoders.cells import mark_cell
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
@@ -19,19 +28,20 @@ from leapjax.types import Array, Context
 
 
 def lava(context: Context, actions: jax.Array) -> jax.Array:
-    """Steps onto lava, of the whole plan, where nothing but the agent moves: see `roll`.
+    """Counts the steps of a plan onto lava.
 
-    Where a plan moves things or shuts doors, and goes on there, it can be wrong either way.
+    Only the agent moves (see `roll`): the count may be wrong if the plan moves objects or shuts
+    doors on its way.
     """
-    return _lava_steps(context.observation, actions)
+    return _count_lava_steps(context.observation, actions)
 
 
 def immediate_lava(context: Context, actions: jax.Array) -> jax.Array:
-    """The same of the first action alone, which is all that the paper penalises."""
-    return _lava_steps(context.observation, actions[:1])
+    """Counts a step onto lava by the first action alone, as the paper does."""
+    return _count_lava_steps(context.observation, actions[:1])
 
 
-def _lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
+def _count_lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
     cells = roll(observation, actions)[:, :2]
     entered = (cells[1:] != cells[:-1]).any(axis=1)
     on_lava = jnp.asarray(observation.grid)[cells[1:, 0], cells[1:, 1], 0] == LAVA
@@ -39,51 +49,51 @@ def _lava_steps(observation: Observation, actions: jax.Array) -> jax.Array:
 
 
 def left_turns(context: Context, actions: jax.Array) -> jax.Array:
-    """Turns to the left before the plan ends, as if they were forbidden."""
+    """Counts the turns to the left before the plan ends."""
     del context
-    return jnp.sum((actions == LEFT) & _before_end(actions)).astype(jnp.float32)
+    return jnp.sum((actions == LEFT) & _mark_executed(actions)).astype(jnp.float32)
 
 
 def turns_over(context: Context, actions: jax.Array, budget: int) -> jax.Array:
-    """Turns over a budget: those that the context remembers, and those of the plan."""
+    """Counts the turns in the context and in the plan beyond a budget."""
     turns = jnp.array(TURNS)
     taken = jnp.isin(jnp.asarray(context.actions), turns).sum()
-    planned = (jnp.isin(actions, turns) & _before_end(actions)).sum()
+    planned = (jnp.isin(actions, turns) & _mark_executed(actions)).sum()
     return jnp.maximum(taken + planned - budget, 0).astype(jnp.float32)
 
 
-def _before_end(actions: jax.Array) -> jax.Array:
-    """`[T]` bool: what of a plan is executed, as far as it is certain."""
+def _mark_executed(actions: jax.Array) -> jax.Array:
+    """Marks the actions of a plan `[T]` before its end and before its first MASK: `[T]` bool."""
     return jnp.cumsum(actions >= END) == 0
 
 
 def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
-    """How far from the coloured cell a plan ends that does not visit it, in steps; 0 if it does.
+    """Counts the steps from the end of a plan to the coloured cell; 0 if the plan visits it.
 
-    Much farther, if it gets to the goal before.
+    Adds the number of cells of the grid if the plan reaches the goal first.
     """
     observation = context.observation
     marked = jnp.asarray(observation.grid)[..., 0] == FLOOR
     poses = roll(observation, actions)
     visited = jnp.cumsum(marked[poses[:, 0], poses[:, 1]]) > 0
-    early = (_at_goal(observation, poses) & ~visited)[1:].any()
+    early = (_find_goal_poses(observation, poses) & ~visited)[1:].any()
     cell = jnp.stack(jnp.unravel_index(jnp.argmax(marked), marked.shape))
-    far = jnp.where(visited[-1], 0, steps_to(poses[-1], cell)) + early * marked.size
+    far = jnp.where(visited[-1], 0, count_steps(poses[-1], cell)) + early * marked.size
     return jnp.where(marked.any(), far, 0).astype(jnp.float32)
 
 
-def revisits(context: Context, actions: jax.Array, handling: bool = False) -> jax.Array:
-    """How often the agent has been before where a plan leads, summed over its poses.
+def count_revisits(context: Context, actions: jax.Array, handling: bool = False) -> jax.Array:
+    """Counts how often the agent was before in each pose of a plan; returns the sum.
 
-    Before is in the past that the context remembers, now, and earlier in the plan. So what leads
-    nowhere costs more each time, until another way is the better one (as Korf's LRTA*, 1990). An
-    end comes back to nothing.
+    Earlier poses are those of the context, the current one, and earlier ones of the plan. A dead
+    end costs more each time, until another way costs less (as in Korf's LRTA*, 1990). The end
+    action adds no pose.
 
     Args:
-        context: whose past poses count.
+        context: its past poses count.
         actions: `[T]` a plan, which may hold MASK.
-        handling: whether nothing is said of actions on the thing in front, which may be of use
-            though the agent stays where it is.
+        handling: whether to allow actions on the object in front, which leave the agent in its
+            pose but may be useful.
     """
     steps = actions.shape[0]
     observation = context.observation
@@ -92,63 +102,66 @@ def revisits(context: Context, actions: jax.Array, handling: bool = False) -> ja
     same = (poses[1:, None] == earlier).all(axis=-1)  # [T, K + T + 1]; a blank pose is in no cell
     now = len(earlier) - steps - 1
     before = jnp.arange(len(earlier)) <= now + jnp.arange(steps)[:, None]
-    times = jnp.sum(same & before, axis=1) * _before_end(actions)
+    times = jnp.sum(same & before, axis=1) * _mark_executed(actions)
     if handling:
-        times *= ~((actions > FORWARD) & _before_a_thing(observation, poses[:-1]))
+        times *= ~((actions > FORWARD) & _find_thing_poses(observation, poses[:-1]))
     return jnp.sum(times).astype(jnp.float32)
 
 
-def _before_a_thing(observation: Observation, poses: jax.Array) -> jax.Array:
-    """`[n]` bool: at which of the poses `[n, 3]` an agent faces a door or an object."""
-    x, y = faced(poses).T
+def _find_thing_poses(observation: Observation, poses: jax.Array) -> jax.Array:
+    """Marks the poses `[n, 3]` in which an agent faces a door or an object: `[n]` bool."""
+    x, y = find_faced_cells(poses).T
     kinds = jnp.asarray(observation.grid)[x, y, 0]
     return (kinds >= DOOR) & (kinds <= INTERCHANGEABLE[-1])
 
 
 def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
-    """Whether the first action leads to the goal while a coloured cell is left: 1, or 0."""
+    """Returns 1 if the first action reaches the goal while a coloured cell is left, else 0."""
     observation = context.observation
     poses = roll(observation, actions[:1])
     left = (jnp.asarray(observation.grid)[..., 0] == FLOOR).any()
-    return (left & _at_goal(observation, poses[1:]).any()).astype(jnp.float32)
+    return (left & _find_goal_poses(observation, poses[1:]).any()).astype(jnp.float32)
 
 
-def _at_goal(observation: Observation, poses: jax.Array) -> jax.Array:
-    """`[n]` bool: at which of the poses `[n, 3]` an agent faces the goal, or a thing like it.
+def _find_goal_poses(observation: Observation, poses: jax.Array) -> jax.Array:
+    """Marks the poses `[n, 3]` in which an agent faces the goal or an object like it: `[n]` bool.
 
-    An instruction that names a kind and a colour is done at any such thing, not at the nearest.
+    Any object of the kind and colour in the instruction completes it, not only the nearest.
     """
     grid, goal = jnp.asarray(observation.grid), jnp.asarray(observation.goal)
     alike = (grid[..., :2] == grid[goal[0], goal[1], :2]).all(axis=-1) & (goal[0] >= 0)
-    x, y = faced(poses).T
+    x, y = find_faced_cells(poses).T
     return alike[x, y]
 
 
-def without_lava(context: Context) -> Context:
-    """A context in which lava cells look empty."""
-    return _hiding(context, lambda grid, goal: grid[..., 0] == LAVA)
+def hide_lava(context: Context) -> Context:
+    """Makes lava cells of a context look empty."""
+    return _hide_cells(context, lambda grid, goal: grid[..., 0] == LAVA)
 
 
-def without_marks(context: Context) -> Context:
-    """A context in which coloured cells look empty."""
-    return _hiding(context, lambda grid, goal: grid[..., 0] == FLOOR)
+def hide_marks(context: Context) -> Context:
+    """Makes coloured cells of a context look empty."""
+    return _hide_cells(context, lambda grid, goal: grid[..., 0] == FLOOR)
 
 
-def without_open_doors(context: Context) -> Context:
-    """A context in which open doors look empty, for models that never saw a door."""
-    return _hiding(context, lambda grid, goal: (grid[..., 0] == DOOR) & (grid[..., 2] == OPEN))
+def hide_open_doors(context: Context) -> Context:
+    """Makes open doors of a context look empty, for models that never saw a door."""
+    return _hide_cells(context, lambda grid, goal: (grid[..., 0] == DOOR) & (grid[..., 2] == OPEN))
 
 
-def half_of_obstacles(context: Context, part: int) -> Context:
-    """A context in which every second object that is not the goal is seen: part 0 or 1.
+def hide_half_of_obstacles(context: Context, part: int) -> Context:
+    """Makes every second obstacle of a context look empty, and leaves part 0 or 1.
 
-    In reading order: where one is taken away, those that come after it change parts.
+    Obstacles are counted in reading order: if one is moved, later ones may change parts.
     """
-    return _hiding(context, lambda grid, goal: in_half(grid, goal, 1 - part))
+    return _hide_cells(context, lambda grid, goal: find_half(grid, goal, 1 - part))
 
 
-def in_half(grid: Array, goal: Array, part: int) -> jax.Array:
-    """Where in a grid `[S, S, 3]` the obstacles of part 0 or 1 are: `[S, S]` bool."""
+def find_half(grid: Array, goal: Array, part: int) -> jax.Array:
+    """Finds the obstacles of part 0 or 1 in a grid `[S, S, 3]`: `[S, S]` bool.
+
+    An obstacle is an object other than the goal.
+    """
     kinds = jnp.asarray(grid)[..., 0]
     objects = (kinds >= INTERCHANGEABLE[0]) & (kinds <= INTERCHANGEABLE[-1])
     obstacles = objects & (mark_cell(jnp.asarray(goal), kinds.shape[0]) == 0)
@@ -156,8 +169,8 @@ def in_half(grid: Array, goal: Array, part: int) -> jax.Array:
     return obstacles & (count % 2 == part)
 
 
-def _hiding(context: Context, which: Callable[[jax.Array, jax.Array], jax.Array]) -> Context:
-    """A context in which some cells look empty, now and in the past.
+def _hide_cells(context: Context, which: Callable[[jax.Array, jax.Array], jax.Array]) -> Context:
+    """Makes some cells of a context look empty, now and in the past.
 
     Args:
         context: of one trajectory.
@@ -174,11 +187,11 @@ def _hiding(context: Context, which: Callable[[jax.Array, jax.Array], jax.Array]
     return context._replace(observation=observation, past=jax.vmap(hide)(context.past))
 
 
-def told_to_go(context: Context) -> Context:
-    """A context whose instruction, to pick something up, is to go to it."""
+def replace_pick_up(context: Context) -> Context:
+    """Replaces 'pick up' in the instruction of a context by 'go to'."""
     words = jnp.arange(vocabulary.SIZE)
-    for said, instead in (("pick", "go"), ("up", "to")):
-        words = words.at[vocabulary.WORD_IDS[said]].set(vocabulary.WORD_IDS[instead])
+    for word, other in (("pick", "go"), ("up", "to")):
+        words = words.at[vocabulary.WORD_IDS[word]].set(vocabulary.WORD_IDS[other])
 
     def tell(observation: Observation) -> Observation:
         return observation._replace(instruction=words[jnp.asarray(observation.instruction)])

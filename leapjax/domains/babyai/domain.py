@@ -1,4 +1,4 @@
-"""BabyAI as a `Domain`: what a run needs of a level."""
+"""BabyAI as a `Domain`."""
 
 import contextlib
 import functools
@@ -23,12 +23,12 @@ from leapjax.domains.babyai.levels import Level
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 
 
 def make(name: str, options: Settings) -> Domain:
-    """A level by name or id; makes its environment once, to look at it.
+    """Makes a level by name or id; makes its environment once, to read its size.
 
     Raises:
         UserError: an unknown level.
@@ -71,15 +71,15 @@ def make(name: str, options: Settings) -> Domain:
 
 
 def check_states(states: Observation, where: str, level: Level) -> None:
-    """Refuses observations whose numbers mean nothing in this world.
+    """Checks that the numbers of observations are in range.
 
     Args:
         states: `[n + 1, ...]` of one episode.
-        where: to find it.
-        level: that they should be of.
+        where: name of the episode, for the message.
+        level: of the episode.
 
     Raises:
-        UserError: says which numbers, and what is possible.
+        UserError: names the numbers and their range.
     """
     side = states.grid.shape[1]
     ranges: dict[str, tuple[np.ndarray, int, int]] = {

@@ -1,4 +1,4 @@
-"""What becomes of an agent that turns and moves, as a pure function: for constraints on plans."""
+"""Poses of an agent that turns and moves, as pure functions: for constraints on plans."""
 
 import jax
 import jax.numpy as jnp
@@ -10,20 +10,20 @@ from leapjax.domains.babyai.symmetries import AGENT, DIRECTION_VECTORS, EMPTY, L
 FORWARD = ACTIONS.index("forward")
 FLOOR, DOOR, GOAL, LAVA = 3, 4, 8, 9  # MiniGrid's object indices; a floor is a coloured cell
 OPEN = 0  # MiniGrid's state of an open door
-PASSABLE = (EMPTY, FLOOR, GOAL, LAVA, AGENT)  # the agent's mark hides what it stands on
+PASSABLE = (EMPTY, FLOOR, GOAL, LAVA, AGENT)  # the agent's mark hides the cell below
 
 
-def passable(grid: jax.Array) -> jax.Array:
-    """`[S, S]` bool: which cells an agent can step into."""
+def find_passable(grid: jax.Array) -> jax.Array:
+    """Finds the cells that an agent can step into: `[S, S]` bool."""
     kind, state = grid[..., 0], grid[..., 2]
     return jnp.isin(kind, jnp.array(PASSABLE)) | ((kind == DOOR) & (state == OPEN))
 
 
 def roll(observation: Observation, actions: jax.Array) -> jax.Array:
-    """The poses that a plan leads through, in a world where nothing else changes.
+    """Computes the poses that a plan leads through if only the agent moves.
 
-    Doors and objects stay as they are, whatever the plan does to them, and lava is passed.
-    From the end action on, and from the first action that is not chosen yet, nothing moves.
+    Doors and objects stay as they are, even if the plan acts on them, and lava is passed. The
+    agent stops at the end action and at the first MASK.
 
     Args:
         observation: the current state.
@@ -32,7 +32,7 @@ def roll(observation: Observation, actions: jax.Array) -> jax.Array:
     Returns:
         `[T + 1, 3]` int32: x, y and direction before the first action, and after each.
     """
-    free = passable(jnp.asarray(observation.grid))
+    free = find_passable(jnp.asarray(observation.grid))
     vectors = jnp.asarray(DIRECTION_VECTORS)
 
     def move(
@@ -52,13 +52,13 @@ def roll(observation: Observation, actions: jax.Array) -> jax.Array:
     return jnp.concatenate([start[None], poses])
 
 
-def faced(poses: jax.Array) -> jax.Array:
-    """`[n, 2]` int32: the cells in front of an agent at poses `[n, 3]`."""
+def find_faced_cells(poses: jax.Array) -> jax.Array:
+    """Finds the cells in front of an agent at poses `[n, 3]`: `[n, 2]` int32."""
     return poses[:, :2] + jnp.asarray(DIRECTION_VECTORS)[poses[:, 2]]
 
 
-def steps_to(pose: jax.Array, cell: jax.Array) -> jax.Array:
-    """`[]` int32: turns and moves from a pose `[3]` to a cell `[2]`, if nothing is in the way."""
+def count_steps(pose: jax.Array, cell: jax.Array) -> jax.Array:
+    """Counts turns and moves from a pose `[3]` to a cell `[2]` on a free grid: `[]` int32."""
     offset = jnp.asarray(cell) - pose[:2]
     ahead = offset @ jnp.asarray(DIRECTION_VECTORS)[pose[2]]
     moves = jnp.abs(offset).sum()

@@ -1,4 +1,4 @@
-"""Episodes that somebody recorded of MiniGrid's own observations, played again.
+"""Plays recorded episodes of MiniGrid's own observations again.
 
 Minari's published data sets of BabyAI hold an image, a direction and the mission, seen from the
 agent or as a whole. They hold no object carried, and no goal. Their levels follow from the seed
@@ -23,7 +23,15 @@ OTHER_GOAL = "that ended at another match than the nearest"
 
 
 def replay(recording: Recording, level: Level) -> Demonstration | str | None:
-    """A recorded episode as a demonstration; or why it is none; None: it is not of MiniGrid."""
+    """Plays a recorded episode again, to make a demonstration of it.
+
+    Args:
+        recording: of MiniGrid's own observations; `None` is returned for others.
+        level: of the recording.
+
+    Returns:
+        The demonstration, or the reason why the episode cannot be used.
+    """
     stored = recording.observations
     if not isinstance(stored, dict) or not {"image", "mission"} <= set(stored):
         return None
@@ -37,22 +45,22 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
     if not (recording.rewards > 0).any():
         return FAILED
     with closing(BabyAIAdapter(level)) as adapter:
-        return _replayed(recording, adapter, images, missions)
+        return _play_again(recording, adapter, images, missions)
 
 
-def _replayed(
+def _play_again(
     recording: Recording, adapter: BabyAIAdapter, images: np.ndarray, missions: np.ndarray
 ) -> Demonstration | str:
-    """A recorded episode played again; or why it is no demonstration."""
+    """Plays the recorded actions and compares each state with the recorded one."""
     states = [adapter.reset(recording.seed)]
-    same = _is(adapter, images[0], missions[0])
+    same = _matches(adapter, images[0], missions[0])
     success = terminated = truncated = False
     for step, action in enumerate(recording.actions, start=1):
         if terminated or truncated or not same:
             return DIFFERENT
         state, reward, terminated, truncated, success = adapter.step(int(action))[:5]
         states.append(state)
-        same = _is(adapter, images[step], missions[step])
+        same = _matches(adapter, images[step], missions[step])
         same = same and bool(np.isclose(reward, recording.rewards[step - 1]))
     if not same or not success:
         return DIFFERENT
@@ -68,13 +76,13 @@ def _replayed(
     )
 
 
-def _is(adapter: BabyAIAdapter, image: np.ndarray, mission: np.ndarray) -> bool:
-    """Whether a level is now as it was recorded."""
+def _matches(adapter: BabyAIAdapter, image: np.ndarray, mission: np.ndarray) -> bool:
+    """Returns whether the current state of a level equals a recorded one."""
     env = adapter.env
     if str(mission) != env.mission:
         return False
     whole = adapter.observe().grid[: env.width, : env.height]
     if np.array_equal(whole, image):
         return True
-    # The adapter has no use for the agent's view, so it has taken it away.
+    # The adapter removed the agent's view from the environment, as it does not use it.
     return np.array_equal(type(env).gen_obs(env)["image"], image)

@@ -25,8 +25,8 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.domains.gymnasium.recorded import check_environment, describe_environment
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
 R = TypeVar("R")
@@ -35,14 +35,13 @@ EXAMPLES = ("CartPole-v1",)
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What an environment does not always say of itself.
+    """Settings of an environment.
 
     Attributes:
-        success_return: Return that an episode must reach to count as a success. None for the
-            environment's own `reward_threshold`; if it has none, an episode succeeds that ends of
-            its own with a positive reward.
-        max_steps: Steps after which an episode is cut off; None for the limit that the environment
-            has.
+        success_return: Return that an episode must reach to count as a success. By default the
+            environment's own `reward_threshold`; without it an episode succeeds that terminates
+            with a positive reward.
+        max_steps: Steps after which an episode is cut off; by default the limit of the environment.
         arguments: Keyword arguments of `gymnasium.make`, as a JSON object.
     """
 
@@ -66,7 +65,7 @@ class Settings:
 
 
 class CheckedAdapter(GymnasiumAdapter):
-    """Anybody's environment: what goes wrong in it is said in one line."""
+    """A user's environment: turns its errors into one-line `UserError`s."""
 
     def __init__(
         self, env: gym.Env, name: str, blank: PyTree, success_return: float | None
@@ -77,28 +76,26 @@ class CheckedAdapter(GymnasiumAdapter):
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed."""
-        return self._checked(
-            self._guarded("reset", lambda: super(CheckedAdapter, self).reset(seed))
-        )
+        return self._check(self._guard("reset", lambda: super(CheckedAdapter, self).reset(seed)))
 
     def step(self, action: int) -> Transition:
         """Takes one action."""
-        found = self._guarded("step", lambda: super(CheckedAdapter, self).step(action))
-        return found._replace(observation=self._checked(found.observation))
+        found = self._guard("step", lambda: super(CheckedAdapter, self).step(action))
+        return found._replace(observation=self._check(found.observation))
 
     def close(self) -> None:
         """Closes the environment."""
-        self._guarded("close", super().close)
+        self._guard("close", super().close)
 
-    def _guarded(self, what: str, work: Callable[[], R]) -> R:
+    def _guard(self, what: str, work: Callable[[], R]) -> R:
         try:
             return work()
-        except Exception as error:  # it is anybody's code
+        except Exception as error:  # it is the user's code
             raise UserError(
                 f"{what} of {self._name} raised {type(error).__name__}: {first_line(error)}"
             ) from error
 
-    def _checked(self, observation: Any) -> PyTree:
+    def _check(self, observation: Any) -> PyTree:
         shapes = jax.tree.map(np.shape, observation)
         if shapes != self._shapes:
             raise UserError(
@@ -107,27 +104,27 @@ class CheckedAdapter(GymnasiumAdapter):
             )
         where = f"an observation of {self._name}"
 
-        def narrowed(path: Any, values: Any, like: np.ndarray) -> np.ndarray:
+        def narrow_part(path: Any, values: Any, like: np.ndarray) -> np.ndarray:
             return check_fits(f"{where}{jax.tree_util.keystr(path)}", values, like.dtype)
 
-        narrow = jax.tree.map_with_path(narrowed, observation, self._blank)
+        narrow = jax.tree.map_with_path(narrow_part, observation, self._blank)
         check_choices(self.env.observation_space, narrow, where)
         return narrow
 
 
 def make_environment(name: str, options: Settings) -> gym.Env:
-    """An environment by its id, or by `module:id`, cut off after `max_steps`.
+    """Makes an environment by its id, or by `module:id`, cut off after `max_steps`.
 
     Raises:
         UserError: it cannot be made, or an episode may never end.
     """
     try:
         env = gym.make(name, options.max_steps, **json.loads(options.arguments))
-    except Exception as error:  # noqa: BLE001  (it is anybody's code)
+    except Exception as error:  # noqa: BLE001  (it is the user's code)
         raise UserError(
             f"the environment {name!r} cannot be made: {_explain(name, error)}"
         ) from None
-    if _longest(env) is None:
+    if _read_limit(env) is None:
         with contextlib.suppress(Exception):
             env.close()
         raise UserError(
@@ -138,10 +135,7 @@ def make_environment(name: str, options: Settings) -> gym.Env:
 
 
 def _explain(name: str, error: Exception) -> str:
-    """Says why an environment cannot be made, and what to do where that is known.
-
-    Other names are proposed only where the name is what is wrong.
-    """
+    """Explains why an environment cannot be made, and proposes a remedy if it knows one."""
     module, _, short = name.rpartition(":")
     register = "" if module else f"; if a module registers it, give MODULE:{name}"
     if ":" in module:
@@ -158,26 +152,26 @@ def _explain(name: str, error: Exception) -> str:
     return first_line(error)
 
 
-def _longest(env: gym.Env) -> int | None:
+def _read_limit(env: gym.Env) -> int | None:
     return env.spec.max_episode_steps if env.spec is not None else None
 
 
 def make(name: str, options: Settings) -> Domain:
-    """An environment by its id; it is made once, to look at it.
+    """Makes the domain of an environment by id; makes the environment once, to read its spaces.
 
     Raises:
         UserError: it cannot be made, or its spaces cannot be used.
     """
     env = make_environment(name, options)
     try:
-        return _described(env, name, options)
+        return _describe(env, name, options)
     finally:
-        with contextlib.suppress(Exception):  # it was only looked at
+        with contextlib.suppress(Exception):  # only its spaces were read
             env.close()
 
 
-def _described(env: gym.Env, name: str, options: Settings) -> Domain:
-    """The domain of an environment that is only looked at."""
+def _describe(env: gym.Env, name: str, options: Settings) -> Domain:
+    """Describes an environment as a domain."""
     actions = env.action_space
     if not isinstance(actions, gym.spaces.Discrete) or actions.start != 0:
         raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
@@ -211,7 +205,7 @@ def _described(env: gym.Env, name: str, options: Settings) -> Domain:
             make_environment(name, options), name, blank, options.success_return
         ),
         actions=(*(str(action) for action in range(actions.n)), "end"),
-        max_steps=_longest(env) or 0,
+        max_steps=_read_limit(env) or 0,
         blank=blank,
         encoders=make_encoders(()),
         demonstrations=Demonstrations(

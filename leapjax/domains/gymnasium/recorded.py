@@ -1,4 +1,4 @@
-"""Whether a data set was recorded in the environment that is played."""
+"""Checks that a data set was recorded in the environment that is played."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,8 +10,8 @@ import numpy as np
 from leapjax.domain import Described
 from leapjax.errors import UserError
 
-UNBOUNDED = 2.0**31 - 1  # larger bounds only say that there are none, each version another
-# Wrappers of Gymnasium that change neither observations, nor rewards, nor what actions do.
+UNBOUNDED = 2.0**31 - 1  # larger bounds stand for unbounded; versions of Gymnasium differ in them
+# Wrappers of Gymnasium that change neither observations, nor rewards, nor actions.
 WATCHING = frozenset(
     {
         "AddWhiteNoise", "HumanRendering", "ObstructView", "OrderEnforcing", "PassiveEnvChecker",
@@ -101,7 +101,7 @@ def _check_arguments(recorded: Described, where: str, played: Described) -> None
 
 
 def _select_changing(wrappers: Sequence[Mapping[str, Any]]) -> list[tuple[Any, Any]]:
-    """Name and arguments of each wrapper that changes what is observed, rewarded or done."""
+    """Selects the wrappers that change observations, rewards or actions: name and arguments."""
     return [
         (each.get("name"), each.get("kwargs"))
         for each in wrappers
@@ -118,7 +118,7 @@ def _list_wrappers(wrappers: Sequence[tuple[Any, Any]]) -> str:
 
 
 def _as_json(value: Any) -> Any:
-    """A value as it is after it was written as JSON; what JSON does not have as its `repr`."""
+    """Converts a value to JSON and back; values that JSON does not have become their `repr`."""
 
     def convert(other: Any) -> Any:
         return other.tolist() if isinstance(other, np.ndarray | np.generic) else repr(other)
@@ -132,7 +132,7 @@ def _as_json(value: Any) -> Any:
 def _check_space(
     recorded: gym.Space, played: gym.Space, part: str, where: str, level: str | None
 ) -> None:
-    """Refuses a space of other values; data may have more parts than are looked at.
+    """Checks that two spaces hold the same values; data may have additional parts.
 
     Raises:
         UserError: names the part that differs.
@@ -150,7 +150,7 @@ def _check_space(
 
 
 def _is_same(recorded: Any, played: Any) -> bool:
-    """Whether two spaces hold the same values, whatever types these are stored in."""
+    """Returns whether two spaces hold the same values, of any types."""
     if type(recorded) is not type(played) or recorded.shape != played.shape:
         return False
     if isinstance(played, gym.spaces.Box):

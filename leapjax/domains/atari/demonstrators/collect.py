@@ -55,7 +55,7 @@ def collect(
         transitions: smallest number of transitions, in whole games.
         dqn_seed: number from 1 that names the folder as DQN-Replay does; each has other games.
         longest: decisions after which a game is cut off: see `replay.Episode`.
-        workers: number of processes; None for one on each core.
+        workers: number of processes; as many as cores by default.
         progress: called with the number of transitions so far.
 
     Returns:
@@ -96,7 +96,7 @@ def is_whole(folder: Path, game: Game, transitions: int, dqn_seed: int, longest:
     """Returns whether `collect` has already made all transitions.
 
     Raises:
-        UserError: the files are not those that `collect` would make.
+        UserError: `collect` would make other files.
     """
     return (
         count_transitions(read_manifests(folder, game, dqn_seed, transitions, longest))
@@ -107,7 +107,7 @@ def is_whole(folder: Path, game: Game, transitions: int, dqn_seed: int, longest:
 def find_shards(folder: Path, game: Game, transitions: int, dqn_seed: int) -> range | None:
     """Returns the numbers of the first files that hold so many transitions.
 
-    Returns None if the files were not made here, or hold too few.
+    Returns `None` if the files were not made here, or hold too few.
 
     Raises:
         UserError: the files are of another game or `dqn_seed`.

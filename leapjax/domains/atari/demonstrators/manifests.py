@@ -22,15 +22,15 @@ def manifest_path(logs: Path, number: int) -> Path:
 def read_manifest(
     folder: Path, game: Game, dqn_seed: int, number: int, longest: int | None = None
 ) -> Manifest | None:
-    """Reads the manifest of a file that was made here; returns None if it was not.
+    """Reads the manifest of a file; returns `None` if the file was not made here.
 
     Args:
         folder: of all games.
         game: to expect.
         dqn_seed: to expect.
         number: of the file.
-        longest: decisions of a game, to check that the file equals one that would be made now;
-            None to skip this check.
+        longest: decisions of a game, to check that the file would be made alike now; not checked
+            by default.
 
     Raises:
         UserError: the manifest is damaged, of another game or `dqn_seed`, or fails the check.

@@ -7,7 +7,7 @@ six files, each a gzip of one `.npy` (Agarwal et al., 2020: 50 shards of 1,000,0
     $store$_action_ckpt.N.gz       [R] int32
     $store$_reward_ckpt.N.gz       [R] float32, clipped to [-1, 1]
     $store$_terminal_ckpt.N.gz     [R] uint8: the episode ended with this action
-    add_count_ckpt.N.gz, invalid_range_ckpt.N.gz: the buffer's own, which nothing here reads
+    add_count_ckpt.N.gz, invalid_range_ckpt.N.gz: the buffer's own, not read here
 
 Three rows of zeros, the padding, come before every episode. The last row is not of this shard:
 the buffer is circular, and had not overwritten that row yet. An episode may go on from one shard

@@ -29,7 +29,7 @@ def read(
 
     A random shard at a time gives up to ten trajectories, from where the last visit ended, until
     there are enough; docs/deviations.md lists the differences. Padding is left out. Data of other
-    makers may have none; then the first trajectory of a shard may be cut, and counts as cut.
+    makers may lack it; then the first trajectory of a shard may be cut, and counts as cut.
 
     The frames are unpacked once into a memory-mapped file beside the data, or in the user's cache
     folder if the data are read-only. Until a shard changes, later calls with the same arguments
@@ -41,7 +41,7 @@ def read(
         transitions: smallest number of transitions; all, if there are fewer.
         seed: of the sampling.
         dqn_seed: seed of the DQN that played; DQN-Replay has 1 to 5 of each game.
-        shards: numbers of the shards to read; None for all.
+        shards: numbers of the shards to read; all by default.
 
     Returns:
         The trajectories, in the order of the visits, and the number of cut trajectories in the

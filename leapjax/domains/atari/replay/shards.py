@@ -1,4 +1,4 @@
-"""The files of DQN-Replay: what a shard consists of, and where it is."""
+"""The files of DQN-Replay: the parts of a shard, and their paths."""
 
 import gzip
 import re
@@ -85,10 +85,10 @@ def find_shards(logs: Path, chosen: Sequence[int] | None) -> list[int]:
 
     Args:
         logs: folder of the shards.
-        chosen: numbers of the shards to check; None for all in the folder.
+        chosen: numbers of the shards to check; all in the folder by default.
 
     Raises:
-        UserError: there are no shards, or a part of one is missing or empty.
+        UserError: there are no shards, or a part of a shard is missing or empty.
     """
     pattern = rf"(?:{'|'.join(map(re.escape, PARTS))})_ckpt\.(\d+)\.gz"
     found = (re.fullmatch(pattern, path.name) for path in logs.iterdir())

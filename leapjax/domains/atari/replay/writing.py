@@ -21,9 +21,9 @@ _LEVEL = 4  # of gzip: twice as fast as the default, and the files are hardly la
 
 
 def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
-    """Writes episodes as one shard; a killed program leaves no shard that seems complete.
+    """Writes episodes as a shard; a killed program leaves no shard that seems complete.
 
-    Clips the rewards, and adds a row of zeros in place of the last row, which nobody reads.
+    Clips the rewards, and adds a row of zeros in place of the last row, which is not read.
 
     Args:
         folder: of the shards of one DQN, see `replay_logs`; made if it does not exist.

@@ -1,4 +1,4 @@
-"""Encodes the instruction: its words, the whole, and which words speak of which cell."""
+"""Encodes the instruction, and attends from cells to its words."""
 
 from typing import NamedTuple
 

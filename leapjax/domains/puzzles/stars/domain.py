@@ -14,8 +14,8 @@ from leapjax.data.solved import collect_solved
 from leapjax.domain import Augmentation, Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from leapjax.models.transformer import dense
 from leapjax.types import Context
 
@@ -102,7 +102,7 @@ def check_labels(states: Graph, where: str, labels: int) -> None:
     """Checks that the labels of nodes are in range.
 
     Raises:
-        UserError: one is not.
+        UserError: a label is out of range.
     """
     for field, values in states._asdict().items():
         check_range(f"{where}: {field}", values, 0, labels - 1)

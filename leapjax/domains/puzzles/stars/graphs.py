@@ -23,35 +23,46 @@ MOST_NODES = 1000
 
 
 class Star(NamedTuple):
-    """A level: how many arms of how many edges."""
+    """A level.
+
+    Attributes:
+        arms: number of arms.
+        length: edges of each arm.
+    """
 
     arms: int
     length: int
 
     @property
     def nodes(self) -> int:
-        """How many there are, the centre included; edges are one less."""
+        """Number of nodes, the centre included; there is one edge less."""
         return 1 + self.arms * self.length
 
     @property
     def labels(self) -> int:
-        """How many names there are for nodes: 50, or as many fifties as are needed."""
+        """Number of labels for nodes: the smallest multiple of 50 that is enough."""
         return 50 * -(-self.nodes // 50)
 
 
 class Graph(NamedTuple):
-    """What the agent sees. Nodes are known by their labels, `0 .. labels - 1`."""
+    """An observation. Nodes have labels in `0 .. labels - 1`.
 
-    edges: Array  # [E, 2] int32: from a node to the next one farther from the centre
-    node: Array  # [] int32: where the agent is
-    goal: Array  # [] int32
+    Attributes:
+        edges: `[E, 2]` int32, each from a node to the next node away from the centre.
+        node: `[]` int32, where the agent is.
+        goal: `[]` int32.
+    """
+
+    edges: Array
+    node: Array
+    goal: Array
 
 
 def find_level(name: str) -> Star:
-    """The level of a name such as Star3x5: three arms of five edges.
+    """Reads a level's name, such as Star3x5: three arms of five edges.
 
     Raises:
-        UserError: it is none.
+        UserError: the level does not exist.
     """
     pattern, expected = r"Star([1-9]\d{0,3})x([1-9]\d{0,3})", "Star<arms>x<edges of an arm>"
     star = Star(*read_numbers(name, pattern, expected, LEVELS))
@@ -61,7 +72,7 @@ def find_level(name: str) -> Star:
 
 
 def draw(star: Star, seed: int) -> tuple[Graph, np.ndarray]:
-    """The graph of a seed, and the nodes `[length]` that lead to its goal."""
+    """Draws the graph of a seed, and the nodes `[length]` of the path to its goal."""
     rng = np.random.default_rng(check_seed(seed))
     names = rng.permutation(star.labels)[: star.nodes].astype(np.int32)
     arms = names[1:].reshape(star.arms, star.length)
@@ -98,38 +109,37 @@ class StarAdapter:
 
 
 def relabel(key: jax.Array, window: Window, labels: int) -> Window:
-    """The same window with other names for nodes, and its edges in another order.
+    """Draws the labels of a window's nodes and the order of its edges anew.
 
-    All graphs of a level are one but for these, so a window becomes that of a new graph.
+    Graphs of a level differ only in these, so this makes a window of a new graph.
     """
     name_key, order_key = jax.random.split(key)
     names = jax.random.permutation(name_key, labels).astype(jnp.int32)
     order = jax.random.permutation(order_key, window.context.observation.edges.shape[0])
 
-    def renamed(actions: jax.Array) -> jax.Array:
+    def rename(actions: jax.Array) -> jax.Array:
         return jnp.where(actions < labels, names[jnp.minimum(actions, labels - 1)], actions)
 
-    def redrawn(graph: Graph) -> Graph:
+    def redraw(graph: Graph) -> Graph:
         return Graph(names[graph.edges[..., order, :]], names[graph.node], names[graph.goal])
 
     context = window.context._replace(
-        observation=redrawn(window.context.observation),
-        past=redrawn(window.context.past),
-        actions=renamed(window.context.actions),
+        observation=redraw(window.context.observation),
+        past=redraw(window.context.past),
+        actions=rename(window.context.actions),
     )
-    return window._replace(context=context, actions=renamed(window.actions))
+    return window._replace(context=context, actions=rename(window.actions))
 
 
 def leave_out_arms(key: jax.Array, window: Window, star: Star) -> Window:
-    """The same window without some of the arms that do not lead to its goal.
+    """Leaves out a random number of the arms that do not lead to a window's goal.
 
-    How many are left is drawn evenly. Edges that are left are seen several times, so that there
-    are as many as before. In a smaller graph it is easier to find out that an edge leads on from
-    where another ends.
+    The remaining edges are repeated, so their number stays. In a smaller graph it is easier to
+    learn that an edge continues where another ends.
     """
     count_key, arm_key = jax.random.split(key)
     graph = window.context.observation
-    # From each node to the next one of its arm; from the centre to any, but no edge ends there.
+    # The next node of each node's arm; the centre has any, but no edge ends there.
     following = jnp.arange(star.labels).at[graph.edges[:, 0]].set(graph.edges[:, 1])
     # Where the arm of each edge ends. (XLA would nest unrolled steps, and compile for minutes.)
     ends = jax.lax.fori_loop(0, star.length - 1, lambda _, at: following[at], graph.edges[:, 1])
@@ -138,10 +148,10 @@ def leave_out_arms(key: jax.Array, window: Window, star: Star) -> Window:
     kept = star.length * jax.random.randint(count_key, (), 1, star.arms + 1)
     edges = by_arm[jnp.arange(len(ends)) % kept]
 
-    def pruned(graph: Graph) -> Graph:
+    def prune(graph: Graph) -> Graph:
         return graph._replace(edges=graph.edges[..., edges, :])
 
     context = window.context
     return window._replace(
-        context=context._replace(observation=pruned(context.observation), past=pruned(context.past))
+        context=context._replace(observation=prune(context.observation), past=prune(context.past))
     )

@@ -23,29 +23,39 @@ FEWEST_CLUES = {4: 4, 9: 26}  # boards with fewer take long to find
 
 
 class Size(NamedTuple):
-    """A level: the side of its boards, and how many cells of them are known."""
+    """A level.
+
+    Attributes:
+        side: of its boards, in cells.
+        clues: number of known cells.
+    """
 
     side: int
     clues: int
 
     @property
     def cells(self) -> int:
-        """How many there are."""
+        """Number of cells."""
         return self.side**2
 
 
 class Board(NamedTuple):
-    """What the agent sees."""
+    """An observation: a board and the cell to write next.
 
-    digits: Array  # [cells] int32: 1 .. side; 0 where nothing is written
-    cell: Array  # [] int32: which one is written next; `cells` where none is left
+    Attributes:
+        digits: `[cells]` int32, 1 .. side; 0 for an empty cell.
+        cell: `[]` int32, the cell to write next; `cells` if the board is full.
+    """
+
+    digits: Array
+    cell: Array
 
 
 def find_level(name: str) -> Size:
-    """The level of a name such as Sudoku9x36: boards of 9 by 9 cells, 36 of them known.
+    """Reads a level's name, such as Sudoku9x36: boards of 9 by 9 cells with 36 clues.
 
     Raises:
-        UserError: it is none.
+        UserError: the level does not exist.
     """
     pattern, expected = r"Sudoku(4|9)x([1-9]\d?)", "Sudoku<4 or 9>x<clues>"
     size = Size(*read_numbers(name, pattern, expected, LEVELS))
@@ -56,8 +66,8 @@ def find_level(name: str) -> Size:
 
 
 @functools.cache
-def peers(side: int) -> np.ndarray:
-    """`[cells, cells]` bool: whether two cells share a row, a column or a box, and are not one."""
+def find_peers(side: int) -> np.ndarray:
+    """Finds the pairs of cells that share a row, a column or a box: `[cells, cells]` bool."""
     cell = np.arange(side**2)
     row, column = np.divmod(cell, side)
     box = side_of_box(side)
@@ -67,28 +77,28 @@ def peers(side: int) -> np.ndarray:
 
 
 def side_of_box(side: int) -> int:
-    """Of a board: 2 or 3."""
+    """Returns the side of a board's boxes: 2 or 3."""
     return math.isqrt(side)
 
 
-def solutions(
+def find_solutions(
     digits: np.ndarray, most: int = 2, rng: np.random.Generator | None = None
 ) -> list[np.ndarray]:
-    """Solutions `[cells]` of a board, the first that are found: an exact search.
+    """Finds solutions `[cells]` of a board by exact search.
 
     It fills the cell with the fewest possible digits first.
 
     Args:
-        digits: `[cells]`, 0 where nothing is written.
-        most: how many to look for.
-        rng: in whose order digits are tried; None: ascending.
+        digits: `[cells]`, 0 for an empty cell.
+        most: number of solutions to stop at.
+        rng: draws the order in which digits are tried; ascending without it.
     """
     side = math.isqrt(len(digits))
-    neighbours = [np.flatnonzero(row).tolist() for row in peers(side)]
+    neighbours = [np.flatnonzero(row).tolist() for row in find_peers(side)]
     found: list[np.ndarray] = []
 
     def write(options: list[int], cell: int, bit: int) -> bool:
-        """Writes a digit, and those that follow from it; False if a cell has none left."""
+        """Writes a digit and its consequences; False if a cell has no digit left."""
         options[cell] &= bit
         if not options[cell]:
             return False
@@ -126,17 +136,17 @@ def solutions(
     return found
 
 
-# Every way to search is measured on the same boards. By type, as 5.0 is not the seed 5.
+# All planners are measured on the same boards. `typed`, as 5.0 is not the seed 5.
 @functools.lru_cache(maxsize=10_000, typed=True)
 def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The clues `[cells]` (0: none) of a seed, and their only solution `[cells]`.
+    """Draws the clues `[cells]` (0 is empty) of a seed, and their only solution `[cells]`.
 
-    Neither may be changed. Cells of a random solution are emptied in random order, as long as the
-    rest have one solution; where no more can be, another is begun.
+    Both arrays are read-only. It empties cells of a random solution in random order while the
+    solution stays the only one. If too many clues are left, it begins with another solution.
     """
     rng = np.random.default_rng(check_seed(seed))
     while True:
-        (solution,) = solutions(np.zeros(size.cells, np.int32), 1, rng)
+        (solution,) = find_solutions(np.zeros(size.cells, np.int32), 1, rng)
         clues, order = solution.copy(), rng.permutation(size.cells).tolist()
         excess, several = size.cells - size.clues, size.cells
         while excess and order:
@@ -144,12 +154,12 @@ def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
             some, rest = order[:several], order[several:]
             fewer = clues.copy()
             fewer[some] = 0
-            if len(solutions(fewer)) == 1:
+            if len(find_solutions(fewer)) == 1:
                 clues, order, excess = fewer, rest, excess - several
             elif several == 1:
                 order = rest  # this cell is needed
             else:
-                several //= 2  # one of these is
+                several //= 2  # at least a cell of these is needed
         if not excess:
             for board in (clues, solution):
                 board.setflags(write=False)
@@ -185,24 +195,29 @@ class SudokuAdapter:
 
 
 class Puzzle(NamedTuple):
-    """What augmentation must know of a step: all of the board's cells, and what was given."""
+    """The board of a step, for augmentation.
 
-    clues: Array  # [cells] int8, 0: none
-    solution: Array  # [cells] int8
+    Attributes:
+        clues: `[cells]` int8, 0 for an empty cell.
+        solution: `[cells]` int8.
+    """
+
+    clues: Array
+    solution: Array
 
 
-def puzzles(demonstration: Demonstration) -> Puzzle:
-    """Of every step, `[n, cells]`."""
+def make_puzzles(demonstration: Demonstration) -> Puzzle:
+    """Makes the puzzle of every step: arrays `[n, cells]`."""
     digits = demonstration.observations.digits
     repeated = [np.broadcast_to(board, digits[1:].shape) for board in (digits[0], digits[-1])]
     return Puzzle(*(board.astype(np.int8) for board in repeated))
 
 
 def transform(key: jax.Array, window: Window, side: int) -> Window:
-    """The same window of another board: all that keeps the rules changes.
+    """Turns a window into a window of another board, by random symmetries of the rules.
 
-    Digits change names; bands, and rows in them, change places, and so do stacks and columns; rows
-    may become columns. The new board is read row by row too, up to the same cell.
+    They permute digits, bands, rows in a band, stacks and columns in a stack, and may exchange rows
+    and columns. The new board is read row by row too, up to the same cell.
     """
     digit_key, row_key, column_key, turn_key = jax.random.split(key, 4)
     names = jnp.append(0, 1 + jax.random.permutation(digit_key, side))
@@ -222,20 +237,20 @@ def transform(key: jax.Array, window: Window, side: int) -> Window:
     earlier = cell + jnp.arange(-window.context.actions.shape[0], 0)
     ahead = cell + jnp.arange(window.actions.shape[0])
 
-    def written(at: jax.Array, otherwise: int) -> jax.Array:
+    def write_plan(at: jax.Array, otherwise: int) -> jax.Array:
         inside = (at >= 0) & (at < cells)
         return jnp.where(inside, solution[jnp.clip(at, 0, cells - 1)] - 1, otherwise)
 
     context = window.context._replace(
         observation=board(cell),
         past=jax.vmap(board)(earlier),
-        actions=written(earlier, pad_token(side + 1)),
+        actions=write_plan(earlier, pad_token(side + 1)),
     )
-    return window._replace(context=context, actions=written(ahead, end))
+    return window._replace(context=context, actions=write_plan(ahead, end))
 
 
 def _keep_boxes(key: jax.Array, side: int) -> jax.Array:
-    """An order `[side]` of rows that keeps together those of a band."""
+    """Draws an order `[side]` of rows that keeps the rows of each band together."""
     box = side_of_box(side)
     band_key, row_key = jax.random.split(key)
     bands = jax.random.permutation(band_key, box)

@@ -24,8 +24,8 @@ class Settings:
     """Sudoku: augmentation.
 
     Attributes:
-        augment: Turn every training window into one of another board, by symmetries that keep the
-            rules.
+        augment: Turn every training window into a window of another board, by symmetries that keep
+            the rules.
     """
 
     augment: bool = True
@@ -35,10 +35,14 @@ class Settings:
 
 
 class BoardTokens(Encoder):
-    """A token for each cell, and one for the cell that is written next.
+    """A token for each cell, and a token for the cell that is written next.
 
-    It says of which cell an action of the plan is (`encode_positions`), so that which cells share
-    a row, a column or a box with it need not be learned for each of them.
+    `encode_positions` gives each action of a plan its cell, so the network need not learn for each
+    position which cells share its row, column or box.
+
+    Attributes:
+        side: of the board, in cells.
+        width: D, of a token.
     """
 
     side: int
@@ -58,16 +62,16 @@ class BoardTokens(Encoder):
         return jnp.concatenate([self._cells(context), task + here])
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """`[T, D]`: the cells that a plan fills, and what is in them."""
+        """Encodes the cells that a plan fills, with their content: `[T, D]`."""
         ahead = context.observation.cell + jnp.arange(horizon)
         return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]
 
     def _cells(self, context: Context) -> jax.Array:
-        """`[cells, D]`."""
+        """Encodes all cells with their digits: `[cells, D]`."""
         return self._groups(jnp.arange(self.side**2)) + self.digit(context.observation.digits)
 
     def _groups(self, cells: jax.Array) -> jax.Array:
-        """`[n, D]` the row, column and box of cells `[n]`; of the last, where there is none."""
+        """Encodes row, column and box of cells `[n]`, clipped to the last cell: `[n, D]`."""
         row, column = jnp.divmod(jnp.minimum(cells, self.side**2 - 1), self.side)
         box = boards.side_of_box(self.side)
         return self.row(row) + self.column(column) + self.box(row // box * box + column // box)
@@ -93,7 +97,7 @@ def make(name: str, settings: Settings) -> Domain:
             functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
             check=functools.partial(check_boards, side=size.side),
         ),
-        augmentations=Augmentations([turn] if settings.augment else [], boards.puzzles),
+        augmentations=Augmentations([turn] if settings.augment else [], boards.make_puzzles),
         rules=rules(size.side),
         signature={"side": size.side, "clues": size.clues},
     )

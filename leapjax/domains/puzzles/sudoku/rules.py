@@ -8,17 +8,16 @@ from leapjax.types import Context, Energy, Params
 
 
 def rules(side: int, weight: float = 4.0) -> Energy:
-    """The energy of a board as a plan fills it: `weight` for each pair of cells that break a rule.
+    """Makes the energy of a plan on a board: `weight` for each pair of cells that break a rule.
 
-    Position t of a plan is the t-th cell from the next one on. It accepts MASK: a cell that is not
-    filled breaks no rule. A clue cannot be changed, and the end action never chosen. Parameters:
-    none, `()`.
+    Position 0 of a plan is the next cell to write. The energy accepts MASK: an empty cell
+    breaks no rule. It is infinite if a plan changes a clue or ends. Its parameters are `()`.
 
     Args:
         side: of the board.
         weight: of a broken rule, in nats.
     """
-    peers, cells, end = jnp.asarray(boards.peers(side), jnp.float32), side**2, side
+    peers, cells, end = jnp.asarray(boards.find_peers(side), jnp.float32), side**2, side
     mask = side + 1
 
     def encode(params: Params, context: Context) -> tuple[jax.Array, jax.Array]:
@@ -27,7 +26,7 @@ def rules(side: int, weight: float = 4.0) -> Energy:
         return jnp.asarray(board.digits), jnp.asarray(board.cell)  # [cells], 0 if open; the next
 
     def known(digits: jax.Array, cell: jax.Array, actions: jax.Array) -> jax.Array:
-        """Which digit is where, as a plan continues a board: `[cells, side]`, 0 where none is."""
+        """One-hot digits of a board that a plan continues: `[cells, side]`, 0 for empty cells."""
         places = cell + jnp.arange(actions.shape[0])
         planned = jnp.full(cells, mask).at[places].set(actions, mode="drop")
         return jax.nn.one_hot(jnp.where(digits > 0, digits - 1, planned), side)
@@ -41,7 +40,7 @@ def rules(side: int, weight: float = 4.0) -> Energy:
         del params
         digits, cell = board
         tokens = actions.at[positions].set(mask)
-        # Past the last cell nothing is written, so nothing breaks a rule.
+        # Positions after the last cell write no digit and break no rule.
         on_board = (cell + positions < cells)[:, None]
         places = jnp.minimum(cell + positions, cells - 1)
         broken = peers[places] @ known(digits, cell, tokens)  # [P, side]
