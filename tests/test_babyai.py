@@ -1,9 +1,9 @@
 """The real `main`, end to end at toy size, and what it says to wrong input."""
 
+import functools
 import json
 import shutil
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -27,11 +27,6 @@ LEVEL = "GoToLocalS7N5"
 DOMAIN = BABYAI.make(LEVEL, Settings())
 MINE = storage.name_dataset(DOMAIN, 6, 0)
 SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
-FIELDS = (
-    "experiment domain level method preset seed demos episodes successes mean_return mean_length "
-    "horizon iterations executed train_steps train_seconds eval_seconds plans_per_second params "
-    "versions date hash"
-).split()
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +37,6 @@ def workplace(toy_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield folder
-
-
-@pytest.fixture(scope="module")
-def planner(workplace):
-    """The planner of that run, loaded."""
-    return load(run_folder(workplace))
 
 
 @pytest.fixture(autouse=True)
@@ -65,24 +54,19 @@ def only_folder(runs):
     return folder
 
 
-def test_a_run_leaves_a_row_with_every_field(workplace):
+def test_a_run_leaves_a_row_a_training_curve_and_checkpoints(workplace):
     (row,) = results.read(workplace / "runs" / "babyai.jsonl")
-    assert set(FIELDS) <= row.keys()
     assert (row["domain"], row["level"], row["method"]) == ("babyai", LEVEL, "leap")
     assert row["preset"] == "leapjax" and row["demos"] == 6
-    assert row["episodes"] == 3 and 0 <= row["successes"] <= 3
-    assert 0 <= row["mean_return"] <= row["successes"] / 3
+    assert row["episodes"] == 3 and 0 <= row["mean_return"] <= row["successes"] / 3 <= 1
     assert row["iterations"] == 3 and row["horizon"] == 5 and row["train_steps"] == 4
     assert row["configuration"]["training"]["batch"] == 4
     assert not (workplace / "results").exists()
-
-
-def test_a_run_leaves_a_training_curve_and_checkpoints(workplace):
-    folder = run_folder(workplace)
-    metrics = read_metrics(folder)
+    metrics = read_metrics(run_folder(workplace))
     assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
-    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["4"]
-    assert not (folder / "plan.gif").exists()  # without --pictures
+    checkpoints = (run_folder(workplace) / "checkpoints").iterdir()
+    assert [path.name for path in checkpoints] == ["4"]
+    assert not (run_folder(workplace) / "plan.gif").exists()  # without --pictures
 
 
 def test_a_run_leaves_pictures(workplace):
@@ -100,7 +84,7 @@ def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
     assert babyai.main(arguments) == 0
     (before,) = results.read(workplace / "runs" / "babyai.jsonl")
     (after,) = results.read(workplace / "again" / "babyai.jsonl")
-    assert after["train_steps"] == 0 and after["train_seconds"] == 0
+    assert after["train_steps"] == after["train_seconds"] == 0
     for name in ("successes", "mean_length", "mean_return", "demos", "configuration"):
         assert after[name] == before[name], name
     assert after["hash"] != before["hash"]  # to train and to play are two rows
@@ -121,18 +105,16 @@ def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_pat
     for other in ("5", '{"seeds": 5}', '{"fingerprint": "0"}'):  # of an earlier version, or damaged
         (folder / "data.json").write_text(other)
         assert find_demonstrated(folder) == []
-    assert find_demonstrated(tmp_path / "nowhere") == []
 
 
-def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
+def test_a_checkpoint_brings_its_seed_and_leaves_pictures(workplace, tmp_path, capsys):
     folder = untrained_run(tmp_path / "random", "--method", "random", "--seeds", "2")
     arguments = ["--checkpoint", str(folder), "--episodes", "1", "--runs", str(tmp_path / "again")]
     assert babyai.main(arguments) == 0
     (row,) = results.read(tmp_path / "again" / "babyai.jsonl")
     assert row["seed"] == row["configuration"]["seed"] == 2 and row["method"] == "random"
-    pictures = only_folder(tmp_path / "again" / "evaluations")
-    names = {path.name for path in pictures.iterdir()}
-    assert names == {"iterations.png", "plan.gif", "episodes.csv"}
+    left = only_folder(tmp_path / "again" / "evaluations").iterdir()
+    assert {path.name for path in left} == {"iterations.png", "plan.gif", "episodes.csv"}
     capsys.readouterr()
     assert babyai.main([*arguments, "--seeds", "0"]) == 2
     assert "does not fit: seed is 2, not 0" in capsys.readouterr().err
@@ -143,9 +125,7 @@ def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace
     [
         ("--level", "GoToLocalS8N7", f"level is {LEVEL}, not GoToLocalS8N7"),
         ("--method", "classifier", "method is leap, not classifier"),
-        ("--demos", "5", "demos is 6, not 5"),
         ("--horizon", "4", "horizon is 5, not 4"),
-        ("--channels", "8", "channels is 4, not 8"),
         ("--steps", "5", "steps is 4, not 5"),
     ],
 )
@@ -159,14 +139,6 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
     assert not (tmp_path / "runs").exists()
 
 
-def plans(planner, count):
-    """Plans for the same state, each with a key of its own."""
-    adapter = BabyAIAdapter(LEVELS[LEVEL])
-    history = rollouts.History(adapter.reset(0), 0, adapter.num_actions)
-    contexts = rollouts.stack_contexts([history] * count)
-    return planner(plan_keys(0, np.arange(count), np.zeros(count)), contexts)
-
-
 def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
     arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", "twice"]
     assert babyai.main(arguments) == 0
@@ -176,29 +148,23 @@ def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
     assert len(results.read(workplace / "twice" / "babyai.jsonl")) == 1
 
 
-def test_a_loaded_planner_plans(planner):
+def test_a_loaded_planner_plans_what_its_horizon_and_grid_are(workplace):
+    planner = load(run_folder(workplace))
     adapter = BabyAIAdapter(LEVELS[LEVEL])
     histories = [rollouts.History(adapter.reset(s), 0, adapter.num_actions) for s in range(3)]
     plan = planner(plan_keys(0, np.arange(3), np.zeros(3)), rollouts.stack_contexts(histories))
     actions = np.asarray(plan.actions)
     assert actions.shape == (3, 5) and plan.trace.shape == (3, 3, 5)
-    assert actions.min() >= 0 and actions.max() < 7
-    assert (actions[:, 0] != 6).all()  # end is never first
-    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(planner.params))
-
-
-def test_a_planner_of_another_horizon_or_a_smaller_grid_is_refused(planner, workplace):
+    assert actions.min() >= 0 and actions.max() < 7 and (actions[:, 0] != 6).all()  # end is last
     with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
         load(run_folder(workplace), GibbsConfig(horizon=4))
-    large = LEVELS["GoToLocalS8N7"]
-    with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
-        rollouts.evaluate(
-            lambda: BabyAIAdapter(large), [0], planner.plan, planner.params, context=0
-        )
-    with pytest.raises(UserError, match=r"past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"):
-        rollouts.evaluate(
-            lambda: BabyAIAdapter(LEVELS[LEVEL]), [0], planner.plan, planner.params, context=2
-        )
+    for level, context, message in (
+        ("GoToLocalS8N7", 0, r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"),
+        (LEVEL, 2, r"past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"),
+    ):
+        make = functools.partial(BabyAIAdapter, LEVELS[level])
+        with pytest.raises(UserError, match=message):
+            rollouts.evaluate(make, [0], planner.plan, planner.params, context=context)
 
 
 def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
@@ -240,12 +206,10 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
         (["--method", "bcx"], "unknown method 'bcx': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
         (["--horizon", "50", "--resampled", "1"], "longer than any episode"),
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
-        (["--seeds", "-1"], "a training seed must be at least 0"),
         (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--demonstrations", MINE, "--demos", "7"], "fewer than 7: ask for 6"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
@@ -254,32 +218,31 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
 def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):
     assert babyai.main([*TOY_RUN, *arguments]) == 2
     error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1 and error.startswith("error: ")
+    assert message in error and error.count("\n") == 1 and error.startswith("error: ")
 
 
 def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_path, capsys):
     runs = tmp_path / "runs"
     arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", str(runs)]
+
+    def damage():
+        """Cuts every file of the checkpoint's arrays in half."""
+        for file in (only_folder(runs) / "checkpoints" / "4" / "default").rglob("*"):
+            if file.is_file():
+                file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
     assert babyai.main(arguments) == 0
-    folder, (before,) = only_folder(runs), results.read(runs / "babyai.jsonl")
-    damage(folder / "checkpoints" / "4")
+    (before,) = results.read(runs / "babyai.jsonl")
+    damage()
     assert babyai.main(arguments) == 0
     error = capsys.readouterr().err
     assert "checkpoints/4 is damaged" in error and "there is none before it" in error
     (after,) = results.read(runs / "babyai.jsonl")
     assert after["successes"] == before["successes"]
-    assert [m["step"] for m in read_metrics(folder)] == [4]
+    assert [m["step"] for m in read_metrics(only_folder(runs))] == [4]
+    damage()
     with pytest.raises(UserError, match="cannot be read"):
-        damage(folder / "checkpoints" / "4")
-        load(folder)
-
-
-def damage(checkpoint):
-    """Cuts every file of a checkpoint's arrays in half."""
-    for file in (checkpoint / "default").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        load(only_folder(runs))
 
 
 def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_path, capsys):
@@ -316,8 +279,7 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     monkeypatch.setattr(
         quality, "variants", lambda trained, most: {"trained": trained, "two": GibbsConfig(1, 2)}
     )
-    played = []
-    evaluate = rollouts.evaluate
+    played, evaluate = [], rollouts.evaluate
 
     def record(make_adapter, episode_seeds, *rest, **options):
         played.append(list(episode_seeds))
@@ -325,12 +287,10 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 
     monkeypatch.setattr(rollouts, "evaluate", record)
     rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
-    arguments = "--episodes 3 --batch 4 --seconds 0.01 --json".split()
     folder = str(untrained_run(tmp_path / "run", "--method", "random", "--iterations", "1"))
+    arguments = "--episodes 3 --batch 4 --seconds 0.01 --json".split()
     assert quality.main([folder, *arguments, str(rows), "--plot", str(plot)]) == 0
-    written = json.loads(rows.read_text())
-    assert [row["variant"] for row in written] == ["trained", "two"]
-    assert [row["iterations"] for row in written] == [1, 2]
-    assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
+    written = [(row["variant"], row["iterations"]) for row in json.loads(rows.read_text())]
+    assert written == [("trained", 1), ("two", 2)]
     assert played == [list(seeds.validation_seeds(0, 3))] * 2
     assert plot.stat().st_size > 1000
