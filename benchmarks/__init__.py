@@ -1,3 +1,3 @@
-"""Programs that measure speed. They begin as those of `experiments` do, before JAX is imported."""
+"""Programs that measure speed. `experiments` prepares the process before JAX is imported."""
 
 import experiments  # noqa: F401

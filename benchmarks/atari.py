@@ -1,9 +1,8 @@
-"""What playing and training cost on Atari: `python -m benchmarks.atari`.
+"""Measures playing and training on Atari: `python -m benchmarks.atari`.
 
-Training steps as `benchmarks.training` measures them; decisions per second for some games that are
-played together, by what they are made of: the games themselves, the encoder, and the iterations
-over the plan; states encoded per second, and what that is of the matrix-multiply peak measured in
-the same run, as for training.
+Playing: the milliseconds of a decision in each of several games, divided into emulator, encoder and
+planner, and the encoder's share of the matrix-multiply peak, measured in the same run. Training:
+steps, as `benchmarks.training` measures them.
 """
 
 import contextlib
@@ -44,25 +43,25 @@ class Options:
     """Measure training and playing."""
 
     games: tuple[str, ...] = ("Breakout",)
-    """Which games; they differ in their actions, and in how fast they are."""
+    """Games to play."""
     presets: tuple[str, ...] = ("leapjax", "paper")
-    """Which presets."""
+    """Presets to measure."""
     batches: tuple[int, ...] = GAMES_PLAYED
-    """Games that are played together."""
+    """Numbers of games played together."""
     training: bool = True
     """Measure training too."""
     consecutive: int = 16
-    """Windows in a row whose states preset `paper` encodes once; beside windows drawn alone."""
+    """Consecutive windows in an example of preset `paper`; also measures windows drawn alone."""
     json: Path | None = None
     """Write the rows of playing here."""
     training_json: Path | None = None
     """Write the rows of training here."""
     seconds: float = 3.0
-    """Time to spend on each measurement, at least."""
+    """Least time for each measurement."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints tables, and writes what was asked for."""
+    """Measures, prints tables, and writes the rows."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.atari", given)
     return shell.run_program("benchmarks.atari", given, lambda: run(options))
@@ -72,8 +71,8 @@ def run(options: Options) -> None:
     """Measures every game and preset.
 
     Raises:
-        UserError: rows are asked for of what is not measured, or cannot be written, or no games
-            are to be played.
+        UserError: no games to play, a file that cannot be written, or `training_json` without
+            `training`.
     """
     if any(batch < 1 for batch in options.batches):
         raise UserError(f"--batches {min(options.batches)}: at least one game must be played")
@@ -107,7 +106,7 @@ def run(options: Options) -> None:
 
 
 def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[Row]:
-    """One preset of one game, with so many games at a time."""
+    """Measures one preset of one game, for each number of games played together."""
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     energy = agent.energy
@@ -132,7 +131,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
         _, cache = plan(params, keys, contexts, None)
         first = time.perf_counter() - begun
         anew = planning = fastest(partial(plan, params, keys, contexts, None), seconds)
-        if cache is not None:  # as it is while playing
+        if cache is not None:  # as in play
             plan(params, keys, contexts, cache)
             planning = fastest(partial(plan, params, keys, contexts, cache), seconds)
         # On as many devices as the planner.
@@ -148,7 +147,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
                 "batch": batch,
                 "compile_seconds": first - anew,
                 "planning_seconds": planning,
-                "anew_seconds": anew,  # where nothing is known of past states
+                "anew_seconds": anew,  # without cached states
                 "encoding_seconds": fastest(encoding, seconds),
                 "playing_seconds": playing_seconds(domain, batch),
                 "encoding_flops": matmul_flops(encode, params, contexts, cache),
@@ -159,7 +158,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
 
 
 def playing_seconds(domain: Domain, batch: int) -> float:
-    """What one decision in each of some games takes the emulator."""
+    """Measures the emulator's seconds for one decision in each of several games."""
     with contextlib.ExitStack() as stack:
         adapters = [stack.enter_context(closing(domain.make_adapter())) for _ in range(batch)]
         for seed, adapter in enumerate(adapters):
@@ -176,7 +175,7 @@ def playing_seconds(domain: Domain, batch: int) -> float:
 
 
 def tables(rows: Sequence[Row]) -> tuple[Table, Table]:
-    """The rows for a terminal: what decisions take, in milliseconds, and what is encoded."""
+    """Makes a table of decisions: milliseconds, and states encoded."""
     taken = Table("game", "preset", "games", "ms", "planner", "of it encoder", "emulator", "per s")
     encoded = Table("game", "preset", "games", "past anew", "states/s", "GFLOP/s", "of the peak")
     for row in rows:

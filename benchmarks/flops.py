@@ -1,4 +1,4 @@
-"""The floating-point operations that a function needs: those of its matrix products."""
+"""Counts the floating-point operations of matrix products in a function."""
 
 import math
 from collections.abc import Callable
@@ -10,9 +10,9 @@ Jaxpr = Any  # JAX gives its programs no public type
 
 
 def matmul_flops(function: Callable[..., Any], *arguments: Any) -> float:
-    """Of one call on all its devices; what a scan repeats counts as often as it is repeated.
+    """Counts the operations of one call on all devices; a scan counts once for each repetition.
 
-    A product of `[n, k]` and `[k, m]` counts 2 n k m, a convolution what it would be as one.
+    A product of `[n, k]` and `[k, m]` counts 2 n k m, a convolution as the equivalent product.
 
     Args:
         function: to count, jitted or not; it is traced, not run.

@@ -1,7 +1,7 @@
-"""What a plan of each method costs: `python -m benchmarks.methods`.
+"""Measures a plan of each method: `python -m benchmarks.methods`.
 
-Speed does not depend on what a model has learned, so parameters are random. All methods take turns,
-and each keeps its fastest call: on a machine that is slow for a while, it is for all of them.
+Parameters are random, because speed does not depend on them. Methods take turns, and each keeps its
+fastest call, so that a slow spell of the machine affects all alike.
 """
 
 import dataclasses
@@ -36,15 +36,15 @@ class Options:
     batch: int = 256
     """Plans in one call."""
     rounds: int = 5
-    """How often each method has its turn."""
+    """Turns of each method."""
     seconds: float = 0.5
-    """Time to spend on each turn, at least."""
+    """Least time for each turn."""
     json: Path | None = None
     """Write the rows here."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes what was asked for."""
+    """Measures, prints a table, and writes the rows to `--json`."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.methods", given)
     return shell.run_program("benchmarks.methods", given, lambda: run(options))
@@ -80,7 +80,7 @@ def run(options: Options) -> None:
 
 
 def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
-    """A compiled call that makes plans for as many contexts as `batch` says."""
+    """Compiles a call that makes `batch` plans."""
     config = find_preset("babyai", level, method, "leapjax")
     energy, params, domain = untrained(config)
     planner = compile_planner(energy, config.planner)
@@ -93,7 +93,7 @@ def make_call(level: str, method: str, batch: int) -> Callable[[], object]:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Makes a table of the rows for a terminal."""
     result = Table("method", "plans/s", "ms per plan")
     for row in rows:
         speed = row["plans_per_second"]

@@ -1,9 +1,8 @@
 """Plans per second against this machine's limit: `python -m benchmarks.planning --quick`.
 
-Speed does not depend on what a model has learned, so parameters are random. Compilation is
-timed apart; every figure is the best of several runs. FLOPs are those of all matrix products of
-a plan, the encoders' included, set against the matrix-multiply peak measured in the same run on
-the shapes of a transformer layer.
+Parameters are random, because speed does not depend on them. Compilation is timed apart; every
+figure is the best of several runs. FLOPs count all matrix products of a plan and its encoder. The
+peak is measured in the same run, on the shapes of a transformer layer.
 """
 
 import dataclasses
@@ -51,9 +50,9 @@ class Options:
     quick: bool = False
     """Only the first level, (T, N) = (5, 10), at batch 1 and 256."""
     batches: tuple[int, ...] = BATCHES
-    """Plans at a time."""
+    """Plans in a call."""
     chunks: tuple[int, ...] = CHUNK_SIZES
-    """What they are cut into; a GPU wants larger ones than a core's cache."""
+    """Chunks that a batch is cut into; a GPU wants larger ones than a core."""
     large: int = 0
     """Also plan so many contexts of the last level in one call, and report the memory it took."""
     json: Path | None = None
@@ -61,11 +60,11 @@ class Options:
     plot: Path | None = None
     """Draw plans per second and fraction of peak against batch size here."""
     seconds: float = 1.0
-    """Time to spend on each measurement, at least."""
+    """Least time for each measurement."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes what was asked for."""
+    """Measures, prints a table, and writes the rows to `--json`."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.planning", given)
     return shell.run_program("benchmarks.planning", given, lambda: run(options))
@@ -75,7 +74,7 @@ def run(options: Options) -> None:
     """Measures both presets on every level.
 
     Raises:
-        UserError: what was asked for cannot be written, or is less than nothing.
+        UserError: a file that cannot be written, or a size below its minimum.
     """
     if options.plot is not None:
         plots.check_figure(options.plot)
@@ -111,7 +110,7 @@ def measure(
     seconds: float,
     chunks: Sequence[int],
 ) -> list[Row]:
-    """One preset and level at every batch size."""
+    """Measures one preset and level at every batch size."""
     model, horizon = find_preset("babyai", level.name, "leap", name).model, level.horizon
     search = GibbsConfig(horizon, level.iterations)
     energy, params, domain = make_energy(name, level)
@@ -154,7 +153,7 @@ def measure(
 
 
 def compare_with_peak(rows: Sequence[Row]) -> None:
-    """Adds `fraction_of_peak`: of the best that was seen of the products of that shape."""
+    """Adds `fraction_of_peak`, of the best peak measured for the row's shapes."""
     peaks: dict[int, float] = {}
     for row in rows:
         peaks[row["tokens"]] = max(row["peak_gflops"], peaks.get(row["tokens"], 0.0))
@@ -177,7 +176,7 @@ def untrained(config: AnyConfig) -> tuple[Energy, Params, Domain]:
 
 
 def plan_many(name: str, level: Level, count: int) -> str:
-    """Plans for very many contexts at once, and says what it took."""
+    """Plans for very many contexts in one call; prints time and memory."""
     energy, params, domain = make_energy(name, level)
     planner = compile_planner(energy, GibbsConfig(level.horizon, level.iterations))
     contexts = random_contexts(domain, level.context, count)
@@ -215,7 +214,7 @@ def random_contexts(domain: Domain, length: int, batch: int) -> Any:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Makes a table of the rows for a terminal."""
     result = Table("preset", "T, N", "batch", "compile s", "plans/s", "GFLOP/s", "peak", "fraction")
     for row in rows:
         result.add_row(

@@ -1,4 +1,4 @@
-"""What each way to search costs and gives: `python -m benchmarks.quality runs/RUN`.
+"""Measures success and speed of search settings: `python -m benchmarks.quality runs/RUN`.
 
 Success on validation levels (never on test levels) against plans per second, for
 trained planners and many search settings. Speed is measured at one batch of contexts, the
@@ -41,7 +41,7 @@ class Options:
     """Measure success and speed of search settings."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of runs, or levels for which a planner comes with the library."""
+    """Folders of runs, or levels of published planners."""
     episodes: int = 500
     """Validation episodes for each setting."""
     batch: int = 256
@@ -55,7 +55,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures every setting, prints a table, and writes what was asked for."""
+    """Measures every setting, prints a table, and writes the rows to `--json`."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.quality", given)
     return shell.run_program("benchmarks.quality", given, lambda: run(options))
@@ -97,7 +97,7 @@ def run(options: Options) -> None:
 
 
 def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:
-    """Search settings to compare, by what to call them; the paper's N is `most`."""
+    """Makes the search settings to compare, by title; `most` is the paper's N."""
     horizon = trained.horizon
 
     def search(**options: Any) -> GibbsConfig:
@@ -124,7 +124,7 @@ def variants(trained: GibbsConfig, most: int) -> dict[str, GibbsConfig]:
 
 
 def measure(options: Options, path: Path, name: str, config: GibbsConfig) -> Row:
-    """Success and speed of one setting."""
+    """Measures success and speed of one setting."""
     planner = pretrained.load(path, config)
     specification = planner.specification
     domain, context = pretrained.make_domain(specification), specification.context
@@ -162,7 +162,7 @@ def measure(options: Options, path: Path, name: str, config: GibbsConfig) -> Row
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Makes a table of the rows for a terminal."""
     result = Table("level", "search", "success", "95% interval", "plans/s", "authors' code x")
     for row in rows:
         low, high = wilson_interval(row["successes"], row["episodes"])

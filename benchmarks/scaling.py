@@ -1,8 +1,8 @@
 """Weak scaling of training over devices and processes: `python -m benchmarks.scaling`.
 
-Each device has as many windows per step however many devices there are. A setting is measured
-in processes of its own, because JAX fixes its devices when it starts. Virtual devices beyond
-the cores of the machine cannot be faster; what they show is what splitting costs.
+Each device takes the same number of windows per step. A setting runs in processes of its own,
+because JAX fixes its devices when it starts. More virtual devices than cores show only the cost of
+splitting.
 """
 
 import dataclasses
@@ -39,27 +39,27 @@ class Options:
     """Measure weak scaling."""
 
     level: str = "GoToLocalS7N5"
-    """Whose settings of preset `leapjax` to measure."""
+    """Level to train on, with preset `leapjax`."""
     per_device: int = 32
     """Windows per device and step."""
     seconds: float = 5.0
-    """Time to spend on each measurement, at least."""
+    """Least time for each measurement."""
     json: Path | None = None
     """Write the rows here."""
     worker: bool = False
-    """Measure in this process, on the devices that there are, and print the row."""
+    """Measure in this process, on its devices, and print the row."""
     cluster: Annotated[Cluster, tyro.conf.arg(name="")] = Cluster()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures every setting, prints a table, and writes what was asked for."""
+    """Measures every setting, prints a table, and writes the rows to `--json`."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.scaling", given)
     return shell.run_program("benchmarks.scaling", given, lambda: run(options, given))
 
 
 def run(options: Options, arguments: list[str]) -> None:
-    """Measures every setting, or the one of this process."""
+    """Measures every setting, or with `worker` this process's setting."""
     find_preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
     check_writable(options.json)
     if options.worker:
@@ -74,10 +74,10 @@ def run(options: Options, arguments: list[str]) -> None:
 
 
 def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
-    """The row of one setting, from processes of its own.
+    """Measures one setting in processes of its own; returns its row.
 
     Raises:
-        UserError: one of them failed.
+        UserError: a process failed.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -107,14 +107,14 @@ def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
 
 
 def measure(options: Options) -> Row:
-    """One setting, on all devices of all processes."""
+    """Measures one setting on all devices of all processes."""
     config = find_preset("babyai", options.level, "leap", "leapjax")
     batch = options.per_device * jax.device_count()
     chosen = dataclasses.replace(config.training, batch=batch)
     mesh = sharding.make_mesh(batch, jax.devices(), options.cluster.fsdp)
     advance = Stepper(dataclasses.replace(config, training=chosen), mesh)
 
-    # Every process must do as many steps, so none may decide by its own clock.
+    # All processes must take the same number of steps: the slowest clock decides.
     for _ in range(3):
         jax.block_until_ready(advance())
     repeats = max(processes.gather(int(options.seconds / fastest(advance, 0) / 5) + 1))
@@ -138,7 +138,7 @@ def measure(options: Options) -> Row:
 
 
 def exchange(params: Any, mesh: jax.sharding.Mesh) -> Any:
-    """The communication of one step, alone: parameters gathered, gradients averaged."""
+    """Compiles the communication of one step: gather parameters, average gradients."""
     specs = sharding.parameter_specs(params, mesh)
 
     def on_each_device(parts: Any) -> Any:
@@ -152,7 +152,7 @@ def exchange(params: Any, mesh: jax.sharding.Mesh) -> Any:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Makes a table of the rows for a terminal."""
     result = Table(
         "processes", "devices", "fsdp", "ms/step", "examples/s", "of two devices", "exchange (ms)"
     )

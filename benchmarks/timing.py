@@ -1,4 +1,4 @@
-"""How long something takes, and how long it could take at best on this machine."""
+"""Times calls, and measures this machine's matrix-multiply peak."""
 
 import functools
 import json
@@ -19,7 +19,7 @@ Row = dict[str, Any]  # one measurement, as JSON values
 
 
 def fastest(run: Callable[[], Any], seconds: float) -> float:
-    """The shortest of several runs, in seconds."""
+    """Returns the seconds of the fastest of several runs."""
     best, spent = float("inf"), 0.0
     while spent < seconds or best == float("inf"):
         begun = time.perf_counter()
@@ -30,10 +30,10 @@ def fastest(run: Callable[[], Any], seconds: float) -> float:
 
 
 def matmul_peak(tokens: int, width: int, seconds: float) -> float:
-    """GFLOP/s of the matrix products of one transformer layer, one after the other, no more.
+    """Measures the GFLOP/s of one transformer layer's matrix products, one after the other.
 
-    Four of `[tokens, width]` by `[width, width]`, then to `4 width` and back: the better of
-    all cores on one product at a time, and the tokens split over the devices.
+    Four products of `[tokens, width]` by `[width, width]`, then one to `4 width` and one back.
+    Returns the better of two ways: all cores on one product, or the tokens split over devices.
     """
     devices = len(jax.local_devices())
     tokens = -(-tokens // devices) * devices  # so that they can be split
@@ -45,7 +45,7 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
     repeats = max(1, int(2e9 / flops))  # hides the dispatch
 
     def multiply(_: None, weights: list[jax.Array], x: jax.Array) -> jax.Array:
-        # Each product needs the one before, so none can be left out.
+        # Each product needs the last one, so XLA cannot leave it out.
         def layer(_: int, y: jax.Array) -> jax.Array:
             return functools.reduce(jnp.matmul, weights, y)
 
@@ -63,10 +63,10 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Refuses files that could not be written at the end.
+    """Checks, before any measurement, that files can be written.
 
     Raises:
-        UserError: says which folder nothing can be written to.
+        UserError: names the folder that cannot be written to.
     """
     for path in paths:
         if path is not None:
@@ -74,7 +74,7 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def write_rows(path: Path | None, rows: Sequence[Row]) -> None:
-    """Writes the rows where `--json` asked for them, with what they were made with."""
+    """Writes rows as JSON, each with the date and versions."""
     if path is not None:
         made = {"date": results.format_date(), "versions": results.find_versions()}
         files.write_text(path, json.dumps([{**row, **made} for row in rows], indent=1) + "\n")

@@ -1,10 +1,9 @@
 """Training steps per second against this machine's limit: `python -m benchmarks.training`.
 
-The steps are those of the main job: a batch is drawn and augmented, the gradient taken, the
-parameters updated. What is in the grids does not change the speed, so they are random.
-Compilation is timed apart. FLOPs are those of the matrix products of one step, set against the
-matrix-multiply peak measured in the same run. The parts of a step are compiled alone: what
-they leave of it is the exchange between devices, and what they cost each other.
+A step draws and augments a batch, takes the gradient and updates the parameters, as the main job
+does. Grids are random, because speed does not depend on them. Compilation is timed apart. FLOPs
+count the matrix products of a step; the peak is measured in the same run. The parts of a step are
+compiled alone, so their sum leaves out the exchange between devices.
 """
 
 import dataclasses
@@ -43,20 +42,19 @@ class Options:
     """Measure training."""
 
     levels: tuple[str, ...] = LEVELS
-    """Whose settings to measure: horizon, context, grid."""
+    """Levels to measure."""
     presets: tuple[str, ...] = ("leapjax", "paper")
-    """Which presets."""
+    """Presets to measure."""
     microbatch: int | None = None
-    """Windows whose loss a device takes at a time, 0 for all; None: as the preset says, which
-    fits a core's cache."""
+    """Windows whose loss a device computes at a time, 0 for all; default: the preset's."""
     json: Path | None = None
     """Write the rows here."""
     seconds: float = 3.0
-    """Time to spend on each measurement, at least."""
+    """Least time for each measurement."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes what was asked for."""
+    """Measures, prints a table, and writes the rows to `--json`."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.training", given)
     return shell.run_program("benchmarks.training", given, lambda: run(options))
@@ -200,7 +198,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
         "consecutive": windows,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
-        "parts": step.parts(mesh, seconds) if windows == 1 else [],  # those of runs are shared
+        "parts": step.parts(mesh, seconds) if windows == 1 else [],  # of windows drawn alone
         "flops_per_step": flops,
         "gflops": flops / taken / 1e9,
         "peak_gflops": peak,
@@ -211,7 +209,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
 
 
 def random_steps(domain: Domain) -> Steps:
-    """Demonstrations of the right shapes, of nothing in particular."""
+    """Makes random demonstrations of the right shapes."""
     states = random_contexts(domain, 0, LENGTH + 1).observation
     choose = np.random.default_rng(0)
     played = [
@@ -225,7 +223,7 @@ def random_steps(domain: Domain) -> Steps:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal."""
+    """Makes a table of the rows for a terminal."""
     result = Table("level", "preset", "steps/s", "ms/step", "GFLOP/s", "peak", "fraction", "in all")
     for row in rows:
         result.add_row(

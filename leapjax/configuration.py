@@ -17,7 +17,7 @@ from leapjax.data.seeds import UNSEEN
 from leapjax.domain import Domain
 from leapjax.domains import find_domain, make_level
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.pretrained import GROUPS, Origin, Specification
 from leapjax.processes import Cluster
 

@@ -19,8 +19,8 @@ from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_pla
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from leapjax.models.config import ModelConfig
     from leapjax.models.encoder import Encoder
-    from leapjax.models.trajectory import ModelConfig
 
 EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
 Encoders = Mapping[str, EncoderMaker]  # by architecture

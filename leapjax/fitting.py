@@ -16,7 +16,7 @@ from leapjax.domain import Domain, apply_statistics, measure_statistics
 from leapjax.domains import make_level
 from leapjax.errors import UserError
 from leapjax.methods import find_method, learns_from_rewards
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.presets import find_preset
 from leapjax.pretrained import Origin, Pretrained, Specification

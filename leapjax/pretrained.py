@@ -25,7 +25,7 @@ from leapjax.errors import UserError, first_line
 from leapjax.extras import report_missing
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import PlannerConfig
 from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 

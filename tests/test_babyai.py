@@ -1,9 +1,9 @@
 """The real `main`, end to end at toy size, and what it says to wrong input."""
 
+import functools
 import json
 import shutil
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -27,11 +27,6 @@ LEVEL = "GoToLocalS7N5"
 DOMAIN = BABYAI.make(LEVEL, Settings())
 MINE = storage.name_dataset(DOMAIN, 6, 0)
 SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
-FIELDS = (
-    "experiment domain level method preset seed demos episodes successes mean_return mean_length "
-    "horizon iterations executed train_steps train_seconds eval_seconds plans_per_second params "
-    "versions date hash"
-).split()
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +37,6 @@ def workplace(toy_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield folder
-
-
-@pytest.fixture(scope="module")
-def planner(workplace):
-    """The planner of that run, loaded."""
-    return load(run_folder(workplace))
 
 
 @pytest.fixture(autouse=True)
@@ -65,19 +54,14 @@ def only_folder(runs):
     return folder
 
 
-def test_a_run_leaves_a_row_with_every_field(workplace):
+def test_a_run_leaves_a_row_a_training_curve_and_checkpoints(workplace):
     (row,) = results.read(workplace / "runs" / "babyai.jsonl")
-    assert set(FIELDS) <= row.keys()
     assert (row["domain"], row["level"], row["method"]) == ("babyai", LEVEL, "leap")
     assert row["preset"] == "leapjax" and row["demos"] == 6
-    assert row["episodes"] == 3 and 0 <= row["successes"] <= 3
-    assert 0 <= row["mean_return"] <= row["successes"] / 3
+    assert row["episodes"] == 3 and 0 <= row["mean_return"] <= row["successes"] / 3 <= 1
     assert row["iterations"] == 3 and row["horizon"] == 5 and row["train_steps"] == 4
     assert row["configuration"]["training"]["batch"] == 4
     assert not (workplace / "results").exists()
-
-
-def test_a_run_leaves_a_training_curve_and_checkpoints(workplace):
     folder = run_folder(workplace)
     metrics = read_metrics(folder)
     assert metrics[-1]["step"] == 4 and np.isfinite(metrics[-1]["loss"])
@@ -95,8 +79,9 @@ def test_a_run_leaves_pictures(workplace):
 
 
 def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
-    arguments = ["--checkpoint", str(run_folder(workplace)), "--episodes", "3", "--no-pictures"]
-    arguments += ["--runs", "again"]
+    arguments = (
+        f"--checkpoint {run_folder(workplace)} --episodes 3 --no-pictures --runs again".split()
+    )
     assert babyai.main(arguments) == 0
     (before,) = results.read(workplace / "runs" / "babyai.jsonl")
     (after,) = results.read(workplace / "again" / "babyai.jsonl")
@@ -118,10 +103,8 @@ def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_pat
     assert len(noted["seeds"]) > 3
     assert babyai.main([*arguments, "--test-seed", "5"]) == 2
     assert "level seed 7 is both a demonstration and a test episode" in capsys.readouterr().err
-    for other in ("5", '{"seeds": 5}', '{"fingerprint": "0"}'):  # of an earlier version, or damaged
-        (folder / "data.json").write_text(other)
-        assert find_demonstrated(folder) == []
-    assert find_demonstrated(tmp_path / "nowhere") == []
+    (folder / "data.json").write_text('{"fingerprint": "0"}')  # of an earlier version
+    assert find_demonstrated(folder) == []
 
 
 def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
@@ -142,11 +125,8 @@ def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace
     ("option", "value", "message"),
     [
         ("--level", "GoToLocalS8N7", f"level is {LEVEL}, not GoToLocalS8N7"),
-        ("--method", "classifier", "method is leap, not classifier"),
-        ("--demos", "5", "demos is 6, not 5"),
         ("--horizon", "4", "horizon is 5, not 4"),
         ("--channels", "8", "channels is 4, not 8"),
-        ("--steps", "5", "steps is 4, not 5"),
     ],
 )
 def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
@@ -159,46 +139,23 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
     assert not (tmp_path / "runs").exists()
 
 
-def plans(planner, count):
-    """Plans for the same state, each with a key of its own."""
-    adapter = BabyAIAdapter(LEVELS[LEVEL])
-    history = rollouts.History(adapter.reset(0), 0, adapter.num_actions)
-    contexts = rollouts.stack_contexts([history] * count)
-    return planner(plan_keys(0, np.arange(count), np.zeros(count)), contexts)
-
-
-def test_the_same_configuration_continues_and_keeps_one_row(workplace, capsys):
-    arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", "twice"]
-    assert babyai.main(arguments) == 0
-    capsys.readouterr()
-    assert babyai.main(arguments) == 0
-    assert "continuing at step 4 of 4" in capsys.readouterr().out
-    assert len(results.read(workplace / "twice" / "babyai.jsonl")) == 1
-
-
-def test_a_loaded_planner_plans(planner):
-    adapter = BabyAIAdapter(LEVELS[LEVEL])
+def test_a_loaded_planner_plans_as_far_and_as_large_as_it_was_trained_to(workplace):
+    planner, adapter = load(run_folder(workplace)), BabyAIAdapter(LEVELS[LEVEL])
     histories = [rollouts.History(adapter.reset(s), 0, adapter.num_actions) for s in range(3)]
     plan = planner(plan_keys(0, np.arange(3), np.zeros(3)), rollouts.stack_contexts(histories))
     actions = np.asarray(plan.actions)
     assert actions.shape == (3, 5) and plan.trace.shape == (3, 3, 5)
     assert actions.min() >= 0 and actions.max() < 7
     assert (actions[:, 0] != 6).all()  # end is never first
-    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(planner.params))
-
-
-def test_a_planner_of_another_horizon_or_a_smaller_grid_is_refused(planner, workplace):
     with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
         load(run_folder(workplace), GibbsConfig(horizon=4))
-    large = LEVELS["GoToLocalS8N7"]
-    with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
-        rollouts.evaluate(
-            lambda: BabyAIAdapter(large), [0], planner.plan, planner.params, context=0
-        )
-    with pytest.raises(UserError, match=r"past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"):
-        rollouts.evaluate(
-            lambda: BabyAIAdapter(LEVELS[LEVEL]), [0], planner.plan, planner.params, context=2
-        )
+    for level, context, message in (
+        ("GoToLocalS8N7", 0, r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"),
+        (LEVEL, 2, r"past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"),
+    ):
+        make_adapter = functools.partial(BabyAIAdapter, LEVELS[level])
+        with pytest.raises(UserError, match=message):
+            rollouts.evaluate(make_adapter, [0], planner.plan, planner.params, context=context)
 
 
 def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
@@ -240,13 +197,10 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
         (["--method", "bcx"], "unknown method 'bcx': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
-        (["--episodes", "0"], "--episodes must be at least 1"),
         (["--horizon", "50", "--resampled", "1"], "longer than any episode"),
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
-        (["--seeds", "-1"], "a training seed must be at least 0"),
-        (["--demonstrations", "nobody/nothing-v0"], "no Minari data set"),
         (["--demonstrations", MINE, "--demos", "7"], "fewer than 7: ask for 6"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
     ],
@@ -305,32 +259,26 @@ def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, cap
 def test_a_data_set_of_the_users_own_is_trained_on(workplace):
     arguments = ["--steps", "1", "--demos", "6", "--demonstrations", MINE, "--runs", "mine"]
     assert babyai.main([*RANDOM, *arguments]) == 0
-    found, expected = (
-        json.loads((folder / "data.json").read_text())
-        for folder in (only_folder(workplace / "mine"), run_folder(workplace))
-    )
+    folders = only_folder(workplace / "mine"), run_folder(workplace)
+    found, expected = (json.loads((folder / "data.json").read_text()) for folder in folders)
     assert found == expected
 
 
 def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        quality, "variants", lambda trained, most: {"trained": trained, "two": GibbsConfig(1, 2)}
-    )
-    played = []
-    evaluate = rollouts.evaluate
+    kinds = {"one": GibbsConfig(1, 1), "two": GibbsConfig(1, 2)}
+    monkeypatch.setattr(quality, "variants", lambda trained, most: kinds)
+    played, evaluate = [], rollouts.evaluate
 
     def record(make_adapter, episode_seeds, *rest, **options):
         played.append(list(episode_seeds))
         return evaluate(make_adapter, episode_seeds, *rest, **options)
 
     monkeypatch.setattr(rollouts, "evaluate", record)
-    rows, plot = tmp_path / "rows.json", tmp_path / "plot.png"
-    arguments = "--episodes 3 --batch 4 --seconds 0.01 --json".split()
-    folder = str(untrained_run(tmp_path / "run", "--method", "random", "--iterations", "1"))
-    assert quality.main([folder, *arguments, str(rows), "--plot", str(plot)]) == 0
-    written = json.loads(rows.read_text())
-    assert [row["variant"] for row in written] == ["trained", "two"]
-    assert [row["iterations"] for row in written] == [1, 2]
+    folder = untrained_run(tmp_path / "run", "--method", "random")
+    options = f"--episodes 3 --batch 4 --seconds 0.01 --plot {tmp_path}/plot.png --json"
+    assert quality.main([str(folder), *options.split(), str(tmp_path / "rows.json")]) == 0
+    written = json.loads((tmp_path / "rows.json").read_text())
+    assert [(row["variant"], row["iterations"]) for row in written] == [("one", 1), ("two", 2)]
     assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
     assert played == [list(seeds.validation_seeds(0, 3))] * 2
-    assert plot.stat().st_size > 1000
+    assert (tmp_path / "plot.png").stat().st_size > 1000

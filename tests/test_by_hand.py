@@ -16,7 +16,7 @@ import pytest
 from leapjax.agents import bc, bcq, classifier, cql, iql, mopo, plate, qr_dqn, rem
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.data import windows
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from tests import mixed, toy
 from tests.parameters import random_like
 from tests.programs import only_long

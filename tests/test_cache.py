@@ -13,7 +13,7 @@ from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domain import Domain, blank_context
 from leapjax.domains import find_domain
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.rollouts import History
 from tests.parameters import random_parameters

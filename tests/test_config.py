@@ -20,7 +20,7 @@ from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 from leapjax.presets import babyai, find_preset
 from leapjax.running import command_line, memory, shell

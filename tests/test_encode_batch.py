@@ -12,8 +12,8 @@ from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domains.babyai import repeats
 from leapjax.domains.babyai.encoders import state_tokens
 from leapjax.methods import find_method
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from tests import mixed
 from tests.parameters import random_state
 from tests.programs import only_long

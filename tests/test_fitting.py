@@ -12,7 +12,7 @@ from leapjax import fitting, pretrained
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import specify
 from leapjax.domain import Demonstrations
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.presets import find_preset
 from tests import frozen_lake
 from tests.parameters import make_begin

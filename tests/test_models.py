@@ -13,7 +13,9 @@ from leapjax.domains.babyai.encoders.state_tokens import StateTokens
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.energy import pseudo_likelihood
-from leapjax.models.trajectory import ARCHITECTURES, ModelConfig, SequenceClassifier, Sizes, build
+from leapjax.models.config import ARCHITECTURES, ModelConfig, Sizes
+from leapjax.models.lstm import SequenceClassifier
+from leapjax.models.masked import build_masked_model
 from leapjax.models.transformer import causal_mask
 from leapjax.types import Context, mask_token, pad_token
 from tests import mixed
@@ -54,7 +56,7 @@ def model(architecture, past):
     `evaluate(params, context, actions, position)` compiles once and returns the logits at all
     positions and at one alone, the conditional energies at one position, and the total energy.
     """
-    module = make(build, architecture, past)
+    module = make(build_masked_model, architecture, past)
 
     def encode(params, context):
         return module.apply(params, context, method="encode")
@@ -312,7 +314,7 @@ def test_turning_the_whole_world_changes_no_logits(goal):
 def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
     params, _ = model(architecture, 2)
     context, actions = random_context(0, 2), np.zeros(HORIZON, np.int32)
-    module = make(build, architecture, 2, "bfloat16")
+    module = make(build_masked_model, architecture, 2, "bfloat16")
     init = functools.partial(module.init, method=everything)
     shapes = jax.eval_shape(init, jax.random.key(0), context, actions)
     assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
@@ -335,7 +337,7 @@ def test_with_causal_attention_no_action_sees_a_later_one(architecture):
     for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
         config = ModelConfig(architecture, 2, 2, 16, attention=attention)
         encoder = mixed.DOMAIN.encoders[architecture](config, 1)
-        module = build(config, Sizes(4, 1, HORIZON, 9), encoder)
+        module = build_masked_model(config, Sizes(4, 1, HORIZON, 9), encoder)
         apply = functools.partial(module.apply, method=everything)
         init = functools.partial(module.init, method=everything)
         params = scaled_like(jax.eval_shape(init, jax.random.key(0), context, nothing))
@@ -355,7 +357,9 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     """The paper's network, conditioned on returns; with full attention it keeps all tokens."""
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), past)
     configs = [ModelConfig("paper", 2, 2, 16, attention=each) for each in ("causal", "full")]
-    module, full = (build(each, Sizes(4, past, HORIZON, 9), encoder, True) for each in configs)
+    module, full = (
+        build_masked_model(each, Sizes(4, past, HORIZON, 9), encoder, True) for each in configs
+    )
     context = jax.tree.map(lambda leaf: np.asarray(leaf)[0], mixed.contexts(past))
     returns = np.arange(past + 1, dtype=np.float32)
     actions, positions = np.array([1, mask_token(4), 2]), np.array([2, 0])
@@ -385,7 +389,9 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
     """The current one, as equation 4 has it; or what does not depend on where the agent is."""
     encoder = StateTokens(SIDE, 16)
     sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
-    module = build(ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state)
+    module = build_masked_model(
+        ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state
+    )
     here = random_context(0, past)
     initialise = functools.partial(module.init, method=everything)
     params = scaled_like(jax.eval_shape(initialise, jax.random.key(0), here, EVERYWHERE))
@@ -428,7 +434,9 @@ def judge(module, context, actions):
     return module.degree(module.encode(context), actions)
 
 
-@pytest.mark.parametrize(("kind", "method"), [(build, everything), (SequenceClassifier, judge)])
+@pytest.mark.parametrize(
+    ("kind", "method"), [(build_masked_model, everything), (SequenceClassifier, judge)]
+)
 @EACH_ARCHITECTURE
 def test_plans_of_another_length_are_refused(kind, method, architecture):
     init = functools.partial(make(kind, architecture, 0).init, method=method)

@@ -11,7 +11,7 @@ from leapjax.agents import plate
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.batching import compile_planner
 from leapjax.data import windows
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig
 from tests import mixed, toy
 from tests.parameters import random_parameters

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.models.policy import PolicyModel
-from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.types import Context, pad_token
 from tests.parameters import random_like
 from tests.quick import quick_jit

@@ -12,7 +12,7 @@ from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, retur
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.domain import Scaling
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
 from tests.programs import only_long

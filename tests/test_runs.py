@@ -16,8 +16,8 @@ from leapjax.data import windows
 from leapjax.domain import Augmentations
 from leapjax.domains.babyai.encoders import state_tokens as babyai
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from tests import toy
 from tests.parameters import random_state
 from tests.programs import only_long

@@ -14,7 +14,7 @@ from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.running import results
 from tests.programs import only_long, toy_row
 

@@ -16,7 +16,7 @@ from leapjax.domains.puzzles.stars.domain import Settings, make
 from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
 from leapjax.errors import UserError
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.types import pad_token

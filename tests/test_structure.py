@@ -14,7 +14,7 @@ import leapjax
 from experiments import report
 from leapjax import types
 from leapjax.agents.base import TrainingConfig
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.running import jax_setup, results
 from tests.programs import LONG, ROOT
 

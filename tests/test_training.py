@@ -18,7 +18,7 @@ from leapjax.agents.update import make_update
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import Augmentations, blank_context
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy

@@ -12,9 +12,9 @@ from leapjax.checks import check_at_least, check_types, check_within
 from leapjax.data import windows
 from leapjax.domain import Domain
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.models.policy import PolicyModel
-from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.planners import GibbsConfig
 from leapjax.types import Agent, Energy, PyTree, TrainState
 

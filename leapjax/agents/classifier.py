@@ -17,7 +17,7 @@ from leapjax.agents.batches import window_batches
 from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.update import make_init, make_update
 from leapjax.energy import classifier
-from leapjax.models.trajectory import SequenceClassifier
+from leapjax.models.lstm import SequenceClassifier
 from leapjax.types import Agent, Context, Params, PyTree, Window
 
 

@@ -18,8 +18,7 @@ from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood
 from leapjax.errors import UserError
-from leapjax.models import trajectory
-from leapjax.models.trajectory import Model
+from leapjax.models.masked import MaskedModel, build_masked_model
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
 
 
@@ -60,7 +59,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """
     sizes, masking = setup.sizes, setup.settings.masking
     conditioned = setup.settings.returns
-    module = trajectory.build(
+    module = build_masked_model(
         setup.model, sizes, setup.make_encoder(), conditioned, setup.settings.repeat_state
     )
     to_go = returns.condition_on_target(setup) if conditioned else returns.omit_returns
@@ -162,7 +161,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     update = make_update(mean_loss, optimizer, mesh)
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
-    def touch(module: Model, context: Context, actions: jax.Array) -> jax.Array:
+    def touch(module: MaskedModel, context: Context, actions: jax.Array) -> jax.Array:
         memory: PyTree = module.encode(context, returns=to_go(context))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 

@@ -19,7 +19,7 @@ from leapjax.data import windows
 from leapjax.energy import autoregressive
 from leapjax.errors import UserError
 from leapjax.models.alternating import AlternatingModel
-from leapjax.models.trajectory import MOST_LAYERS
+from leapjax.models.config import MOST_LAYERS
 from leapjax.planners import BeamConfig
 from leapjax.types import Agent, Context, Params, PyTree, Window
 

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.data import windows
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig, Sizes, check_plan, forbid_early_end
+from leapjax.models.plans import check_plan, forbid_early_end
 from leapjax.models.transformer import (
     KeysValues,
     Transformer,

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.data import windows
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig, Sizes
 from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
 

@@ -8,7 +8,7 @@ from leapjax.agents import leap
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import AnyConfig, Config
 from leapjax.methods import find_method
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
 
 UNTRAINED = ("random", "rules")  # these methods learn nothing

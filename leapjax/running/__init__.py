@@ -1,1 +1,1 @@
-"""What a run of one's own needs: its command line, data, training, evaluation and record."""
+"""Runs a configuration: command line, data, training, evaluation and record."""

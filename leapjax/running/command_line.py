@@ -25,8 +25,7 @@ class Choice:
     """The options of a command line that decide the defaults of all others, and of --help.
 
     Attributes:
-        level: name or id of a level, or "all"; None if the command line names none. All fields
-            below are None in the same way.
+        level: name or id of a level, or "all". A field is None if the command line lacks it.
         method: names of methods.
         preset: name of a preset.
         checkpoint: folder of a trained planner.
@@ -74,7 +73,7 @@ def parse(
             shown = f"{module} --method {method}" if methods else module
             config = override(default, others, shown)
             if methods and len(methods) > 1 and not default.training.steps:
-                config = change(config, training={"steps": 0})  # --steps is for those that learn
+                config = change(config, training={"steps": 0})  # this method does not learn
             check(config)
             configs.append(config)
     return configs
@@ -105,7 +104,7 @@ def choose(kind: type[AnyConfig], arguments: Sequence[str]) -> tuple[Choice, lis
 
 
 def choose_levels(domain: str, choice: Choice, data: Described) -> Sequence[str]:
-    """Returns the levels to run: the named ones, or that of the checkpoint or the data set.
+    """Returns the levels to run: the named ones, or the level of the checkpoint or data set.
 
     Args:
         domain: name of the domain; its first level is the default.
@@ -127,7 +126,7 @@ def choose_levels(domain: str, choice: Choice, data: Described) -> Sequence[str]
 
 
 def choose_methods(choice: Choice) -> list[str] | None:
-    """Returns the methods that a command line names, each once; None if it names none.
+    """Returns the methods that a command line names, each once; None without --method.
 
     "all" stands for the methods that fit every domain.
 

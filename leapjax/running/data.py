@@ -25,7 +25,7 @@ DATA = "data.json"  # in the folder of a run: the demonstrations that it learns 
 
 
 def load_demonstrations(run: Run) -> list[Demonstration]:
-    """Reads the demonstrations to train on: the user's, or those that the domain makes.
+    """Reads the demonstrations to train on: the user's, or the domain's own.
 
     Raises:
         UserError: they cannot be made or read, are fewer than asked for, hold no rewards where the
@@ -38,7 +38,7 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     name = config.demonstrations or source.default
     begun = time.perf_counter()
     if config.demonstrations is None and processes.run_on_first(lambda: not source.exists(name)):
-        if run.domain.scaling.measure is None:  # the network needs to know nothing of the data
+        if run.domain.scaling.measure is None:  # the network does not depend on the data
             run.programs.begin(run)
         processes.run_on_first(lambda: _make(run, source, name))
     # Each process reads for itself: the data need not be on one shared disk.
@@ -65,9 +65,9 @@ def _make(run: Run, source: Source, name: str) -> None:
 
 
 def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
-    """How well demonstrations do, by the criterion that played episodes are judged by.
+    """Returns success rate and mean return of demonstrations, by the criterion of the domain.
 
-    None where the environment has a measure of its own, which demonstrations do not keep.
+    Returns None if the environment judges success itself: demonstrations do not store that.
     """
     criterion = domain.demonstrations.criterion
     if criterion is None or not data:
@@ -94,10 +94,10 @@ def check_data(
     level_seeds: Sequence[int],
     outcome: Mapping[str, Any] | None = None,
 ) -> None:
-    """Refuses to train, or to continue a run, on demonstrations that are not the same ones.
+    """Checks that a run continues on the demonstrations that it was begun on.
 
-    Notes what they are, their level seeds for `find_demonstrated`, and their outcome for
-    `read_outcome`.
+    The first call notes their fingerprint, their level seeds for `find_demonstrated`, and their
+    outcome for `read_outcome`.
 
     Raises:
         UserError: the run was begun on others, or processes have read different ones.
@@ -131,6 +131,6 @@ def find_demonstrated(folder: Path) -> list[int]:
 
 
 def _read_note(folder: Path) -> dict[str, Any]:
-    """What `check_data` has noted of a run's demonstrations; nothing, where it is no object."""
+    """Reads what `check_data` noted about the demonstrations; {} if the note is damaged."""
     values = read_json(folder / DATA)
     return values if isinstance(values, dict) else {}

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: stop where nothing is lost, and say how to go on."""
+"""Stops a program on SIGINT and SIGTERM after its work is saved."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ GRACE = 1.0  # seconds in which a signal should have its effect
 
 
 class Interrupted(BaseException):
-    """The program was asked to stop. Not an `Exception`: nothing on the way may catch it."""
+    """A signal asked the program to stop. No `Exception`: `except Exception` must not catch it."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -21,14 +21,14 @@ class Interrupted(BaseException):
 
 
 class Interruption:
-    """What the two signals do while a program runs: see `catch_signals`."""
+    """Receives the two signals while a program runs: see `catch_signals`."""
 
     def __init__(self) -> None:
         self._number: int | None = None
         self._deferred = False
 
     def handle(self, number: int, _: FrameType | None = None) -> None:
-        """The signal handler. A second signal does not wait any more."""
+        """Handles a signal. A second signal is not deferred."""
         waits = self._deferred and self._number is None
         self._number = number
         if not waits:
@@ -36,26 +36,26 @@ class Interruption:
 
     @property
     def waits(self) -> bool:
-        """Whether a signal waits until something is done."""
+        """Whether signals are deferred."""
         return self._deferred
 
     @property
     def requested(self) -> int | None:
-        """The signal that came, if one came."""
+        """The number of the signal that arrived, or None."""
         return self._number
 
     def adopt(self, number: int) -> None:
-        """A signal that came to another process of this run."""
+        """Takes over a signal that another process of this run received."""
         self._number = self._number or number
 
     def check(self) -> None:
-        """Raises what came. Python may have dropped it: it can do so inside a callback."""
+        """Raises `Interrupted` if a signal arrived; Python may drop the first one in a callback."""
         if self._number is not None:
             raise Interrupted(self._number)
 
     @contextlib.contextmanager
     def defer_signals(self) -> Iterator[None]:
-        """Inside, a signal waits: look at `requested`. At the end it is raised."""
+        """Defers signals: `requested` shows them inside, and the end of the block raises them."""
         self.check()
         self._deferred = True
         try:
@@ -69,13 +69,13 @@ class Interruption:
 def catch_signals(
     give_up: Callable[[Interrupted], object] = lambda stopped: None,
 ) -> Iterator[Interruption]:
-    """Inside, SIGINT and SIGTERM raise `Interrupted`, at once or where they were deferred.
+    """Lets SIGINT and SIGTERM raise `Interrupted` inside the block, unless they are deferred.
 
-    Python raises nothing while a compiler runs, and drops what is raised in some callbacks.
+    Python cannot raise while a compiler runs, and drops exceptions in some callbacks.
 
     Args:
-        give_up: called from another thread where a signal that does not wait had no effect for
-            a second; it ends the program.
+        give_up: ends the program; another thread calls it if a signal that is not deferred had
+            no effect for a second.
     """
     interruption = Interruption()
     try:

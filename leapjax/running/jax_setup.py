@@ -1,4 +1,4 @@
-"""How JAX is set up for a program of ours: its devices, its compilation cache."""
+"""Sets up JAX for a program: its settings, devices and compilation cache."""
 
 import contextlib
 import enum
@@ -25,7 +25,7 @@ LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
 class Promise(NamedTuple):
-    """A setting of JAX that one of our promises rests on."""
+    """A setting of JAX that a promise of this library depends on."""
 
     setting: str
     allowed: Sequence[Any]
@@ -67,11 +67,11 @@ ALONE = Cluster()  # one process
 
 
 def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
-    """Every program's first step, before JAX has touched a device.
+    """Sets up JAX; a program calls it before JAX uses a device.
 
     Args:
         cluster: the processes that share the run.
-        cache: keep compiled programs; without, compile times are real.
+        cache: whether to keep compiled programs on disk; False measures compilation.
 
     Raises:
         UserError: a setting of JAX breaks a promise, the other processes cannot be reached, or
@@ -88,10 +88,10 @@ def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
 
 
 def check_promises() -> None:
-    """Refuses settings of JAX under which something that we promise does not hold.
+    """Checks the settings of JAX that promises of this library depend on.
 
     Raises:
-        UserError: names the setting.
+        UserError: a setting breaks a promise.
     """
     for setting, allowed, why in PROMISES:
         value = getattr(jax.config, setting, allowed[0])  # not every version has them all
@@ -104,7 +104,7 @@ def check_promises() -> None:
 
 
 def check_devices() -> None:
-    """Starts JAX, if it was not.
+    """Starts JAX, unless it has started.
 
     Raises:
         UserError: it has no device, as with JAX_PLATFORMS=cuda where there is no GPU.
@@ -144,16 +144,15 @@ def connect(cluster: Cluster) -> None:
 
 
 def _read_count(text: str) -> int:
-    """A number of processes; 1 where nothing, or no number, is said."""
+    """Returns a number of processes from its text; 1 if the text is not a number."""
     return int(text) if text.strip().isdecimal() else 1
 
 
 def leave_program(code: int) -> int:
-    """The exit code of a program that ends early.
+    """Returns the exit code of a program that ends early; with other processes, ends it here.
 
-    With other processes it ends here: JAX would wait for them to end too, minutes long, while
-    they wait for this one. The first one gives the others time to say why they end, because
-    without it they are aborted.
+    JAX would wait minutes for the other processes, which wait for this one. Process 0 ends last:
+    JAX aborts the others without it, before they can print their errors.
     """
     if jax.distributed.is_initialized():
         exit_at_once(code)
@@ -161,7 +160,7 @@ def leave_program(code: int) -> int:
 
 
 def exit_at_once(code: int) -> NoReturn:
-    """Ends the program without the interpreter's own end."""
+    """Ends the program without the cleanup of the interpreter."""
     sys.stdout.flush()
     sys.stderr.flush()
     if jax.distributed.is_initialized():
@@ -184,12 +183,12 @@ def use_every_core() -> None:
                 f"JAX_NUM_CPU_DEVICES is {asked}: expected a number in 1 .. {MOST_ASKED_FOR}"
             )
         return
-    with contextlib.suppress(RuntimeError):  # JAX runs already: its devices are what they are
+    with contextlib.suppress(RuntimeError):  # JAX has started: its devices are fixed
         jax.config.update("jax_num_cpu_devices", min(count_cores(), MOST_CPU_DEVICES))
 
 
 def count_cores() -> int:
-    """How many cores this process may use."""
+    """Returns the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

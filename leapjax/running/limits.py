@@ -1,4 +1,4 @@
-"""What a configuration may ask for: refused before any long work."""
+"""Checks a configuration before any long work."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from leapjax.configuration import AnyConfig, choose_episode_seeds, make_domain, 
 from leapjax.data import seeds, storage
 from leapjax.domain import Domain
 from leapjax.errors import UserError
-from leapjax.models.trajectory import ModelConfig
+from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
@@ -23,10 +23,10 @@ COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
 
 
 def check(config: AnyConfig) -> None:
-    """Refuses what cannot work before any long work starts.
+    """Checks that a run of a configuration can work.
 
     Raises:
-        UserError: says what.
+        UserError: names the option that cannot work.
     """
     check_counts(config, "episodes")
     if config.training.steps and config.demos < 1:
@@ -76,7 +76,7 @@ def check(config: AnyConfig) -> None:
             f"{domain.max_steps} steps come before a state"
         )
     check_memory(config, domain)
-    # An agent costs nothing to make, and says what its method cannot do.
+    # Making an agent is cheap, and raises what its method cannot do.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
     fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
@@ -87,10 +87,10 @@ def check(config: AnyConfig) -> None:
 
 
 def check_seeds(training: Sequence[int]) -> None:
-    """Refuses training seeds that are out of range, or one seed twice.
+    """Checks training seeds.
 
     Raises:
-        UserError: says which.
+        UserError: a seed is out of range, or occurs twice.
     """
     if not training:
         raise UserError("--seeds needs at least one seed")
@@ -101,10 +101,10 @@ def check_seeds(training: Sequence[int]) -> None:
 
 
 def check_target_return(config: AnyConfig) -> None:
-    """Refuses to ask for a return where the model is not told of any.
+    """Checks that a model with a target return is conditioned on returns.
 
     Raises:
-        UserError: says which option is missing.
+        UserError: names the missing option.
     """
     settings = config.method_settings
     if getattr(settings, "returns", True):
@@ -118,13 +118,13 @@ def check_target_return(config: AnyConfig) -> None:
 
 
 def check_memory(config: AnyConfig, domain: Domain) -> None:
-    """Refuses what would need more memory than the machine has, by what it needs at least.
+    """Checks that the machine has the least memory that a configuration needs.
 
-    This is arithmetic, which a number of any size passes at once. What is exact follows when the
-    programs of a run are compiled: `memory.check_program`.
+    The estimate is arithmetic on the options. `memory.check_program` measures exactly, after
+    compilation.
 
     Raises:
-        UserError: says which options ask for it.
+        UserError: names the options that need too much.
     """
     model, search, training = config.model, config.planner, config.training
     horizon, paper = search.horizon, model.architecture == "paper"
@@ -166,26 +166,26 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
 
 
 def count_layer_bytes(model: ModelConfig, tokens: int) -> int:
-    """Bytes that a layer makes of so many tokens, at least."""
+    """Returns the least number of bytes of activations of a layer for a number of tokens."""
     # Queries, keys, values and so on; and the weights of attention.
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
 def check_counts(options: object, *names: str) -> None:
-    """Refuses options that count something and are not positive, or more than can be counted.
+    """Checks that options which count something are positive and not too large.
 
     Raises:
-        UserError: says which.
+        UserError: names the option.
     """
     for name in names:
         check_integer(f"--{name.replace('_', '-')}", getattr(options, name), 1)
 
 
 def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
-    """Refuses to execute more of a plan than there is.
+    """Checks that a plan has as many actions as are to be executed.
 
     Raises:
-        UserError: says how much there is.
+        UserError: names the horizon.
     """
     if executed is not None and not 1 <= executed <= horizon:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")

@@ -1,6 +1,6 @@
-"""Where measurements go while a run is under way, beside its own CSV files.
+"""Sends measurements of a run to TensorBoard and Weights & Biases, beside its CSV files.
 
-Nothing leaves the machine: Weights & Biases is offline unless WANDB_MODE says otherwise.
+Weights & Biases stays offline unless WANDB_MODE says otherwise.
 """
 
 import contextlib
@@ -18,14 +18,14 @@ Log = Callable[[int, Mapping[str, float]], None]  # (training step, values by na
 
 
 class Logger(NamedTuple):
-    """What every kind of logger does."""
+    """The functions of an open logger."""
 
     log: Log
     close: Callable[[], None]
 
 
 class About(NamedTuple):
-    """What a logger may want to know of a run."""
+    """Description of a run for its loggers."""
 
     folder: Path
     name: str  # of its configuration: a run that goes on has the same
@@ -34,11 +34,11 @@ class About(NamedTuple):
 
 
 def log_nothing(step: int, values: Mapping[str, float]) -> None:
-    """Logs nothing."""
+    """Ignores measurements."""
 
 
 def open_tensorboard(about: About) -> Logger:
-    """Event files in the run's folder."""
+    """Opens event files in the run's folder."""
     writer = _import_logger("tensorboard").SummaryWriter(
         str(about.folder / "tensorboard"), purge_step=about.begin + 1 if about.begin else None
     )
@@ -51,7 +51,7 @@ def open_tensorboard(about: About) -> Logger:
 
 
 def open_wandb(about: About) -> Logger:
-    """A run of Weights & Biases, in the run's folder."""
+    """Opens a run of Weights & Biases in the run's folder."""
     run = _import_logger("wandb").init(
         project="leapjax", name=about.folder.name, id=about.name, resume="allow",
         dir=str(about.folder), config=dict(about.configuration),
@@ -72,10 +72,10 @@ _MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
 def check(names: Sequence[str]) -> None:
-    """Refuses loggers that there are not, or that are not installed.
+    """Checks that loggers exist and are installed.
 
     Raises:
-        UserError: says which, and what to do.
+        UserError: names the logger, and the remedy.
     """
     for name in names:
         if name not in LOGGERS:
@@ -84,14 +84,14 @@ def check(names: Sequence[str]) -> None:
 
 
 def _import_logger(name: str) -> ModuleType:
-    """The module that a logger needs."""
+    """Imports the module of a logger."""
     with report_missing():
         return importlib.import_module(_MODULES[name])
 
 
 @contextlib.contextmanager
 def open_loggers(names: Sequence[str], about: Callable[[], About]) -> Iterator[Log]:
-    """Inside, what is given to the function goes to some loggers; they begin with the first."""
+    """Yields a function that logs to some loggers; its first call opens them."""
     if not names:
         yield log_nothing
         return

@@ -1,4 +1,4 @@
-"""What a run needs of memory, judged before it begins: a machine without any left kills it."""
+"""Checks before a run that memory suffices: a machine without memory kills the process."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from leapjax.types import PyTree, TrainState
 
 
 def check(needs: Mapping[str, int]) -> None:
-    """Refuses what needs more memory than the machine has.
+    """Checks that the machine has enough memory.
 
     Args:
         needs: bytes, by the options that ask for them.
@@ -24,7 +24,7 @@ def check(needs: Mapping[str, int]) -> None:
 
 
 def check_state(state: TrainState) -> None:
-    """Refuses a network that is too large to be trained here.
+    """Checks that the network can be trained in this machine's memory.
 
     Args:
         state: shapes of all that training changes. Gradients are as large as the parameters.
@@ -37,7 +37,7 @@ def check_state(state: TrainState) -> None:
 
 
 def check_program(program: Any) -> None:
-    """Refuses a step of training whose program, as it was compiled, does not fit.
+    """Checks that a compiled step of training fits into memory.
 
     Args:
         program: compiled for the devices of this machine.

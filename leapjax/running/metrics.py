@@ -11,14 +11,14 @@ Metrics = list[dict[str, float]]
 
 
 def write_metrics(folder: Path, metrics: Metrics) -> None:
-    """The training curve as CSV."""
+    """Writes the training curve as CSV."""
     lines = [",".join(metrics[0])]
     lines += [",".join(repr(value) for value in entry.values()) for entry in metrics]
     files.write_text(folder / "metrics.csv", "\n".join(lines) + "\n")
 
 
 def read_metrics(folder: Path) -> Metrics:
-    """The training curve so far.
+    """Reads the training curve so far.
 
     Raises:
         UserError: the file is damaged.

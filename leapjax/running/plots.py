@@ -16,7 +16,7 @@ from leapjax.errors import UserError
 
 
 def draw_training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None:
-    """What the method reports, each against steps: the loss first."""
+    """Plots each reported value against training steps, the loss first."""
     steps = [entry["step"] for entry in metrics]
     names = [name for name in metrics[0] if name not in ("step", "seconds")]
     figure, axes = plt.subplots(
@@ -34,7 +34,7 @@ def draw_training_curve(metrics: Sequence[dict[str, float]], path: Path) -> None
 def draw_success_by_iteration(
     iterations: Sequence[int], outcomes: Sequence[tuple[int, int]], title: str, path: Path
 ) -> None:
-    """Success rate against planning iterations (paper, figure 6, left).
+    """Plots success against planning iterations (paper, figure 6, left).
 
     Args:
         iterations: after how many iterations plans were executed.
@@ -55,10 +55,10 @@ def draw_success_by_iteration(
 
 
 def check_figure(path: Path) -> None:
-    """Refuses, before anything is measured, a file that no figure can be written to.
+    """Checks, before any measurement, that a figure can be written.
 
     Raises:
-        UserError: it is of another kind, or its folder cannot be written to.
+        UserError: the file type is unknown, or the folder cannot be written to.
     """
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix.removeprefix(".").lower() not in known:
@@ -67,7 +67,7 @@ def check_figure(path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure, atomically, and lets go of it."""
+    """Writes a figure atomically and closes it."""
     try:
         with files.write_whole(path) as scratch:
             figure.savefig(scratch, dpi=120)

@@ -1,4 +1,4 @@
-"""What is compiled for a run, in the background while its data are made."""
+"""Compiles the programs of a run in the background, while its data are made."""
 
 import concurrent.futures
 import time
@@ -27,7 +27,7 @@ PLANS_TOGETHER = 32
 
 
 class Programs(NamedTuple):
-    """What is compiled for a run.
+    """The compiled programs of a run.
 
     Attributes:
         agent: of its method.
@@ -61,7 +61,7 @@ class BackgroundPrograms:
 
 
 def _compile(run: "Run") -> Callable[[], Programs]:
-    """Begins to compile in the background; what it returns waits for the end of that."""
+    """Begins to compile in the background; returns a function that waits for the programs."""
     config, domain = run.config, run.domain
     plays = run.plays and not config.rules  # with rules another planner plays: see `add_rules`
     mesh = make_mesh(config)
@@ -102,12 +102,12 @@ def _compile(run: "Run") -> Callable[[], Programs]:
 
 
 def choose_chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
-    """Plans that are made together: as many as there are episodes, up to the usual."""
+    """Returns the number of plans that are made together: at most `PLANS_TOGETHER`."""
     return (min(PLANS_TOGETHER, 1 << (config.episodes - 1).bit_length()),)
 
 
 def make_mesh(config: AnyConfig) -> Mesh:
-    """The devices that a run trains on, those of all processes included.
+    """Makes the mesh of the devices of all processes that a run trains on.
 
     Raises:
         UserError: they cannot share the batch.

@@ -44,7 +44,7 @@ class Meter:
             self._bar.stop()
 
     def update(self, done: int, note: str = "") -> None:
-        """`done` of the total, with a note such as the loss."""
+        """Shows that `done` of the total is done, with a note such as the loss."""
         now = time.monotonic()
         rate = (done - self._first) / max(now - self._begun, 1e-9)
         if self._bar:
@@ -61,5 +61,5 @@ class Meter:
 
 
 def format_speed(rate: float) -> str:
-    """How many a second; of less than one, how long each takes."""
+    """Formats a rate per second; below 1, as seconds for each."""
     return f"{rate:.1f}/s" if rate >= 1 or rate == 0 else f"{1 / rate:.1f}s each"

@@ -1,4 +1,4 @@
-"""Writes what a run has come to: a row, its episodes, pictures."""
+"""Writes the results of a run: its row, episodes and pictures."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,10 +23,10 @@ def record(
     """Writes the row of a run, its episodes and its pictures; returns the row.
 
     Args:
-        run: that has come to its end.
-        planner: that it made.
-        episodes: that the planner played.
-        versions: of the code that ran.
+        run: a finished run.
+        planner: planner of the run.
+        episodes: held-out episodes that the planner played.
+        versions: versions of the code that ran.
     """
     config, folder, experiment = run.config, run.folder, run.experiment
     row = make_row(run, planner, episodes) | {"versions": dict(versions)}
@@ -48,7 +48,7 @@ def record(
 
 
 def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
-    """The JSON row of a finished run."""
+    """Makes the JSON row of a finished run."""
     config, paper, lengths = run.config, run.experiment.paper, episodes.lengths
     return {
         "experiment": run.experiment.name,
@@ -87,7 +87,7 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
 
 
 def describe_success(run: Run) -> dict[str, Any]:
-    """What success means in a row, and how well the data do by it, where that is not plain."""
+    """Returns the fields of a row that define success, if the domain has a criterion for it."""
     config, criterion = run.config, run.domain.demonstrations.criterion
     if criterion is None:
         return {}

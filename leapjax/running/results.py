@@ -1,4 +1,4 @@
-"""Result rows: JSON lines, one file per experiment; tables are made from rows only."""
+"""Reads and writes result rows: JSON lines, one file for each experiment."""
 
 import contextlib
 import datetime
@@ -86,11 +86,11 @@ OF_ANALYSIS: dict[str, Schema] = {
 
 
 def read(path: Path, schema: Schema = ROW) -> list[Row]:
-    """The rows of a file; none if there is no file.
+    """Reads the rows of a file; [] if there is no file.
 
     Args:
-        path: of the file.
-        schema: what each row must be.
+        path: file of rows.
+        schema: schema of each row.
 
     Raises:
         UserError: a line is not a row, by its number; or two rows have one hash: a table would
@@ -124,7 +124,7 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
 
 
 def _find_contradiction(row: Row) -> str | None:
-    """What fields say against each other."""
+    """Returns how fields of a row contradict each other, or None."""
     for name in ("successes", "first_pass_successes"):
         if (row.get(name) or 0) > row["episodes"]:
             return f"{row[name]} {name} of {row['episodes']} episodes"
@@ -136,17 +136,17 @@ def _find_contradiction(row: Row) -> str | None:
 
 
 def compute_success(row: Row) -> float:
-    """The success rate of a row, as a fraction."""
+    """Returns the success rate of a row, as a fraction."""
     return row["successes"] / row["episodes"]
 
 
 def choose_folder(recorded: bool, runs: Path) -> Path:
-    """Where rows go: to those that are committed, or beside the runs that they are of."""
+    """Returns the folder of rows: `results`, which is committed, or the folder of the runs."""
     return Path("results") if recorded else runs
 
 
 def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
-    """Adds a row, in the place of one of the same configuration, and its episodes, atomically.
+    """Writes a row and its episodes atomically; replaces the row with the same hash.
 
     Args:
         path: file of rows.
@@ -176,7 +176,7 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
 
 
 def change(path: Path, changed: Callable[[Any], Any]) -> Any:
-    """Rewrites a JSON file as what becomes of it, None where there is none, atomically."""
+    """Rewrites a JSON file atomically; `changed` maps its old value, or None, to the new one."""
     with lock_folder(path.parent, wait=True):
         found = changed(read_json(path) if path.exists() else None)
         write_text(path, json.dumps(found, indent=1) + "\n")
@@ -184,7 +184,7 @@ def change(path: Path, changed: Callable[[Any], Any]) -> Any:
 
 
 def add(path: Path, name: str, value: Any) -> dict[str, Any]:
-    """Adds a value by its name to a JSON file, in the place of one of that name; all of them."""
+    """Adds or replaces a named value in a JSON file; returns all values."""
     return change(path, lambda known: {**(known or {}), name: value})
 
 
@@ -239,12 +239,12 @@ def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
 
 
 def find(path: Path, configuration: str) -> Row | None:
-    """The recorded row of a configuration."""
+    """Returns the recorded row of a configuration, or None."""
     return next((row for row in read(path) if row["hash"] == configuration), None)
 
 
 def find_versions() -> dict[str, str]:
-    """What a result was made with; starts JAX, if it was not."""
+    """Returns the versions of the packages and the machine; starts JAX."""
     found = {}
     for name in ("jax", "flax", "optax", "minigrid", "numpy", "ale-py"):
         with contextlib.suppress(metadata.PackageNotFoundError):  # of an extra
@@ -258,10 +258,10 @@ def find_versions() -> dict[str, str]:
 
 
 def find_code_version(root: Path) -> str:
-    """Which commit last changed the code of a checkout, as a local version: "+g1a2b3c4".
+    """Returns the commit that last changed the code, as a local version: "+g1a2b3c4".
 
-    With ".dirty" where the code differs from it; empty where there is no repository. Rows are
-    committed too, so it is not simply the last commit.
+    Adds ".dirty" if the code differs from that commit; returns "" without a repository. It need
+    not be the last commit: rows are committed too.
     """
     code = ("--", "leapjax", "experiments", "benchmarks")
 
@@ -279,19 +279,19 @@ def find_code_version(root: Path) -> str:
 
 
 def format_date() -> str:
-    """The date of a row."""
+    """Returns the date of today as text."""
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
 def format_rate(row: Row) -> str:
-    """A success rate with its 95% interval."""
+    """Formats a success rate with its 95% interval."""
     return _format_with_interval(
         compute_success(row), scores.wilson_interval(row["successes"], row["episodes"])
     )
 
 
 def format_rate_over_seeds(rows: Sequence[Row]) -> str:
-    """The mean success rate of rows of several training seeds with its 95% interval."""
+    """Formats the mean success rate over training seeds with its 95% interval."""
     counts = [row["successes"] for row in rows], [row["episodes"] for row in rows]
     mean = statistics.fmean(map(compute_success, rows))
     return _format_with_interval(mean, scores.interval_over_seeds(*counts))
@@ -302,11 +302,11 @@ def _format_with_interval(rate: float, interval: tuple[float, float]) -> str:
 
 
 def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
-    """The rows that differ in their training seed alone, where there are several.
+    """Groups rows that differ only in their training seed; leaves out groups of one row.
 
     Args:
-        rows: of any seeds.
-        key: all that tells rows apart but the seed.
+        rows: rows of any seeds.
+        key: (row) -> everything that tells rows apart except the seed.
     """
     groups: dict[Any, list[Row]] = {}
     for row in rows:
@@ -315,7 +315,7 @@ def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row
 
 
 def summarize(row: Row) -> str:
-    """What a run has come to, in one line."""
+    """Summarises a row in one line."""
     paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
     parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
     if "criterion" not in row:
@@ -326,13 +326,13 @@ def summarize(row: Row) -> str:
 
 
 def format_success(row: Row) -> str:
-    """A success rate, and that of the data where it is known."""
+    """Formats the success rate of a row, and of its data if known."""
     data = _find_number(row, "data_success")
     return format_rate(row) + ("" if data is None else f" (data: {data:.1%})")
 
 
 def format_return(row: Row) -> str:
-    """A mean return, and that of the data where it is known."""
+    """Formats the mean return of a row, and of its data if known."""
     mean, data = _find_number(row, "mean_return"), _find_number(row, "data_return")
     return ("-" if mean is None else f"{mean:.2f}") + (
         "" if data is None else f" (data: {data:.2f})"
@@ -346,7 +346,7 @@ def _find_number(row: Row, name: str) -> float | None:
 
 
 def name_planner(row: Row) -> str:
-    """How a row's plans were found, as far as it says."""
+    """Returns a short name of the planner of a row."""
     configuration = row.get("configuration", {})
     planner, rules = configuration.get("planner", {}), configuration.get("rules", 0)
     parts = {
@@ -402,7 +402,7 @@ def _format_mean_return(rows: Sequence[Row]) -> str:
 
 
 def make_time_table(rows: Sequence[Row]) -> Table:
-    """Where the time of each run went."""
+    """Makes a table of the seconds that each part of the runs took."""
     parts = ("demos", "compile", "train", "eval")
     result = Table("level", "seed", *(f"{part} (s)" for part in parts), "plans/s")
     for row in rows:

@@ -1,4 +1,4 @@
-"""Which JSON values can be used: a schema, and what is wrong with a value.
+"""Checks JSON values against a schema.
 
 A schema is a type, one of the classes below, or a dictionary: an object with at least these
 fields. `int` and `float` are finite numbers, a float may be written as an integer.
@@ -60,7 +60,7 @@ KINDS = {str: "str", bool: "bool", dict: "object", list: "array"}
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text.
+    """Parses a JSON text.
 
     Raises:
         ValueError: it is not JSON, or an object names a field twice.
@@ -79,11 +79,11 @@ def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def find_problem(value: Any, schema: Schema, name: str = "") -> str | None:
-    """What is wrong with a value, with the path of the field; None if nothing is.
+    """Describes the first error of a value, with the path of the field; None if it is valid.
 
     Args:
         value: parsed JSON.
-        schema: what it must be.
+        schema: schema of the value.
         name: path of the value from the outermost one.
     """
     if isinstance(schema, Absent):

@@ -1,4 +1,4 @@
-"""Where a program begins and ends: a user's mistake is one line and exit code 2."""
+"""Starts and ends programs: a user's mistake is one line and exit code 2."""
 
 import errno
 import shlex
@@ -16,14 +16,14 @@ from leapjax.running.interruption import Interrupted, Interruption, catch_signal
 from leapjax.training import NonFiniteLoss
 
 T = TypeVar("T")
-FAILURES = (UserError, NotANumber, NonFiniteLoss)  # that end one run, and can be said in one line
+FAILURES = (UserError, NotANumber, NonFiniteLoss)  # each ends one run, with an error of one line
 
 
 def read_arguments(arguments: Sequence[str] | None) -> list[str]:
-    """The command line of a program: what was given, or the real one.
+    """Returns the given arguments, or those of the process.
 
     Raises:
-        SystemExit: a value is empty; it is said in one line.
+        SystemExit: a value is empty; prints an error of one line.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -34,7 +34,7 @@ def read_arguments(arguments: Sequence[str] | None) -> list[str]:
 
 
 def check_values(arguments: Sequence[str]) -> None:
-    """Refuses empty values, which a shell makes of a variable that is not set.
+    """Checks that no value is empty: a shell makes empty values of unset variables.
 
     Raises:
         UserError: names the option.
@@ -49,31 +49,31 @@ def check_values(arguments: Sequence[str]) -> None:
 
 
 def parse(kind: type[T], module: str, arguments: Sequence[str], **options: Any) -> T:
-    """The options of a command line; exits after --help, and with 2 where they are wrong.
+    """Parses a command line; exits after --help, and with 2 if an option is wrong.
 
     Args:
         kind: dataclass of the options.
-        module: of the program, for usage lines.
-        arguments: of the command line.
-        options: of `tyro.cli`.
+        module: module of the program, for usage lines.
+        arguments: command line.
+        options: further options of `tyro.cli`.
     """
     import tyro  # noqa: PLC0415  (`leapjax --help` needs no extra)
 
     return tyro.cli(kind, prog=startup.format_command(module), args=list(arguments), **options)
 
 
-# A path that is too long, leads through a file, into a folder that may not be looked into, or into
-# one that was removed, such as the working folder.
+# The path is too long, leads through a file or a forbidden folder, or does not exist: the working
+# folder may have been removed.
 NAMED_WRONGLY = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT}
 
 
 def run_program(module: str, arguments: Sequence[str], work: Callable[[], object]) -> int:
-    """Does the work of a program; the exit code.
+    """Runs the work of a program, reports its errors, and returns the exit code.
 
     Args:
-        module: of the program.
-        arguments: what it was given: an interrupted program says how to continue.
-        work: all that it does.
+        module: module of the program.
+        arguments: command line, which an interrupted program prints to continue with.
+        work: does the work.
     """
     try:
         with report_missing(startup.find_extra(module)):
@@ -106,7 +106,7 @@ def run_program(module: str, arguments: Sequence[str], work: Callable[[], object
 
 
 def describe(error: Exception) -> str:
-    """Returns what an error says, and the options that would have to change."""
+    """Returns the message of an error with the options that it is about."""
     options = [f"--{name.replace('_', '-')}" for name in getattr(error, "fields", ())]
     return f"{error} ({', '.join(options)})" if options else str(error)
 
@@ -114,7 +114,7 @@ def describe(error: Exception) -> str:
 def run_interruptible_program(
     module: str, arguments: Sequence[str], work: Callable[[Interruption], object]
 ) -> int:
-    """The same for long work, which SIGINT and SIGTERM stop where nothing is lost."""
+    """Runs long work as `run_program` does; SIGINT and SIGTERM stop it after saving."""
 
     def give_up(stopped: Interrupted) -> None:
         if not jax.distributed.is_initialized():  # the others would wait for this one
@@ -128,7 +128,7 @@ def run_interruptible_program(
 
 
 def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoReturn:
-    """Ends an interrupted program, and says how to continue it."""
+    """Ends an interrupted program and prints the command that continues it."""
     command = " ".join([startup.format_command(module), *map(shlex.quote, arguments)])
     print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
     # At once: threads that still compile or write would crash in the interpreter's own end.

@@ -1,4 +1,4 @@
-"""What the command lines of some domains call their options."""
+"""Names of options on the command lines of some domains."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What a program does before it imports JAX: signals, output, --version, JAX's own settings.
+"""Prepares a program before it imports JAX: signals, output, --version, settings of JAX.
 
 Imports only the standard library: importing JAX takes seconds.
 """
@@ -16,7 +16,7 @@ from leapjax.running.interruption import SIGNALS, Interrupted
 from leapjax.version import find_version
 
 COMMAND = "leapjax"  # the installed script
-UNREAD = 128 + signal.SIGPIPE  # the exit code of a program whose output nobody reads
+UNREAD = 128 + signal.SIGPIPE  # exit code after the reader of the output has gone
 
 
 def is_program() -> bool:
@@ -29,7 +29,7 @@ def is_program() -> bool:
 
 
 def find_program() -> Path:
-    """What the interpreter runs, as `sys.argv` says it."""
+    """Returns the path of the program that the interpreter runs, from `sys.argv`."""
     return Path(next(iter(getattr(sys, "argv", ())), ""))
 
 
@@ -58,7 +58,7 @@ def prepare() -> None:
 
 
 class Output(io.TextIOWrapper):
-    """A stream that ends the program once nobody reads it any more, as in `--help | head`.
+    """A stream that ends the program when its reader has gone, as in `--help | head`.
 
     Other programs are ended by SIGPIPE. That signal would also end this one where a worker process
     or a logger has gone, which are failures that can be reported.
@@ -72,7 +72,7 @@ class Output(io.TextIOWrapper):
             end_unread()
 
     def flush(self) -> None:
-        """Passes on what is buffered; the interpreter does so at its end."""
+        """Flushes the buffer; the interpreter does so when it exits."""
         try:
             super().flush()
         except BrokenPipeError:
@@ -80,8 +80,8 @@ class Output(io.TextIOWrapper):
 
 
 def make_output(stream: TextIO) -> TextIO:
-    """A standard stream as an `Output` that replaces what its encoding does not have."""
-    if not isinstance(stream, io.TextIOWrapper):  # there is none, or another program's
+    """Wraps a standard stream in `Output`, which replaces unencodable characters."""
+    if not isinstance(stream, io.TextIOWrapper):  # None, or replaced by another library
         return stream
     return Output(
         stream.buffer, stream.encoding, "replace",
@@ -90,15 +90,15 @@ def make_output(stream: TextIO) -> TextIO:
 
 
 def end_unread() -> NoReturn:
-    """Ends the program without a word: what is left to print has nowhere to go."""
+    """Ends the program silently: its output has no reader."""
     os._exit(UNREAD)
 
 
 def format_command(module: str) -> str:
-    """How a program was started: `leapjax babyai`, or `python -m experiments.babyai`.
+    """Returns the command of a program: `leapjax babyai`, or `python -m experiments.babyai`.
 
     Args:
-        module: of the program, such as "experiments.babyai".
+        module: module of the program, such as "experiments.babyai".
     """
     package, _, name = module.partition(".")
     if find_program().stem == COMMAND:
@@ -121,18 +121,18 @@ def find_modules_here() -> None:
 def end_on_signal(number: int, _: FrameType | None = None) -> None:
     """The signal handler until `catch_signals` has its own.
 
-    It raises nothing: an import, or a callback of the interpreter, may drop what is raised.
+    It must not raise: imports and callbacks of the interpreter may drop exceptions.
     """
     stopped = Interrupted(number)
-    with contextlib.suppress(Exception):  # what is being printed cannot be flushed
+    with contextlib.suppress(Exception):  # the buffer may be locked
         sys.stdout.flush()
-    with contextlib.suppress(OSError):  # nobody reads it any more
+    with contextlib.suppress(OSError):  # the reader has gone
         os.write(2, f"stopped by {stopped}\n".encode())
     os._exit(stopped.exit_code)
 
 
 def print_unraisable(failure: "sys.UnraisableHookArgs") -> None:
-    """The hook for exceptions that nothing can catch: prints all but those of closed event loops.
+    """Prints an exception that cannot be caught, unless a closed event loop raised it.
 
     If the disk is full, TensorStore reports to event loops that Orbax has closed already.
     """
@@ -160,9 +160,9 @@ def print_uncaught(
 
 
 def find_extra(module: str) -> str:
-    """The extra of the package that a program needs, by its module, such as `experiments.atari`.
+    """Returns the extra that a program needs, by its module, such as `experiments.atari`.
 
-    A program that is named after a domain needs that of the domain, all others need BabyAI's.
+    A program named after a domain needs the extra of that domain, all others need BabyAI's.
     """
     from leapjax.domains import DOMAINS, Place  # noqa: PLC0415  (imports JAX)
 
@@ -171,7 +171,7 @@ def find_extra(module: str) -> str:
 
 
 def list_jax_settings() -> str:
-    """The settings of JAX and XLA in the environment, for a message; empty if there are none."""
+    """Lists the settings of JAX and XLA in the environment, for a message."""
     given = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if _is_setting(name)]
     return f" with {', '.join(given)}" if given else ""
 

@@ -23,16 +23,16 @@ from leapjax.running.run import Run
 from leapjax.types import Demonstration, Energy, Params, TrainState
 
 Watch = Callable[[Energy, Params], dict[str, float]]
-REPORT_SECONDS = 5.0  # where steps are slow: between them nothing is saved, and no signal heard
+REPORT_SECONDS = 5.0  # at most between reports, which save checkpoints and see signals
 
 
 def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -> Pretrained:
     """Trains, or goes on where the run stopped; the training curve is in its folder.
 
     Args:
-        run: to do. Other processes are kept out of its folder until it is closed.
-        data: to train on.
-        watch: measures more of what is being learned, whenever progress is reported.
+        run: run to train; its folder is locked until it is closed.
+        data: demonstrations to train on.
+        watch: (energy, parameters) -> further measurements for each report of progress.
 
     Raises:
         UserError: the folder is of another run or of other data, or another process works in it.
@@ -68,7 +68,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
         console.print(f"continuing at step {int(state.step)} of {total}")
     if not total and restored is None:
-        saved.save(state)  # there is nothing to learn: what a method begins with is all of it
+        saved.save(state)  # the method does not learn: its first state is its last
 
     before = metrics[-1]["seconds"] if metrics else 0.0
     begun = last_saved = time.perf_counter()
@@ -105,7 +105,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
 
 
 def learn_statistics(run: Run, data: Sequence[Demonstration]) -> Run:
-    """Returns a run whose network knows the statistics of what it learns from, if it needs any."""
+    """Returns a run with the statistics of its data, if its network needs them."""
     statistics = measure_statistics(run.domain, data)
     return dataclasses.replace(
         run,

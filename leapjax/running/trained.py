@@ -1,4 +1,4 @@
-"""The planner of an earlier run, and rules beside what it learned."""
+"""Loads the planner of an earlier run, and adds the rules of its domain."""
 
 import dataclasses
 from typing import Any
@@ -18,8 +18,8 @@ def load_trained(run: Run) -> Pretrained:
     """Loads the planner of the checkpoint that a configuration names.
 
     Raises:
-        UserError: says what the run has, and what it was asked for; or a row is to be recorded of a
-            run that has not come to its end.
+        UserError: the configuration does not fit the trained planner, or a row would be recorded
+            of an unfinished run.
     """
     checkpoint = run.config.checkpoint
     assert checkpoint is not None
@@ -44,7 +44,7 @@ def load_trained(run: Run) -> Pretrained:
 
 
 def _select_training_settings(specification: Specification) -> dict[str, Any]:
-    """What a trained planner cannot be asked to change: all but how it searches, and for what."""
+    """Returns the settings that a trained planner fixes: all except its search and target."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -65,7 +65,7 @@ def _select_training_settings(specification: Specification) -> dict[str, Any]:
 
 
 def add_rules(run: Run, planner: Pretrained) -> Pretrained:
-    """Returns a planner that minimises the domain's rules too, where that is asked for."""
+    """Returns a planner that also minimises the domain's rules, if `--rules` has a weight."""
     weight, rules = run.config.rules, run.domain.rules
     if not weight or rules is None:
         return planner

@@ -25,8 +25,8 @@ from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WI
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.extras import report_missing
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 
 LONGEST = 5_000  # decisions of a game of preset `leapjax`, as in its demonstrations
 FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay

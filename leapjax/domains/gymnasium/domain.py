@@ -25,8 +25,8 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.domains.gymnasium.recorded import check_environment, describe_environment
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from leapjax.types import PyTree
 
 R = TypeVar("R")

@@ -14,8 +14,8 @@ from leapjax.data.solved import collect_solved
 from leapjax.domain import Augmentation, Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
+from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
-from leapjax.models.trajectory import ModelConfig
 from leapjax.models.transformer import dense
 from leapjax.types import Context
 

@@ -1,0 +1,39 @@
+"""The rules of plans that every network over several actions shares."""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.models.config import ModelConfig
+from leapjax.models.transformer import causal_mask
+
+
+def check_plan(actions: jax.Array, horizon: int) -> None:
+    """Checks that a plan has the length that a network was made for.
+
+    Raises:
+        ValueError: the shape is not `[horizon]`.
+    """
+    if actions.shape != (horizon,):
+        raise ValueError(f"a plan of shape {actions.shape}: this network was made for ({horizon},)")
+
+
+def forbid_early_end(logits: jax.Array, positions: jax.Array) -> jax.Array:
+    """Sets the logit of the end action, the last one, to -inf at position 0.
+
+    Args:
+        logits: logits `[P, A]` at the positions.
+        positions: positions `[P]` in a plan.
+    """
+    end = jnp.arange(logits.shape[-1]) == logits.shape[-1] - 1
+    return jnp.where(end & (positions[:, None] == 0), -jnp.inf, logits)
+
+
+def make_attention_mask(config: ModelConfig, tokens: int, prefix: int = 0) -> jax.Array | None:
+    """Makes the mask `[tokens, prefix + tokens]` of a plan's tokens; None: each attends to all.
+
+    Args:
+        config: names the attention, "full" or "causal".
+        tokens: number of tokens of the plan.
+        prefix: number of cached tokens of the context.
+    """
+    return causal_mask(tokens, prefix) if config.attention == "causal" else None
