@@ -1,3 +1,6 @@
+"""Augmentations of BabyAI's windows, and those that `experiments.properties` adds to them."""
+
+import dataclasses
 import functools
 from collections import Counter
 from itertools import pairwise
@@ -9,14 +12,17 @@ import pytest
 from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 from minigrid.core.grid import Grid
 
+from experiments import augmentation as more
 from leapjax.data import windows
 from leapjax.domains.babyai import augmentation, demonstrations, levels, vocabulary
 from leapjax.domains.babyai.adapter import END
 from leapjax.domains.babyai.augmentation.words import find_words
+from leapjax.domains.babyai.dynamics import FORWARD, LAVA, roll
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from tests.dynamics import FRONT, stepped
 from tests.oracles import slow_path_lengths
+from tests.programs import only_long
 
 EMPTY, KEY, BALL, BOX = 1, 5, 6, 7
 WORDS = find_words()
@@ -255,3 +261,99 @@ def test_half_of_the_sequences_are_said_the_other_way_round_and_settings_choose(
     assert min(found[False], found[True]) > 30
     assert augmentation.choose_augmentations(Settings()) == []
     assert len(augmentation.choose_augmentations(Settings(augment=True, clutter=1.0))) == 2
+
+
+def plain_windows(horizon=10, level="GoToLocalS8N1", episodes=6):
+    """Windows of an empty room, or of another level, from every step."""
+    steps = lay_out(collected(level, episodes))
+    return [window_at(steps, i, 0, horizon, END) for i in range(steps.actions.shape[0])]
+
+
+def changed_by(change, some, keys=12):
+    """Pairs of windows that an augmentation changed: before and after."""
+    for number, window in enumerate(some):
+        for after in draw(change, window, keys=keys, first=100 * number):
+            if added(window.context.observation, after.context.observation).any():
+                yield jax.device_get(window), after
+
+
+def test_a_false_start_leads_to_where_the_window_began():
+    change = jax.jit(lambda key, window: more.add_false_start(key, window, 1.0))
+    lengths = set()
+    for before, after in changed_by(change, plain_windows()):
+        state, moves = after.context.observation, int(after.imitated.argmax())
+        assert after.imitated[moves:].all() and not after.imitated[:moves].any()
+        np.testing.assert_array_equal(after.actions[moves:], before.actions[: 10 - moves])
+        began = walked(state, after.actions[:moves]).grid
+        np.testing.assert_array_equal(began, before.context.observation.grid)
+        assert after.extras[tuple(state.pose[:2])]
+        lengths.add(moves)
+    assert lengths == set(range(1, 7))
+
+
+@pytest.mark.parametrize("name", ["false_starts", pytest.param("detours", marks=only_long)])
+def test_what_begins_earlier_never_steps_on_lava(name):
+    """Demonstrations walk around it: what is added to them must too."""
+    [change] = map(jax.jit, more.choose(more.Settings(**{name: 1.0})))
+    walk = jax.jit(roll)  # compiled once, not for each window
+    lava = changed = 0
+    for _, after in changed_by(change, plain_windows(10, "GoToLavaMedium", 20)):
+        state, changed = after.context.observation, changed + 1
+        lava += (state.grid[..., 0] == LAVA).any()
+        cells = walk(state, jnp.asarray(after.actions))[:, :2]
+        assert (state.grid[cells[:, 0], cells[:, 1], 0] != LAVA).all()
+    assert lava > 50 and changed > 50
+
+
+def test_a_detour_is_the_shortest_way_and_still_leads_to_the_goal():
+    change = jax.jit(lambda key, window: more.add_detour(key, window, 1.0, WORDS))
+    longer = things = 0
+    for before, after in changed_by(change, plain_windows(horizon=24)):
+        assert after.imitated.all()
+        state = after.context.observation
+        x, y, direction = map(int, walked(state, after.actions).pose)
+        assert (x + FRONT[direction][0], y + FRONT[direction][1]) == tuple(state.goal)
+        moves = int((after.actions == FORWARD).sum())
+        assert shortest(state) == moves + 1 == after.extras.sum()  # no cell twice, not the goal
+        longer += moves + 1 > np.abs(state.pose[:2] - state.goal).sum()
+        things += added(before.context.observation, state).sum() > 6
+    assert longer > 10 and things > 10
+
+
+def test_short_windows_get_detours_as_often_where_they_turn_as_where_they_move():
+    change = jax.jit(lambda key, window: more.add_detour(key, window, 1.0, WORDS))
+    short, keys = plain_windows(horizon=1), 12
+    found = Counter(int(before.actions[0]) == FORWARD for before, _ in changed_by(change, short))
+    tried = Counter(int(window.actions[0]) == FORWARD for window in short)
+    turning, moving = (found[moves] / tried[moves] / keys for moves in (False, True))
+    assert turning > 0.8 * moving > 0.5
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_lookalikes_share_kind_or_colour_with_a_target_that_is_named_but_never_both(named):
+    fill = jax.jit(lambda key, window: more.add_lookalikes(key, window, 1.0, WORDS))
+
+    def unname(window):
+        said = jnp.asarray(vocabulary.encode("go to the box", 5))
+        seen = window.context.observation._replace(instruction=said)
+        return window._replace(context=window.context._replace(observation=seen))
+
+    found, shared = plain_windows()[:4], np.zeros(2, int)
+    for before, after in changed_by(fill, found if named else map(unname, found)):
+        grid = after.context.observation.grid
+        new = grid[added(before.context.observation, after.context.observation)]
+        same = new[:, :2] == grid[tuple(before.context.observation.goal)][:2]
+        assert not same.all(axis=1).any()
+        shared += same.sum(axis=0)
+    assert (shared > 0).all() == shared.any() == named
+
+
+def test_what_is_added_stands_between_the_symmetries_and_the_clutter_of_babyai():
+    plain = more.Settings(augment=True, clutter=0.4)
+    chosen = more.choose(dataclasses.replace(plain, false_starts=0.5, detours=0.5))
+    window, key = plain_windows()[0], jax.random.key(3)
+    assert len(chosen) == 4 and more.choose(more.Settings()) == []
+    for others in (more.choose(plain), [chosen[0], chosen[3]]):
+        for change, other in zip(augmentation.choose_augmentations(plain), others, strict=True):
+            pairs = (jax.tree.leaves(each(key, window)) for each in (change, other))
+            assert all(map(np.array_equal, *pairs))
