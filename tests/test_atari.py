@@ -121,22 +121,11 @@ def test_a_step_that_was_begun_is_waited_for():
 
 def test_a_state_is_the_last_four_frames():
     given = jnp.asarray(frames(6))
-<<<<<<< HEAD
     padded = np.concatenate([np.zeros((3, 84, 84), np.uint8), given])
-    states = np.asarray(encoders.stacked(given, 6))
-    same(states, np.stack([np.moveaxis(padded[i : i + 4], 0, -1) for i in range(6)]))
-    same(encoders.stacked(given, 1), states[-1:])
-    same(encoders.stacked(given[:2], 1)[0], states[1])
-=======
     states = np.asarray(encoders.stack_frames(given, 6))
-    assert states.shape == (6, 84, 84, 4)
-    for index in range(6):
-        for back in range(4):
-            expected = given[index - back] if index >= back else np.zeros((84, 84), np.uint8)
-            np.testing.assert_array_equal(states[index, :, :, 3 - back], expected)
-    np.testing.assert_array_equal(encoders.stack_frames(given, 1), states[-1:])
-    np.testing.assert_array_equal(encoders.stack_frames(given[:2], 1)[0], states[1])
->>>>>>> main
+    same(states, np.stack([np.moveaxis(padded[i : i + 4], 0, -1) for i in range(6)]))
+    same(encoders.stack_frames(given, 1), states[-1:])
+    same(encoders.stack_frames(given[:2], 1)[0], states[1])
 
 
 @pytest.mark.parametrize("architecture", ["paper", "leapjax"])
@@ -170,30 +159,9 @@ def test_as_many_states_are_encoded_while_playing_as_the_tables_say(name, past):
 
 def test_without_a_past_the_whole_frame_has_changed():
     context = window(8, context=0).context
-<<<<<<< HEAD
-    shown = encoders.changes(encoders.stacked(encoders.seen(context), 1))[0]
-    same(shown[..., 1:3], 0)
-=======
-    assert context.past.shape == (0, 84, 84)
     shown = encoders.compute_changes(encoders.stack_frames(encoders.join_frames(context), 1))[0]
-    np.testing.assert_array_equal(shown[..., 1:3], 0)
->>>>>>> main
+    same(shown[..., 1:3], 0)
     np.testing.assert_allclose(shown[..., 3], encoders.CHANGES * shown[..., 0], rtol=1e-5)
-
-
-<<<<<<< HEAD
-def test_a_shift_moves_all_frames_alike():
-    drawn, corners = window(5), set()
-    move = jax.jit(functools.partial(augmentation.shifted, most=4))
-    before = encoders.seen(drawn.context)
-    wide = np.pad(before, ((0, 0), (4, 4), (4, 4)), mode="edge")
-    moved_to = {wide[:, y : y + 84, x : x + 84].tobytes(): (y, x) for y, x in np.ndindex(9, 9)}
-    for seed in range(12):
-        moved = move(jax.random.key(seed), drawn)
-        corners.add(moved_to[np.asarray(encoders.seen(moved.context)).tobytes()])
-        same(moved.actions, drawn.actions)
-    assert len(corners) > 6
-    same(augmentation.shifted(jax.random.key(0), drawn, 0).context.past, drawn.context.past)
 
 
 def reflected(states, mirror):
@@ -206,62 +174,27 @@ def reflected(states, mirror):
     return result
 
 
-=======
->>>>>>> main
 @pytest.mark.parametrize("name", GAMES)
 def test_every_other_window_is_in_a_mirror(name):
     game, drawn = GAMES[name], window(5)
     past = frames(6, seed=1)
     ids = jnp.arange(len(game.actions) + 3)  # the end action, MASK and PAD among them
     context = drawn.context._replace(observation=past[-1], past=past[:-1], actions=ids)
-<<<<<<< HEAD
     drawn, mirror = drawn._replace(context=context, actions=ids[::-1]), game.mirror
-    show = jax.jit(functools.partial(augmentation.mirrored, mirror=mirror, actions=game.actions))
+    show = jax.jit(
+        functools.partial(augmentation.mirror_window, mirror=mirror, actions=game.actions)
+    )
     mirrored = 0
     for seed in range(40):
         seen = show(jax.random.key(seed), drawn)
         swapped = seen.context.actions
         kept = (swapped == ids).all()
         mirrored += not kept
-        same(encoders.seen(seen.context), past if kept else reflected(past, mirror))
+        same(encoders.join_frames(seen.context), past if kept else reflected(past, mirror))
         same(seen.actions, swapped[::-1])
         same(swapped[swapped], ids)
         same(swapped[len(game.actions) :], ids[len(game.actions) :])
     assert 8 < mirrored < 32
-=======
-    drawn = drawn._replace(context=context, actions=ids[::-1])
-    show = jax.jit(
-        functools.partial(augmentation.mirror_window, mirror=game.mirror, actions=game.actions)
-    )
-    shown = [show(jax.random.key(seed), drawn) for seed in range(40)]
-    as_played = [bool((each.actions == drawn.actions).all()) for each in shown]
-    assert 8 < sum(as_played) < 32
-    for each, kept in zip(shown, as_played, strict=True):
-        same(each.context.past, past[:-1] if kept else augmentation.reflect(past[:-1], game.mirror))
-        same(each.context.observation, past[-1] if kept else reflected(past[-1], game.mirror))
-        same(each.context.actions, each.actions[::-1])
-        same(each.context.step, drawn.context.step)
-    swapped = shown[as_played.index(False)].actions[::-1]
-    same(swapped[swapped], ids)  # twice in the mirror is as before
-    same(swapped[len(game.actions) :], ids[len(game.actions) :])
-
-
-def reflected(frame, mirror):
-    """An oracle: pixel by pixel."""
-    frame = np.array(frame)
-    result = frame.copy()
-    for row in range(*mirror.rows):
-        for column in range(*mirror.columns):
-            if mirror.axis == 0:
-                result[row, column] = frame[sum(mirror.rows) - 1 - row, column]
-            else:
-                result[row, column] = frame[row, sum(mirror.columns) - 1 - column]
-    return result
-
-
-def same(found, expected):
-    np.testing.assert_array_equal(found, expected)
->>>>>>> main
 
 
 # Where in memory a player is, along the axis of the mirror; and across it.
@@ -294,25 +227,6 @@ def test_in_a_mirror_actions_do_the_opposite(name):
         same(ours[1:], theirs[1:])
 
 
-<<<<<<< HEAD
-def test_the_mirror_of_breakout_is_in_its_middle():
-    frame, mirror = Emulator(BREAKOUT).frame(), BREAKOUT.mirror  # walls and bricks
-    (first, stop), error = mirror.columns, {}
-    for columns in ((first, stop), (first + 1, stop), (first, stop - 1)):
-        shown = augmentation.reflect(frame, mirror._replace(columns=columns))
-        error[columns] = np.abs(shown * 1.0 - frame).mean()
-    right, *wrong = error.values()
-    assert right < min(wrong) / 3
-
-
-def test_settings_that_cannot_be_are_refused():
-    for name, value in {"transitions": 0, "sticky": 1.5, "shift": 84, "max_steps": 2**29}.items():
-        with pytest.raises(ValueError, match=name):
-            domain.Settings(**{name: value})
-
-
-=======
->>>>>>> main
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory):
     """A folder of a few short games, made by the real command."""
@@ -409,7 +323,6 @@ def _die(*shard):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-<<<<<<< HEAD
 def test_what_others_have_made_is_not_replaced(copied, capsys):
     folder, arguments, manifest = copied
     for path in (manifest, manifest.with_name(collect.MARK)):
@@ -427,8 +340,8 @@ def test_what_others_have_made_is_not_replaced(copied, capsys):
         ({"demonstrator": "Somebody"}, "demonstrator Somebody with rules 1, and today's is Paddle"),
         ({"rules": 2}, "Paddle with rules 2, and today's is Paddle with rules 1"),
         ({"games": [{"noise": 0.2, "transitions": 900}]}, "other shares of random actions"),
-        ({"game": "Pong"}, "holds games of Pong, run 1, not of Breakout, run 1"),
-        ({"run": 2}, "holds games of Breakout, run 2, not of Breakout, run 1"),
+        ({"game": "Pong"}, "holds games of Pong, seed 1, not of Breakout, seed 1"),
+        ({"run": 2}, "holds games of Breakout, seed 2, not of Breakout, seed 1"),
     ],
 )
 def test_games_that_would_not_be_played_now_are_not_gone_on_with(copied, changed, message, capsys):
@@ -446,46 +359,12 @@ def test_games_that_would_not_be_played_now_are_not_gone_on_with(copied, changed
 
 def test_what_was_made_before_manifests_had_rules_is_by_the_first(copied, monkeypatch):
     _, arguments, path = copied
-=======
-def test_what_others_have_made_is_not_replaced(collected, tmp_path, capsys):
-    folder, arguments = collected
-    theirs = replay.replay_logs(tmp_path, BREAKOUT, 1)
-    theirs.mkdir(parents=True)
-    for path in replay.replay_logs(folder, BREAKOUT, 1).glob("*.gz"):
-        shutil.copy(path, theirs)
-    assert atari.main([*arguments, "--folder", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert "holds files that were not made here" in error and error.count("\n") == 1
-    assert collect.find_shards(tmp_path, BREAKOUT, 100, 1) is None
-    assert not list(theirs.glob("manifest*"))
-
-
-def test_games_by_other_rules_are_not_gone_on_with(collected, tmp_path, monkeypatch, capsys):
-    folder, arguments = collected
-    shutil.copytree(folder, tmp_path / "copy")
-    arguments = [*arguments, "--folder", str(tmp_path / "copy")]
-    path = replay.replay_logs(tmp_path / "copy", BREAKOUT, 1) / "manifest.0.json"
->>>>>>> main
     manifest = json.loads(path.read_text())
     del manifest["demonstrator"], manifest["rules"]
     path.write_text(json.dumps(manifest))
     assert atari.main(arguments) == 0
     monkeypatch.setitem(playing.RULES, "Breakout", 2)
     assert atari.main(arguments) == 2
-
-
-<<<<<<< HEAD
-def test_what_is_read_does_not_depend_on_what_else_was_made(copied):
-    folder, _, manifest = copied
-    assert collect.find_shards(folder, BREAKOUT, 10_000, 1) is None
-    source = domain.make_source(BREAKOUT, domain.Settings(transitions=100))
-    found = source.load(str(folder), 0)
-    shutil.rmtree(manifest.parent.parent / "leapjax")  # what was unpacked
-    part = manifest.with_name("$store$_action_ckpt.0.gz")
-    shutil.copy(part, part.with_name("$store$_action_ckpt.9.gz"))  # of a file nobody asks for
-    again = source.load(str(folder), 0)
-    for a, b in zip(found.demonstrations, again.demonstrations, strict=True):
-        same(a.actions, b.actions)
 
 
 def run_toy(folder, options):
@@ -499,22 +378,6 @@ def run_toy(folder, options):
     return row
 
 
-=======
-@pytest.mark.parametrize(("game", "number"), [("Pong", 1)])
-def test_a_folder_under_another_name_is_refused(collected, tmp_path, capsys, game, number):
-    folder, arguments = collected
-    shutil.copytree(folder / "Breakout" / "1", tmp_path / game / str(number))
-    where = ["--folder", str(tmp_path), "--game", game, "--dqn-seed", str(number)]
-    assert atari.main([*arguments, *where]) == 2
-    error = capsys.readouterr().err
-    assert f"holds games of Breakout, seed 1, not of {game}, seed {number}" in error
-    assert error.count("\n") == 1
-    settings = domain.Settings(transitions=100, dqn_seed=number)
-    with pytest.raises(UserError, match=f"of Breakout, seed 1, not of {game}, seed {number}"):
-        domain.make_source(GAMES[game], settings).load(str(tmp_path), 0)
-
-
->>>>>>> main
 def test_leap_trains_on_them_and_plays(collected, tmp_path, monkeypatch, capsys, quick_begin):
     monkeypatch.chdir(tmp_path)
     row = run_toy(collected[0], "--steps 4 --episodes 2")
@@ -551,10 +414,6 @@ def test_every_way_to_learn_trains_and_plays(
         (["--game", "Pong", "--demonstrations", "nowhere"], "nowhere"),
         (["collect", "--game", "Pongg"], "did you mean Pong"),
         (["collect", "--game", "Pong", "--transitions", "0"], "--transitions must be at least 1"),
-<<<<<<< HEAD
-=======
-        (["collect", "--game", "Pong", "--dqn-seed", "0"], "--dqn-seed must be at least 1"),
->>>>>>> main
     ],
 )
 def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
@@ -567,82 +426,25 @@ def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys
 def row_of(method, seed=0, mean=30.5, temperature=0.1, **changes):
     """A row of results in Breakout."""
     config = find_preset("atari", "Breakout", method, "leapjax")
-    name = configuration_hash(dataclasses.replace(config, **changes), seed)
+    name = hash_config(dataclasses.replace(config, **changes), seed)
     return {
         "experiment": "atari", "domain": "atari", "level": "Breakout", "seed": seed, "episodes": 10,
         "mean_return": mean, "return_error": 2.88, "train_steps": 0 if changes else 10,
         "configuration": {"planner": {"temperature": temperature}}, "method": method,
         "preset": "leapjax", "hash": name,
     }  # fmt: skip
-<<<<<<< HEAD
 
 
 def test_the_table_has_normalised_scores():
     rows = [row_of("bc"), row_of("bc", checkpoint=Path())]  # played again it is no other seed
-    table = played(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
-=======
-    name = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 0)
-    rows = [{**row, "method": "bc", "preset": "leapjax", "hash": name}]
-    # Its checkpoint played again is no other seed.
-    again = dataclasses.replace(
-        find_preset("atari", "Breakout", "bc", "leapjax"), checkpoint=Path()
-    )
-    rows += [{**rows[0], "train_steps": 0, "hash": hash_config(again, 0)}]
     table = compare_scores(rows, {"Breakout": [{"score": 10.0}, {"score": 22.2}], "Pong": []})
->>>>>>> main
     none = "- | - | - | - | -"
     assert f"| Breakout | ours | - | - | 100.0 ± 10.0 | {none} | 50.0 |" in table
     assert f"| Breakout | score | - | - | 30.5 ± 2.9 | {none} | 16.1 |" in table
     paper = "400.9 | 182.0 | 138.9 | 267.5 | 211.1 | 17.1 | 8.9"
     assert f"| Breakout | paper | {paper} | - | - |" in table
-<<<<<<< HEAD
-    table = played([*rows, row_of("bc", seed=1, mean=40.5)], {})
+    table = compare_scores([*rows, row_of("bc", seed=1, mean=40.5)], {})
     assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in table
     # Who always takes the best action plays four games, however often.
-    table = played([row_of("cql", temperature=0.0)], {})
+    table = compare_scores([row_of("cql", temperature=0.0)], {})
     assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
-
-
-def test_data_of_another_size_are_recorded_beside_the_usual(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(atari, "RECORDED", tmp_path / "data.json")
-    game = {"score": 3.0, "noise": 0.1, "transitions": 7}
-    monkeypatch.setattr(collect, "collect", lambda *arguments: [{"games": [game]}])
-    record = ["collect", "--game", "Breakout", "--record"]
-    for size in ("500000", "50000"):
-        assert atari.main([*record, "--transitions", size]) == 0
-    assert atari.main([*record, "--longest", "2"]) == 2
-    assert "--record is for data that are learned from" in capsys.readouterr().err
-    recorded = json.loads((tmp_path / "data.json").read_text())
-    names = ("Breakout", "Breakout, 500,000 transitions")
-    assert recorded == {name: [game] for name in names}
-    lines = data(recorded).splitlines()[2:]
-    assert lines == [f"| {name} | 1 | 7 | 3.0 | 3 .. 3 | 3.0 (10%) |" for name in names]
-=======
-    second = hash_config(find_preset("atari", "Breakout", "bc", "leapjax"), 1)
-    rows.append({**rows[0], "seed": 1, "hash": second, "mean_return": 40.5})
-    assert "| Breakout | score | - | - | 35.5 ± 5.0 |" in compare_scores(rows, {})
-    # Who always takes the best action plays four games, however often.
-    name = hash_config(find_preset("atari", "Breakout", "cql", "leapjax"), 0)
-    greedy = {"method": "cql", "hash": name, "configuration": {"planner": {"temperature": 0.0}}}
-    table = compare_scores([{**rows[0], **greedy}], {})
-    assert "| Breakout | ours | - | - | - | - | 100.0 | - | - | - | - |" in table
-
-
-def test_a_step_that_was_begun_is_waited_for():
-    adapter, other = AtariAdapter(BREAKOUT, 0.0, 27_000), AtariAdapter(BREAKOUT, 0.0, 27_000)
-    assert isinstance(adapter, Eager)
-    adapter.reset(3), other.reset(3)
-    for index in range(30):
-        adapter.begin(index % 4)
-        begun, stepped = adapter.step(index % 4), other.step(index % 4)
-        np.testing.assert_array_equal(begun.observation, stepped.observation)
-        assert begun[1:] == stepped[1:]
-    adapter.begin(1)
-    with pytest.raises(ValueError, match="action 1 was begun, not 2"):
-        adapter.step(2)
-    # What it was busy with is not of the next game.
-    np.testing.assert_array_equal(adapter.reset(4), other.reset(4))
-    for action in [2, 1, 0, 3, 1]:
-        np.testing.assert_array_equal(adapter.step(action)[0], other.step(action)[0])
-    assert adapter.score == other.score
->>>>>>> main

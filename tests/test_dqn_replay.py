@@ -56,16 +56,10 @@ def stale(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([x, np.asarray(last[name], x.dtype)]) for name, x in rows.items()}
 
 
-<<<<<<< HEAD
-def put(folder: Path, some, number: int = 0, run: int = 1) -> Path:
+def put(folder: Path, some, number: int = 0, dqn_seed: int = 1) -> Path:
     """Writes a shard of episodes, or of rows, with NumPy and gzip alone."""
     rows = some if isinstance(some, dict) else stale(rows_of(some))
-    logs = folder / "Pong" / str(run) / "replay_logs"
-=======
-def put(folder: Path, rows: dict[str, np.ndarray], number: int = 0, dqn_seed: int = 1) -> Path:
-    """Writes a shard with NumPy and gzip alone."""
     logs = folder / "Pong" / str(dqn_seed) / "replay_logs"
->>>>>>> main
     logs.mkdir(parents=True, exist_ok=True)
     count = len(rows["action"]) - 1
     arrays = {f"$store$_{name}": x for name, x in rows.items()}
@@ -149,7 +143,6 @@ def test_a_last_row_is_never_used(tmp_path):
     assert dropped == {CUT_AFTER: 1}
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("padding", [3, 0])
 def test_black_frames_of_a_game_are_kept(tmp_path, padding):
     some = episodes([2, 3, 9, 1])
@@ -165,9 +158,6 @@ def test_black_frames_of_a_game_are_kept(tmp_path, padding):
 def test_sampling_takes_ten_at_a_visit_where_the_last_one_ended_until_there_are_enough(
     three_shards,
 ):
-=======
-def test_sampling_stops_at_enough(three_shards):
->>>>>>> main
     folder, originals = three_shards
     for wanted in (1, 30, 100):
         lengths = [len(d.actions) for d in read(folder, wanted).demonstrations]
@@ -256,36 +246,14 @@ def test_frames_are_never_all_in_memory(tmp_path):
     assert peak < 1000 * 84 * 84 / 2  # not even one of the two was in memory as a whole
 
 
-<<<<<<< HEAD
-def test_only_what_is_needed_is_unpacked(tmp_path):
-    path = put(tmp_path, episodes([50] * 40)) / f"{OBSERVATION}_ckpt.0.gz"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert len(read(tmp_path, 60).demonstrations) == 2
-    assert "ended before" in refused(tmp_path)
-
-
-=======
->>>>>>> main
 def test_no_such_folder_game_run_or_shard(tmp_path, monkeypatch):
     message = refused(tmp_path / "absent")
     assert "Pong/1/replay_logs" in message and "gs://atari-replay-datasets" in message
-<<<<<<< HEAD
-    assert "`python -m experiments.atari collect --game Pong`" in message
-    put(tmp_path, episodes([5]), run=2)
+    put(tmp_path, episodes([5]), dqn_seed=2)
     assert f"no data of Breakout in {tmp_path}, only of Pong" in refused(
         tmp_path, GAMES["Breakout"]
     )
-    assert f"no run 1 of Pong in {tmp_path}, only 2" in refused(tmp_path)
-=======
-    put(tmp_path, stale(rows_of(episodes([5]))), dqn_seed=2)
-    message = refused(tmp_path, GAMES["Breakout"])
-    assert f"no data of Breakout in {tmp_path}, only of Pong" in message
-    assert "no DQN of seed 1 of Pong" in refused(tmp_path) and "only 2" in refused(tmp_path)
-    assert "at least 1, got 0" in refused(tmp_path, dqn_seed=2, transitions=0)
-    logs = replay.replay_logs(tmp_path, PONG, 1)
-    logs.mkdir(parents=True)
-    assert f"no shards in {logs}" in refused(tmp_path)
->>>>>>> main
+    assert f"no DQN of seed 1 of Pong in {tmp_path}, only 2" in refused(tmp_path)
     monkeypatch.setattr(files, "SPARE", 2**60)
     assert "make room" in refused(tmp_path, dqn_seed=2)
 
@@ -389,17 +357,3 @@ def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, written_
     with pytest.raises(KeyboardInterrupt):
         replay.write_shard(tmp_path, 0, episodes([5, 6]))
     assert not replay.has_shard(tmp_path, 0)
-<<<<<<< HEAD
-
-
-def test_episodes_that_are_none(tmp_path):
-    (e,) = episodes([4])
-    for some in ([], [e._replace(rewards=e.rewards[1:])], [e._replace(frames=e.frames[:, 1:])]):
-        with pytest.raises(ValueError, match="episode"):
-            replay.write_shard(tmp_path, 0, some)
-    assert not list(tmp_path.iterdir())
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UserError, match="cannot write"):
-        replay.write_shard(tmp_path / "file" / "replay_logs", 0, [e])
-=======
->>>>>>> main

@@ -56,30 +56,14 @@ def context_of(digits, cell=0):
 
 
 def test_the_search_finds_every_board_and_no_other():
-<<<<<<< HEAD
-    every = boards.solutions(np.zeros(16, np.int32), most=1000)
-    assert len(every) == len({tuple(board) for board in every}) == 288  # as is known of 4 by 4
-=======
     every = boards.find_solutions(np.zeros(16, np.int32), most=1000)
-    assert len(every) == 288  # as is known of 4 by 4
-    assert len({tuple(board) for board in every}) == 288
->>>>>>> main
+    assert len(every) == len({tuple(board) for board in every}) == 288  # as is known of 4 by 4
     assert all(solved(board, 4) for board in every)
     contradiction = np.zeros(16, np.int32)
     contradiction[[0, 3]] = 2
     assert boards.find_solutions(contradiction) == []
 
 
-<<<<<<< HEAD
-=======
-def test_the_search_finds_the_solution_of_a_published_board():
-    clues = "530070000600195000098000060800060003400803001700020006060000280000419005000080079"
-    solution = "534678912672195348198342567859761423426853791713924856961537284287419635345286179"
-    (found,) = boards.find_solutions(np.array(list(clues), int))
-    assert "".join(map(str, found)) == solution
-
-
->>>>>>> main
 @SIZES
 def test_boards_have_so_many_clues_and_one_solution(size):
     seen = set()
@@ -87,13 +71,8 @@ def test_boards_have_so_many_clues_and_one_solution(size):
         clues, solution = boards.draw(size, seed)
         assert (clues > 0).sum() == size.clues
         assert (clues == np.where(clues > 0, solution, 0)).all() and solved(solution, size.side)
-<<<<<<< HEAD
-        (only,) = boards.solutions(clues)
-        same(only, solution)
-=======
         (only,) = boards.find_solutions(clues)
-        np.testing.assert_array_equal(only, solution)
->>>>>>> main
+        same(only, solution)
         seen.add(tuple(clues))
     assert len(seen) == 10
 
@@ -137,13 +116,8 @@ def test_a_transformed_window_is_that_of_another_board(size, cell):
         board, past = window.context.observation, window.context.past
         assert board.cell == cell
         assert (window.actions[rest:] == size.side).all()  # the end action
-<<<<<<< HEAD
-        (solution,) = boards.solutions(board.digits)  # what is left has one solution
-        same(window.actions[:rest] + 1, solution[cell:])
-=======
         (solution,) = boards.find_solutions(board.digits)  # what is left has one solution
-        np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
->>>>>>> main
+        same(window.actions[:rest] + 1, solution[cell:])
         assert (board.digits[:cell] > 0).all()
         clues = (board.digits[cell:] > 0).sum()
         assert clues <= size.clues and (cell > 0 or clues == size.clues)
@@ -242,23 +216,11 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
         same(np.where(clues > 0, plan.actions + 1, 0), clues)
         return (plan.actions + 1 == solution).all(axis=1).mean()
 
-<<<<<<< HEAD
     energy, certain = rules(4), {"iterations": 16, "fill": "confident"}
     alone = share(energy, (), **certain)
     assert alone > max(0.9, share(energy, (), iterations=16, fill="sequential"))
     assert share(energy, (), iterations=160, temperature=1.0, restarts=10) > 0.9
     assert share(compose([energy, energy], [0.5, 0.5]), ((), ()), **certain) == alone
-=======
-    certain = GibbsConfig(16, iterations=16, fill="confident")
-    left_to_right = GibbsConfig(16, iterations=16, fill="sequential")
-    refined = GibbsConfig(16, iterations=160, temperature=1.0, restarts=10)
-    energy = rules(4)
-    assert share(energy, (), left_to_right) < share(energy, (), certain)
-    assert share(energy, (), certain) > 0.9
-    assert share(energy, (), refined) > 0.9
-    both = compose([energy, energy], [0.5, 0.5])
-    assert share(both, ((), ()), certain) == share(energy, (), certain)
->>>>>>> main
 
 
 def test_data_that_solve_no_board_are_refused():
@@ -296,7 +258,7 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, play, qui
     (folder,) = (path for path in (tmp_path / "runs").glob("sudoku-*"))
     play(f"--checkpoint {folder} --rules 1")
     rows = play("--method rules")
-    found = [(row["method"], row["iterations"], results.planner_name(row)) for row in rows]
+    found = [(row["method"], row["iterations"], results.name_planner(row)) for row in rows]
     assert found == [
         ("leap", 16, "N = 16, confident"), ("leap", 1, "N = 1"),
         ("leap", 16, "N = 16, confident, rules 1.0"),
@@ -307,15 +269,6 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, play, qui
     assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
 
 
-<<<<<<< HEAD
-def test_rules_go_on_where_the_board_is(play):
-    """Planned anew after every few digits, and only as far."""
-    row, _ = play("--method rules --executed 4 --horizon 5 --iterations 5")
-    assert row["successes"] >= 3
-
-
-=======
->>>>>>> main
 @pytest.mark.parametrize(
     ("program", "arguments", "message"),
     [
