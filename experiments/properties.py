@@ -178,7 +178,7 @@ masked = functools.partial(penalise_unseen, weight=math.inf)
 
 
 def penalise_revisits(minimise: Minimise, handling: bool = False) -> Minimise:
-    """The same energy, and more for each time that the agent comes where it was (`revisits`)."""
+    """The same energy, and more for each time that the agent comes where it was."""
     return functools.partial(_explored, minimise=minimise, nats=AGAIN, handling=handling)
 
 

@@ -4,7 +4,7 @@ import string
 
 import gymnasium as gym
 import h5py
-import numpy as np
+import jax
 import pytest
 from gymnasium import spaces
 from minari import DataCollector
@@ -18,26 +18,20 @@ from leapjax.domains.babyai.domain import BABYAI
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
 from leapjax.running import command_line
+from tests.oracles import assert_same_observation
 from tests.programs import TOY, only_long
 from tests.test_storage import file_of
 
 LEVEL = "BabyAI-GoToLocal-v0"
 DOMAIN = BABYAI.make(LEVEL, Settings())
 LEFT, DONE = 0, 6
-NAMES = {"partial": "minigrid/BabyAI-GoToLocal/optimal-v0", "whole": "minigrid/full/optimal-v0"}
+PARTIAL = "minigrid/BabyAI-GoToLocal/optimal-v0"
 
 
-@pytest.mark.parametrize("level", ["BabyAI-GoToLocalS7N5-v0"])
-def test_a_view_may_be_as_large_as_the_level(level):
-    name = recorded("minigrid/small-v0", episodes=2, level=level)
-    collection = storage.load(name, BABYAI.make(level, Settings()))
-    assert not collection.dropped and len(collection.demonstrations) == 2
-
-
-def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None, first=1000):
+def recorded(name, wrap=None, episodes=5, level=LEVEL, spoil=None, first=1000):
     """A data set of MiniGrid's bot, whose episode 1 is spoiled."""
     with levels.silenced():
-        env = wrap(gym.make(level))
+        env = gym.make(level) if wrap is None else wrap(gym.make(level))
     words = spaces.Text(200, charset=string.printable)
     space = spaces.Dict({**env.observation_space.spaces, "mission": words})
     collector = DataCollector(env, observation_space=space, jpeg_encoding=False)
@@ -59,42 +53,42 @@ def recorded(name, wrap=lambda env: env, episodes=5, level=LEVEL, spoil=None, fi
     return name
 
 
-@pytest.mark.parametrize("view", ["partial", "whole"])
-def test_what_was_recorded_is_played_again_and_seen_as_a_whole(view):
-    wrap = FullyObsWrapper if view == "whole" else lambda env: env
-    collection = storage.load(recorded(NAMES[view], wrap), DOMAIN)
+@pytest.mark.parametrize(
+    ("wrap", "level"),
+    [(None, LEVEL), (FullyObsWrapper, LEVEL), (None, "BabyAI-GoToLocalS7N5-v0")],  # 7: the view
+)
+def test_what_was_recorded_is_played_again_and_seen_as_a_whole(wrap, level):
+    name, domain = "minigrid/some/optimal-v0", BABYAI.make(level, Settings())
+    collection = storage.load(recorded(name, wrap, level=level), domain)
     assert not collection.dropped and len(collection.demonstrations) == 5
-    level = levels.find_level(LEVEL)
+    adapter = demonstrations.BabyAIAdapter(levels.find_level(level))
     for number, found in enumerate(collection.demonstrations):
         assert found.seed == 1000 + number and found.terminated and found.rewards[-1] > 0
-        adapter = demonstrations.BabyAIAdapter(level)
         state = adapter.reset(found.seed)
         for step, action in enumerate([*found.actions, None]):
-            for ours, expected in zip(found.observations, state, strict=True):
-                np.testing.assert_array_equal(ours[step], expected)
+            assert_same_observation(jax.tree.map(lambda x, i=step: x[i], found.observations), state)
             if action is not None:
                 state = adapter.step(int(action)).observation
-    few = storage.load(NAMES[view], DOMAIN, most=2).demonstrations
-    assert [d.seed for d in few] == [1000, 1001]
+    assert [d.seed for d in storage.load(name, domain, most=2).demonstrations] == [1000, 1001]
 
 
-@pytest.mark.parametrize(("spoil", "reason"), [(DONE, replay.DONE), (LEFT, replay.FAILED)])
-def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(spoil, reason):
-    collection = storage.load(recorded(NAMES["partial"], spoil=spoil), DOMAIN)
+@pytest.mark.parametrize(
+    ("options", "reason", "seeds"),
+    [
+        ({"spoil": DONE}, replay.DONE, [1000, 1002, 1003, 1004]),
+        ({"spoil": LEFT}, replay.FAILED, [1000, 1002, 1003, 1004]),
+        # It ends at another match: what is observed of the goal would teach to go elsewhere.
+        ({"episodes": 2, "first": 1008}, replay.OTHER_GOAL, [1008]),
+    ],
+)
+def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(options, reason, seeds):
+    collection = storage.load(recorded(PARTIAL, **options), DOMAIN)
     assert collection.dropped == {reason: 1}
-    assert [d.seed for d in collection.demonstrations] == [1000, 1002, 1003, 1004]
-    assert storage.describe_dropped(collection) == f"1 {reason}"
-
-
-def test_an_episode_that_ends_at_another_match_is_dropped_and_counted():
-    # What is observed of the goal would teach to go elsewhere.
-    collection = storage.load(recorded(NAMES["partial"], episodes=2, first=1008), DOMAIN)
-    assert collection.dropped == {replay.OTHER_GOAL: 1}
-    assert [d.seed for d in collection.demonstrations] == [1008]
+    assert [d.seed for d in collection.demonstrations] == seeds
 
 
 def test_episodes_that_go_otherwise_are_dropped_and_counted():
-    name = recorded(NAMES["partial"], episodes=6)
+    name = recorded(PARTIAL, episodes=6)
     with h5py.File(file_of(storage.find_datasets_folder(), name), "a") as file:
         file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never was
         file["episode_2"].attrs["seed"] = 5  # of another level
@@ -113,19 +107,18 @@ def test_episodes_that_go_otherwise_are_dropped_and_counted():
 
 
 def test_the_level_follows_from_the_data_and_must_be_theirs():
-    name = recorded(NAMES["partial"], episodes=1)
+    name = recorded(PARTIAL, episodes=1)
     (chosen,) = command_line.parse("babyai", ["--demonstrations", name])
     assert chosen.level == LEVEL and chosen.demonstrations == name
     with pytest.raises(
         UserError, match=f"is of {LEVEL}, not of GoToLocalS7N5: use --level {LEVEL}"
     ):
         command_line.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
-    assert storage.describe_dataset("no/such/set-v0").level is None
 
 
 def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    name = recorded(NAMES["partial"], spoil=DONE)
+    name = recorded(PARTIAL, spoil=DONE)
     assert babyai.main([*TOY, "--demonstrations", name]) == 2
     assert f"4 episodes that can be used (1 {replay.DONE}), fewer than 6" in (
         " ".join(capsys.readouterr().err.split())
