@@ -70,8 +70,7 @@ def test_a_restored_game_goes_on_the_same(name):
     def future(step):
         return [(step(action), emulator.lives, *emulator.ram()) for action in actions[30:]]
 
-    first = future(emulator.step)
-    last = emulator.frame()
+    first, last = future(emulator.step), emulator.frame()
     emulator.restore(saved)
     assert emulator.action == actions[29]
     np.testing.assert_array_equal(emulator.frame(), frame)
@@ -84,17 +83,14 @@ def test_a_restored_game_goes_on_the_same(name):
 @games
 def test_a_game_is_what_its_seed_and_noise_say_and_can_be_played_again(name):
     game = played(name, noise=0.5)
-    assert len(game.actions) == 12
     assert game.frames.shape == (12, 84, 84) and game.frames.dtype == np.uint8
     assert game.actions.dtype == np.int32 and game.rewards.dtype == np.float32
     assert game.score == game.rewards.sum()
     assert same(game, play(GAMES[name], 0, 0.5, 12))
     assert not same(game, played(name, seed=1, noise=0.5))
-    noisy = played(name, noise=1.0)
-    assert len(set(noisy.actions)) >= 4 and not same(played(name), noisy)
+    assert not same(played(name), played(name, noise=1.0))
     levels = [choose_noise(GAMES[name], number) for number in range(6)]
     assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
-    assert levels[2] <= (0.7 if name == "Seaquest" else 0.5)
     emulator = Emulator(GAMES[name])
     starts = np.random.default_rng(np.random.SeedSequence(0).spawn(3)[0])
     emulator.reset(int(starts.integers(31)))
@@ -112,30 +108,15 @@ def test_recorded_games_are_played_again(name):
     assert (len(game.actions), game.score) == (shortest["transitions"], shortest["score"])
 
 
-def test_pong_returns_every_ball():
-    assert not (played("Pong", most_steps=200).rewards < 0).any()
-    assert play_at_random("Pong", 200) < 0
-
-
-def test_breakout_keeps_its_ball():
-    assert played("Breakout", most_steps=250).score >= 8
-    # To do nothing asks for a ball, too: there is no moment without one to be learned apart.
-    assert not (played("Breakout", most_steps=250).actions == 0).any()
-
-
-def test_qbert_colours_tiles():
-    game = played("Qbert", most_steps=80)
-    assert game.score >= 100
-    # Also where nothing can be done it asks for a hop, so that to do nothing is not learned.
-    assert (game.actions > 1).all()
-
-
-def test_seaquest_shoots_fetches_divers_and_never_waits():
-    game = played("Seaquest", seed=1, most_steps=1500)
-    assert game.score >= 1500
-    assert play_at_random("Seaquest", 1500) < 500
-    assert len(game.actions) == 1500  # it is alive
-    assert 0 not in game.actions
+def test_demonstrators_play_well_and_never_wait():
+    """Where nothing can be done they ask for a ball or a hop: waiting is not to be learned."""
+    pong, breakout = played("Pong", most_steps=200), played("Breakout", most_steps=250)
+    assert not (pong.rewards < 0).any() and play_at_random("Pong", 200) < 0
+    assert breakout.score >= 8 and 0 not in breakout.actions
+    qbert, seaquest = played("Qbert", most_steps=80), played("Seaquest", 1, most_steps=1500)
+    assert qbert.score >= 100 and (qbert.actions > 1).all()
+    assert seaquest.score >= 1500 > 3 * play_at_random("Seaquest", 1500)
+    assert len(seaquest.actions) == 1500 and 0 not in seaquest.actions  # it is alive
 
 
 def test_seaquest_sees_what_is_on_the_screen():
