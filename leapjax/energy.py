@@ -1,9 +1,9 @@
 """Energies over plans and their algebra: every function here returns an `Energy`.
 
-An energy is written for one trajectory. Parameters are always an argument and varying
-data lives in the context, so an energy is built once and compiled once. Actions and positions
-that are not integers raise `ValueError`. So do, outside of `jit`, where values can be seen, those
-that are out of range, and energies that are NaN; inside, a plan says whether it is `valid`.
+An energy is written for one trajectory. Parameters are an argument and varying data lives in the
+context, so an energy is built once and compiled once. Actions and positions that are not integers
+raise `ValueError`. Outside of `jit`, so do integers out of range, and energies that are NaN. Inside
+of `jit` values are unknown; there the field `valid` of a plan tells.
 """
 
 from collections.abc import Callable, Sequence
@@ -62,15 +62,14 @@ def pseudo_likelihood(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> E
 def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Energy:
     """The energy of a model that chooses actions from left to right.
 
-    `total` is the negative log-likelihood of the plan, and `conditional` one term of it: the
-    energy of an action given those before it, whatever comes after. `beam_search` is the planner
-    for it.
+    `total` is the negative log-likelihood of the plan. `conditional` is one term of it: the energy
+    of an action given the actions before it. `beam_search` is the planner for it.
 
     Args:
         encode: (params, context) -> memory.
         logits: (params, memory, tokens `[T]`, positions `[P]`) -> `[P, A]` unnormalised
-            log-probabilities, of which each depends on the tokens before its position alone;
-            -inf forbids an action.
+            log-probabilities, which depend on the tokens before the position only; -inf forbids
+            an action.
         num_actions: A, the end action included.
     """
 
@@ -95,8 +94,8 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
 def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
     """An energy from its total alone: any function of a complete plan will do.
 
-    The conditional tries every action at every position while all others are as they are, `P * A`
-    evaluations; MASK is not accepted, so planners start from uniform actions.
+    The conditional tries every action at every position and keeps the rest of the plan, `P * A`
+    evaluations. It accepts no MASK, so planners start from uniform actions.
 
     Args:
         encode: (params, context) -> memory.
@@ -139,8 +138,8 @@ def single_action(
     """
 
     def energies(params: Params, memory: PyTree) -> jax.Array:
-        found = check_floats("scores", scores(params, memory), (num_actions - 1,))
-        return jnp.append(-found, jnp.inf)
+        values = check_floats("scores", scores(params, memory), (num_actions - 1,))
+        return jnp.append(-values, jnp.inf)
 
     def conditional(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
@@ -169,8 +168,8 @@ def _check_single(actions: jax.Array) -> None:
 def classifier(encode: EncodeFn, degree: TotalFn, num_actions: int) -> Energy:
     """The energy of a sequence classifier (paper, appendix, ablation).
 
-    It is trained to say how corrupted a whole plan is, so that what a demonstrator would do
-    has the least energy; `leapjax.agents.classifier` trains the paper's LSTM.
+    The classifier estimates how corrupted a whole plan is, so a demonstrator's plan has the least
+    energy. `leapjax.agents.classifier` trains the paper's LSTM.
 
     Args:
         encode: (params, context) -> memory.
@@ -207,8 +206,8 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
             f"composed energies must agree on one action set, got sizes {sorted(action_sets)}"
         )
     num_actions = energies[0].num_actions
-    # Weight 0 leaves the values of an energy out: 0 * inf would be NaN. JAX takes what is smaller
-    # than `tiny` for 0.
+    # Weight 0 leaves the values of an energy out: 0 * inf would be NaN. JAX rounds numbers below
+    # `tiny` to 0.
     active = [index for index, weight in enumerate(weights) if weight >= np.finfo(np.float32).tiny]
 
     def encode(params: Params, context: PyTree) -> PyTree:
@@ -239,8 +238,8 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
         result = jnp.zeros((), jnp.float32)
-        for energy, p, known in zip(energies, params, memory, strict=True):
-            result += energy.violation(p, known, actions)
+        for energy, p, own_memory in zip(energies, params, memory, strict=True):
+            result += energy.violation(p, own_memory, actions)
         return result
 
     accepts_mask = all(energies[i].accepts_mask for i in active)
@@ -256,29 +255,27 @@ def constrain(
 ) -> Energy:
     """Adds a test-time constraint (paper, section 4, online adaptation).
 
-    Each position is judged with all others as they are, those that are asked for with it, too.
-    While a plan still holds MASK outside the position in question the penalty is not
-    evaluated: it is a function of complete plans. So the first, all-masked iteration
-    ignores it and every later one obeys it. A penalty that grows with the number of
-    violations leads the search out of them one by one; +inf only filters.
+    The conditional tries every action at one position and keeps the rest of the plan. The penalty
+    is a function of complete plans, so it counts only if the rest holds no MASK. The first
+    iteration, with all positions masked, ignores it; later iterations obey it. A penalty that grows
+    with the number of violations leads the search out of them one by one; +inf only filters.
 
-    A `partial` penalty also judges plans that hold MASK, by what is certain of them already. A
-    plan that is filled from left to right, by `gibbs` or `beam_search`, then never begins in a
-    way that is not allowed.
+    A `partial` penalty also judges incomplete plans, by the actions that they have. A plan that
+    `gibbs` or `beam_search` fills from left to right then begins in an allowed way.
 
     Args:
         energy: the energy to constrain.
-        penalty: (context, actions `[T]`) -> `[]`: 0 or less where the plan is allowed,
-            positive (+inf for never) where it is not.
-        partial: the penalty takes plans that hold MASK, the number of actions, too.
+        penalty: (context, actions `[T]`) -> `[]`: 0 or less for an allowed plan, positive for
+            others. +inf forbids a plan.
+        partial: whether the penalty takes plans that hold MASK, the number of actions.
     """
     complete = check_kind(energy, Energy).num_actions - 1  # the last action
 
     def judge(context: PyTree, plan: jax.Array) -> jax.Array:
         return check_floats("a penalty", penalty(context, plan), ())
 
-    def known(context: PyTree, plan: jax.Array) -> jax.Array:
-        """The penalty of what a plan says so far."""
+    def judge_if_complete(context: PyTree, plan: jax.Array) -> jax.Array:
+        """Returns the penalty; 0 for an incomplete plan, unless the penalty is `partial`."""
         if partial:
             return judge(context, plan)
         judged = judge(context, jnp.minimum(plan, complete))
@@ -294,10 +291,10 @@ def constrain(
         actions, positions = _check_query(actions, positions, energy.num_actions)
         base = energy.conditional(params, inner, actions, positions)
         extra = _try_every_action(
-            lambda plan: known(context, plan), actions, positions, energy.num_actions
+            lambda plan: judge_if_complete(context, plan), actions, positions, energy.num_actions
         )
-        # Where no action that is possible at a position makes the plan allowed, another position
-        # has to change: the constraint then says nothing about this one.
+        # If every possible action at a position is forbidden, another position has to change. Then
+        # this position ignores the constraint.
         both = base + extra
         hopeless = jnp.all(jnp.isinf(both), axis=-1, keepdims=True)
         return _check_energies(jnp.where(hopeless, base, both), positions)
@@ -310,7 +307,7 @@ def constrain(
     def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         inner, context = memory
         actions = _check_plan(actions, energy.num_actions)
-        # What one penalty allows, even rewards, makes no other violation good.
+        # A negative penalty must not offset other violations.
         mine = jnp.maximum(judge(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
 
@@ -318,10 +315,10 @@ def constrain(
 
 
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
-    """Puts `function(context)` in front of an energy: what this energy may see.
+    """Makes an energy that reads `function(context)` in place of the context.
 
-    A constraint of this energy sees the same, `function(context)`, and still counts. To judge
-    plans by the whole context, constrain what `view` returns.
+    A constraint of the given energy also reads `function(context)`. To judge plans by the whole
+    context, constrain the result of `view`.
     """
 
     def encode(params: Params, context: PyTree) -> PyTree:
@@ -331,20 +328,18 @@ def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
-    """An energy without an opinion on some actions: each is as good as the best of the others.
+    """Makes some actions of an energy neutral: each is as good as the best other action.
 
-    For `compose`, where a model's data never showed actions that another model needs: going to an
-    object says nothing against picking it up. In the rest of a plan such an action is MASK to the
-    model, which does not know it.
+    Use it in `compose` if a model's data lack actions that another model needs: a model of going to
+    objects should not object to picking them up. The model sees MASK in place of neutral actions.
 
     Args:
-        energy: one that accepts MASK.
-        actions: that it should say nothing of, by number or as a mask `[A]` of booleans; at least
-            one is left.
+        energy: energy that accepts MASK.
+        actions: neutral actions, as numbers or as booleans `[A]`; at least one action must remain.
 
     Raises:
-        ValueError: the energy accepts no MASK, the actions are none, all, or none of its own, or
-            it is constrained: what is MASK would not be judged.
+        ValueError: the energy does not accept MASK or is constrained, or the actions are out of
+            range, all actions, or an empty sequence.
     """
     chosen = check_indices("neutral actions", actions, check_kind(energy, Energy).num_actions)
     if energy.violation is not no_violation:
@@ -360,8 +355,8 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, energy.num_actions)
-        seen = jnp.where(jnp.isin(actions, jnp.array(chosen)), mask, actions)
-        energies = energy.conditional(params, memory, seen, positions)
+        masked = jnp.where(jnp.isin(actions, jnp.array(chosen)), mask, actions)
+        energies = energy.conditional(params, memory, masked, positions)
         best = jnp.min(jnp.where(unknown, jnp.inf, energies), axis=-1, keepdims=True)
         return jnp.where(unknown, best, energies)
 
@@ -370,7 +365,7 @@ def neutral(energy: Energy, actions: Sequence[int]) -> Energy:
 
 
 def _sum_of_conditionals(conditional: ConditionalFn, num_actions: int) -> TotalFn:
-    """The total of a plan: at every position the energy of its action, given all others."""
+    """Makes a total from conditionals: the sum over positions of the energy of its action."""
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
@@ -391,7 +386,7 @@ def _try_every_action(
     positions: jax.Array,
     num_actions: int,
 ) -> jax.Array:
-    """`evaluate` of the plan with each action at each position in turn: `[P, A]`."""
+    """Evaluates the plan with each action at each position in turn: `[P, A]`."""
 
     def at(position: jax.Array, action: jax.Array) -> jax.Array:
         return evaluate(actions.at[position].set(action))
@@ -404,7 +399,7 @@ def _try_every_action(
 def _check_query(
     actions: jax.Array, positions: jax.Array, num_actions: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Both as JAX's arrays of int32."""
+    """Checks actions and positions, and returns them as int32 arrays of JAX."""
     actions = _check_plan(actions, num_actions)
     end = actions.shape[0]
     expected = f"0 .. {end - 1}, the horizon is {end}"
@@ -412,16 +407,16 @@ def _check_query(
 
 
 def _check_plan(actions: jax.Array, num_actions: int) -> jax.Array:
-    """Actions `[T]`, which may be MASK, as JAX's array of int32."""
+    """Checks actions `[T]`, which may be MASK, and returns them as an int32 array of JAX."""
     expected = f"0 .. {num_actions - 1}, or {num_actions} for MASK"
     return _check_integers("actions", actions, num_actions + 1, expected)
 
 
 def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> jax.Array:
-    """Integers `[n]` below `end` as JAX's array of int32.
+    """Checks integers `[n]` below `end`, and returns them as an int32 array of JAX.
 
     Raises:
-        ValueError: not integers; or, outside of `jit`, out of range.
+        ValueError: the values are not integers or, outside of `jit`, out of range.
     """
     if not isinstance(values, jax.Array):
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
@@ -433,9 +428,9 @@ def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> ja
     if not jnp.issubdtype(values.dtype, jnp.integer):
         raise ValueError(f"{name} must be integers, got {values.dtype}")
     if not isinstance(values, jax.core.Tracer) and values.size:
-        seen = np.asarray(values)  # a constant of a program is an array there too
-        if int(seen.min()) < 0 or int(seen.max()) >= end:
-            raise ValueError(f"{name} {seen} are not all in {expected}")
+        concrete = np.asarray(values)  # a constant of a program is an array there too
+        if int(concrete.min()) < 0 or int(concrete.max()) >= end:
+            raise ValueError(f"{name} {concrete} are not all in {expected}")
     return jnp.asarray(values, jnp.int32)
 
 
@@ -456,6 +451,6 @@ def _check_total(energy: jax.Array) -> jax.Array:
 
 
 def _infinite_if_incomplete(energy: jax.Array, actions: jax.Array, num_actions: int) -> jax.Array:
-    """A plan that still holds MASK has no total energy: it is never the best plan."""
+    """Returns +inf for a plan that holds MASK, so that it is never the best plan."""
     complete = jnp.all((actions >= 0) & (actions < num_actions))
     return jnp.where(complete, energy, jnp.inf)

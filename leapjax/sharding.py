@@ -1,11 +1,10 @@
 """Where arrays live: one mesh of devices for batches and, if asked for, for parameters.
 
-The mesh has two axes. Batches are split over both; parameters and what the optimizer keeps
-of them are whole on every device, or split over the second axis (ZeRO, FSDP).
+The mesh has two axes. Both split batches. Parameters and the optimizer's state are whole on every
+device, or the second axis splits them (ZeRO, FSDP).
 
-The cores of a CPU are used best as several devices of their own, each with its share of
-the batch: the many small operations of these networks do not split well by themselves
-(docs/performance.md). Set `jax_num_cpu_devices` before JAX starts to have them.
+A CPU is fastest with one device for each core, because the many small operations of these networks
+do not split well (docs/performance.md). Set `jax_num_cpu_devices` before JAX starts.
 """
 
 import functools
@@ -30,12 +29,12 @@ SMALLEST_SPLIT = 1024  # elements; smaller parameters are whole everywhere
 
 
 def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int = 1) -> Mesh:
-    """A mesh `[data, fsdp]` of as many devices as split a batch evenly.
+    """Makes a mesh `[data, fsdp]` of as many devices as split a batch evenly.
 
     Args:
-        batch: rows to split.
-        devices: to choose from, as many of each process; all of this process, if not given.
-        fsdp: over how many devices parameters are split.
+        batch: number of rows to split.
+        devices: devices to choose from, equally many of each process; None: all of this process.
+        fsdp: number of devices that split the parameters.
 
     Raises:
         ValueError: no number of these devices splits the batch, or makes whole groups of `fsdp`.
@@ -62,7 +61,7 @@ def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int
 
 
 def place(tree: PyTree, shardings: PyTree) -> PyTree:
-    """Arrays that every process has, put where their shardings say."""
+    """Puts arrays, which every process has, on the devices of their shardings."""
 
     def put(leaf: Any, sharding: NamedSharding) -> jax.Array:
         if sharding.is_fully_addressable:
@@ -74,12 +73,12 @@ def place(tree: PyTree, shardings: PyTree) -> PyTree:
 
 
 def replicate(tree: PyTree, mesh: Mesh) -> PyTree:
-    """The same arrays on every device of the mesh."""
+    """Copies arrays to every device of a mesh."""
     return place(tree, jax.tree.map(lambda _: NamedSharding(mesh, REPLICATED), tree))
 
 
 def to_host(tree: PyTree) -> PyTree:
-    """Whole arrays of NumPy, on every process; all of them have to ask."""
+    """Returns whole NumPy arrays. Every process must call it, and gets them."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array)]
     if all(leaf.is_fully_addressable for leaf in leaves):
         return jax.device_get(tree)
@@ -93,14 +92,14 @@ def _gather_all(mesh: Mesh) -> Callable[[PyTree], PyTree]:
     return jax.jit(lambda tree: tree, out_shardings=NamedSharding(mesh, REPLICATED))
 
 
-# Parameters, split over the second axis.
+# Parameters, which the second axis splits.
 
 
 def parameter_specs(tree: PyTree, mesh: Mesh) -> PyTree:
-    """How each array of a tree of parameters, or of a `TrainState`, is split.
+    """Returns how the mesh splits each array of a tree, such as parameters or a `TrainState`.
 
-    Along its longest dimension that the second axis divides; whole if there is none, or if
-    the array is small.
+    It splits the longest dimension that the second axis divides. Small arrays stay whole, and so do
+    arrays without such a dimension.
     """
     count = mesh.shape[FSDP]
 
@@ -115,12 +114,12 @@ def parameter_specs(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 def parameter_shardings(tree: PyTree, mesh: Mesh) -> PyTree:
-    """`parameter_specs` on their mesh."""
+    """Returns `parameter_specs` as shardings of the mesh."""
     return jax.tree.map(lambda spec: NamedSharding(mesh, spec), parameter_specs(tree, mesh))
 
 
 def gather(tree: PyTree, specs: PyTree) -> PyTree:
-    """Inside `jax.shard_map`: whole parameters from each device's part."""
+    """Gathers whole parameters from each device's part, inside `jax.shard_map`."""
 
     def whole(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
         if FSDP not in spec:
@@ -131,7 +130,7 @@ def gather(tree: PyTree, specs: PyTree) -> PyTree:
 
 
 def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
-    """Inside `jax.shard_map`: each device's part of the mean of whole gradients."""
+    """Averages gradients, and keeps each device's part, inside `jax.shard_map`."""
 
     def part(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
         if FSDP not in spec:
@@ -142,7 +141,7 @@ def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
 
     parts, structure = jax.tree.flatten(jax.tree.map(part, tree, specs))
     split = [FSDP in spec for spec in jax.tree.leaves(specs)]
-    # One message instead of one for each array: between processes each costs its latency.
+    # One message for all arrays: between processes each message costs its latency.
     for axes, chosen in ((AXES, False), ((DATA,), True)):
         places = [place for place, is_split in enumerate(split) if is_split == chosen]
         flat, unflatten = ravel_pytree([parts[place] for place in places])
@@ -152,18 +151,18 @@ def scatter_mean(tree: PyTree, specs: PyTree) -> PyTree:
     return jax.tree.unflatten(structure, parts)
 
 
-def quick(mesh: Mesh) -> dict[str, Any] | None:
-    """Options for a program that is compiled for one call, on the devices of a mesh."""
+def choose_quick_options(mesh: Mesh) -> dict[str, Any] | None:
+    """Chooses compiler options for a program that runs once: it compiles fast, and runs slowly."""
     if mesh.devices.flat[0].platform != "cpu":
         return None
     return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
-def alone(mesh: Mesh) -> dict[str, Any] | None:
-    """Options for a program on the devices of a mesh: where each is a core, it stays on its own.
+def choose_core_options(mesh: Mesh) -> dict[str, Any] | None:
+    """Chooses compiler options that keep each device on its own core, if devices are cores.
 
-    A matrix product that asks other cores for help only waits for them; and for ever, where they
-    wait for this one at an exchange between devices.
+    A matrix product that uses other cores would wait for them. It would wait for ever if they wait
+    for its device at an exchange.
     """
     cores = os.cpu_count() or 1
     on_cores = mesh.devices.flat[0].platform == "cpu" and mesh.size > 1 and mesh.size >= cores
@@ -171,7 +170,7 @@ def alone(mesh: Mesh) -> dict[str, Any] | None:
 
 
 def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """Jits `(static, params, *batches) -> batch` so that each device does its own rows."""
+    """Jits `(static, params, *batches) -> batch`, so that each device computes its own rows."""
 
     def program(static: Hashable, params: PyTree, *batches: PyTree) -> PyTree:
         rows = jax.shard_map(
@@ -180,4 +179,4 @@ def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any
         )  # fmt: skip
         return rows(params, *batches)
 
-    return jax.jit(program, static_argnums=0, compiler_options=alone(mesh))
+    return jax.jit(program, static_argnums=0, compiler_options=choose_core_options(mesh))

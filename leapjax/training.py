@@ -36,7 +36,9 @@ def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, ja
     state, _ = jax.eval_shape(begin, 0)
     places = sharding.parameter_shardings(state, mesh), NamedSharding(mesh, sharding.REPLICATED)
     # It runs once, so that what optimisation takes is never won back.
-    return jax.jit(begin, out_shardings=places, compiler_options=sharding.quick(mesh))
+    return jax.jit(
+        begin, out_shardings=places, compiler_options=sharding.choose_quick_options(mesh)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +79,7 @@ def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
         return agent.update(state, batch, key)
 
     rows = None if mesh is None else NamedSharding(mesh, sharding.SPLIT)
-    options = None if mesh is None else sharding.alone(mesh)
+    options = None if mesh is None else sharding.choose_core_options(mesh)
     return TrainStep(
         jax.jit(draw, out_shardings=rows),  # each device draws, and augments, its own
         jax.jit(update, donate_argnums=0, compiler_options=options),

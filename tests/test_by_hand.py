@@ -323,7 +323,7 @@ def test_rem():
     case = make_case(rem, rem.Settings(discount=DISCOUNT, q_heads=count))
     steps = around(case.batch)
     apply = many(case.setup.make_policy(("q", CHOICES * count)))
-    mixtures = jnp.stack([rem.mixture(key, count) for key in DRAWS])
+    mixtures = jnp.stack([rem.draw_mixture(key, count) for key in DRAWS])
 
     def say(params, contexts):
         """[B, P, 2]: each example's own mixture."""

@@ -17,7 +17,9 @@ def least(loss):
 
 @pytest.mark.parametrize("share", [0.1, 0.9])
 def test_the_least_expectile_loss_is_at_the_expectile(share):
-    found = least(lambda estimate: losses.expectile(jnp.array(SAMPLE - estimate), share).mean())
+    found = least(
+        lambda estimate: losses.expectile_loss(jnp.array(SAMPLE - estimate), share).mean()
+    )
     assert found == pytest.approx(stats.expectile(SAMPLE, share), abs=1e-2)
 
 
@@ -27,7 +29,7 @@ def test_the_least_quantile_huber_loss_is_at_the_quantiles():
     @jax.jit
     def loss(x, place):  # each has a least of its own
         estimates = quantiles.at[place].set(x)[None]
-        return 1e3 * losses.quantile_huber(estimates, jnp.array(SAMPLE)[None], 1e-3)[0]
+        return 1e3 * losses.quantile_huber_loss(estimates, jnp.array(SAMPLE)[None], 1e-3)[0]
 
     for place, quantile in enumerate(quantiles):
         assert least(lambda x, place=place: loss(x, place)) == pytest.approx(
@@ -38,4 +40,4 @@ def test_the_least_quantile_huber_loss_is_at_the_quantiles():
 def test_accuracy_counts_what_is_known_alone():
     logits = jnp.log(jnp.array([[0.2, 0.3, 0.5], [0.5, 0.25, 0.25], [0.1, 0.8, 0.1]]))
     known = jnp.array([False, True, True])
-    assert losses.imitation(logits, jnp.array([0, 0, 2]), known)[1] == 0.5
+    assert losses.imitation_loss(logits, jnp.array([0, 0, 2]), known)[1] == 0.5

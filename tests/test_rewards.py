@@ -113,11 +113,11 @@ def test_bcq_never_does_what_the_data_do_not_hold():
         0.3: [[1, 2, -np.inf], [3, 4, -np.inf]],
         1.0: [[1, -np.inf, -np.inf], [3, 4, -np.inf]],
     }.items():
-        np.testing.assert_array_equal(bcq.likely_values(said, threshold), expected)
+        np.testing.assert_array_equal(bcq.mask_unlikely_values(said, threshold), expected)
 
 
 def test_mixtures_are_random_and_convex():
-    weights = jax.vmap(rem.mixture, (0, None))(jax.random.split(jax.random.key(0), 500), 8)
+    weights = jax.vmap(rem.draw_mixture, (0, None))(jax.random.split(jax.random.key(0), 500), 8)
     assert (weights >= 0).all() and weights.shape == (500, 8)
     np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
     np.testing.assert_allclose(weights.mean(axis=0), 1 / 8, atol=0.01)

@@ -1,7 +1,7 @@
 """Behaviour cloning: the action that the demonstrator would take next.
 
-The paper's baseline is a causal transformer over the context (section 5, appendix): it is
-trained to say every action of the context from what came before.
+The paper's baseline is a causal transformer over the context (section 5, appendix). It learns to
+predict every action of the context from the states and actions before it.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """Behaviour cloning as an `Agent`."""
+    """Makes an agent of behaviour cloning."""
     return make_imitator(setup, mesh)
 
 

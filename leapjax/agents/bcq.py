@@ -1,7 +1,7 @@
 """Batch-constrained Q-learning for discrete actions (Fujimoto et al., 2019).
 
-A Q-function is learned from transitions, whose best next action is sought only among those that
-the data make likely: the ones it knows the value of. It acts the same way.
+It learns a Q-function from transitions, with a model of the data's behaviour. The best next action
+must be likely in the data, because the Q-values of other actions are unknown. It acts the same way.
 """
 
 import dataclasses
@@ -17,10 +17,10 @@ from leapjax.agents.base import Method, Setup
 from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
-from leapjax.agents.q_learning import encode_around, look_around
+from leapjax.agents.q_learning import apply_to_transition, make_transition_encoder
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
-from leapjax.models.policy import Said
+from leapjax.models.policy import Outputs
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
@@ -47,16 +47,16 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """BCQ as an `Agent`; its energy is minus the Q-values of the actions that are likely."""
-    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    """Makes a BCQ agent; its energy is minus the Q-values of likely actions, +inf for others."""
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # all but the end
     module = setup.make_policy(("q", choices), ("behaviour", choices))
     optimizer = make_optimizer(setup.training)
 
-    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+    def apply(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens=tokens)
 
-    def likely(said: Said) -> jax.Array:
-        return likely_values(said, settings.threshold)
+    def score(outputs: Outputs) -> jax.Array:
+        return mask_unlikely_values(outputs, settings.threshold)
 
     def transition_loss(
         params: Params,
@@ -65,34 +65,41 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         tokens: PyTree,
         key: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The temporal difference of Q, and the cross-entropy of the behaviour."""
+        """Returns the temporal difference of Q, and the cross-entropy of the behaviour."""
         context = transition.context
-        now, later, held = look_around(module, params, target, context, tokens, key)
-        # Chosen by the one network and valued by the other, as in double Q-learning.
-        best = jnp.argmax(likely(later), axis=1)
-        values = losses.of_action(held["q"], best)  # [P]
-        taken, known = losses.last_actions(context, len(values), choices)
-        targets = losses.bellman(transition, values, settings.discount)
-        estimates = losses.of_action(now["q"], taken)
+        before, after, target_after = apply_to_transition(
+            module, params, target, context, tokens, key
+        )
+        # Double Q-learning: the network chooses, the target network evaluates.
+        best = jnp.argmax(score(after), axis=1)
+        values = losses.select_values(target_after["q"], best)  # [P]
+        taken, known = losses.find_transition_actions(context, len(values), choices)
+        targets = losses.bellman_targets(transition, values, settings.discount)
+        estimates = losses.select_values(before["q"], taken)
         errors = optax.losses.huber_loss(estimates, targets)
-        cloning, accuracy = losses.imitation(now["behaviour"], taken, known)
-        squares = (now["behaviour"] ** 2).mean(axis=1)
-        loss = losses.mean_where(errors + settings.logit_penalty * squares, known) + cloning
-        return loss, {"accuracy": accuracy, "value": losses.mean_where(estimates, known)}
+        cloning, accuracy = losses.imitation_loss(before["behaviour"], taken, known)
+        squares = (before["behaviour"] ** 2).mean(axis=1)
+        loss = losses.average_where(errors + settings.logit_penalty * squares, known) + cloning
+        return loss, {"accuracy": accuracy, "value": losses.average_where(estimates, known)}
 
     init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
-    mean_loss = average_loss(setup, transition_loss, encode_around(module))
+    mean_loss = average_loss(setup, transition_loss, make_transition_encoder(module))
     update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
-    energy = make_acting_energy(setup, say, likely)
-    encode_next = make_encode_next(setup, module, say)
+    energy = make_acting_energy(setup, apply, score)
+    encode_next = make_encode_next(setup, module, apply)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
-def likely_values(said: Said, threshold: float) -> jax.Array:
-    """`[P, A - 1]` Q-values, -inf where an action is less likely than it may be."""
-    likelihoods = jax.nn.softmax(said["behaviour"])
+def mask_unlikely_values(outputs: Outputs, threshold: float) -> jax.Array:
+    """Sets the Q-values `[P, A - 1]` of unlikely actions to -inf.
+
+    Args:
+        outputs: Q-values and behaviour logits.
+        threshold: smallest likelihood, as a share of the likeliest action's.
+    """
+    likelihoods = jax.nn.softmax(outputs["behaviour"])
     likely = likelihoods >= threshold * likelihoods.max(axis=1, keepdims=True)
-    return jnp.where(likely, said["q"], -jnp.inf)
+    return jnp.where(likely, outputs["q"], -jnp.inf)
 
 
 BCQ = Method(Settings, make_agent, rewards=True)

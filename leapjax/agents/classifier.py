@@ -1,7 +1,7 @@
-"""The paper's other energy: an LSTM that says how corrupted a plan is (appendix, ablation).
+"""The paper's other energy: an LSTM that estimates how corrupted a plan is (appendix, ablation).
 
-Trained on plans some of whose actions were replaced; a plan without a replaced action has
-the least energy. Planning with it works worse than with the masked language model.
+It trains on plans with some actions replaced; a plan without replaced actions has the least energy.
+It plans worse than the masked language model.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """The classifier as an `Agent`; it has no use for the transformer's settings."""
+    """Makes a classifier agent; of the model's settings it uses the width only."""
     sizes = setup.sizes
     module = SequenceClassifier(setup.model, sizes, setup.make_encoder())
     optimizer = make_optimizer(setup.training)
@@ -38,7 +38,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def degree(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
         result = module.apply(params, memory, actions, method="degree")
         assert isinstance(result, jax.Array)
-        # As for every energy: the end action, the last one, is never the first of a plan.
+        # As in every energy, the end action (the last one) is never the first of a plan.
         return jnp.where(actions[0] == sizes.num_actions - 1, jnp.inf, result)
 
     energy = classifier(make_encode(setup, encode), degree, sizes.num_actions)
@@ -46,13 +46,13 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Squared error of the degree of corruption of one corrupted window."""
+        """Corrupts a window, and returns the squared error of its degree of corruption."""
         del extra
         corrupted, target = corrupt(key, window.actions, window.imitated, sizes.num_actions)
         memory = module.apply(params, window.context, tokens, method="encode")
-        found = module.apply(params, memory, corrupted, method="degree")
-        assert isinstance(found, jax.Array)
-        return (found - target) ** 2, {"absolute_error": jnp.abs(found - target)}
+        estimate = module.apply(params, memory, corrupted, method="degree")
+        assert isinstance(estimate, jax.Array)
+        return (estimate - target) ** 2, {"absolute_error": jnp.abs(estimate - target)}
 
     mean_loss = average_loss(setup, window_loss, make_window_encoder(module))
     update = make_update(mean_loss, optimizer, mesh)
@@ -63,10 +63,19 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 def corrupt(
     key: jax.Array, actions: jax.Array, imitated: jax.Array, num_actions: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Replaces n of the actions `[T]` by others, n uniform in 0 .. T; and how corrupted they are.
+    """Replaces n actions of a plan by others, with n uniform in 0 .. T.
 
-    The paper says "depending on the degree of randomness": the share of actions that are
-    not the demonstrator's. Nor are those his that are not `imitated [T]`.
+    The degree of corruption is the share of actions that are not the demonstrator's. (The paper:
+    "depending on the degree of randomness".)
+
+    Args:
+        key: random key.
+        actions: plan `[T]`.
+        imitated: booleans `[T]`: which actions are the demonstrator's.
+        num_actions: A.
+
+    Returns:
+        The corrupted plan `[T]`, and its degree of corruption `[]`.
     """
     count_key, order_key, action_key = jax.random.split(key, 3)
     horizon = actions.shape[0]
@@ -82,7 +91,7 @@ def corrupt(
 def _encode_and_judge(
     module: SequenceClassifier, context: Context, actions: jax.Array
 ) -> jax.Array:
-    """Touches every parameter, to initialise them."""
+    """Uses every parameter, to initialise them."""
     return module.degree(module.encode(context), actions)
 
 

@@ -1,7 +1,7 @@
 """Conservative Q-learning for discrete actions (Kumar et al., 2020).
 
-Q-learning that also lowers the Q-values of all actions and raises those of what was done, so that
-no action looks good merely because the data do not hold it.
+Q-learning that also lowers the Q-values of all actions, and raises the Q-values of the actions in
+the data. So no action looks good only because it is missing from the data.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 
 from leapjax.agents import losses, q_learning
 from leapjax.agents.base import Method, Setup
-from leapjax.agents.q_learning import Judged, Returns
+from leapjax.agents.q_learning import MakeTargets, TransitionOutputs
 from leapjax.checks import LARGEST, check_within
 from leapjax.types import Agent
 
@@ -23,7 +23,7 @@ class Settings(q_learning.Settings):
     """The options of CQL. The defaults are the original's, but for the target network.
 
     In the authors' code, and in d3rlpy, Q-values are means of 200 quantiles, whose losses are
-    summed. An `alpha` of 4 weighs against those what 0.04 weighs here, against one loss.
+    summed. An `alpha` of 4 there equals 0.04 here, where the loss is a single one.
 
     Attributes:
         alpha: Weight of the conservative term; 0 leaves double Q-learning.
@@ -37,24 +37,24 @@ class Settings(q_learning.Settings):
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """CQL as an `Agent`; its energy is minus the Q-values."""
+    """Makes a CQL agent; its energy is minus the Q-values."""
 
-    def loss(judged: Judged, returns: Returns, key: jax.Array) -> jax.Array:
+    def loss(steps: TransitionOutputs, make_targets: MakeTargets, key: jax.Array) -> jax.Array:
         """Equation 4."""
         del key
-        # Chosen by the one network and valued by the other, as in double Q-learning.
-        best = jnp.argmax(judged.later, axis=1)
-        targets = returns(losses.of_action(judged.held, best))
-        estimates = losses.of_action(judged.now, judged.taken)
+        # Double Q-learning: the network chooses, the target network evaluates.
+        best = jnp.argmax(steps.after, axis=1)
+        targets = make_targets(losses.select_values(steps.target_after, best))
+        estimates = losses.select_values(steps.before, steps.actions)
         errors = optax.losses.huber_loss(estimates, targets)
-        return errors + setup.settings.alpha * conservative(judged.now, judged.taken)
+        return errors + setup.settings.alpha * conservative_penalty(steps.before, steps.actions)
 
     return q_learning.make_agent(setup, mesh, setup.domain.num_actions - 1, loss, lambda q: q)
 
 
-def conservative(q: jax.Array, taken: jax.Array) -> jax.Array:
-    """By how much the best of Q-values `[P, A - 1]`, softly, exceeds that of actions `[P]`."""
-    return jax.nn.logsumexp(q, axis=1) - losses.of_action(q, taken)
+def conservative_penalty(q: jax.Array, actions: jax.Array) -> jax.Array:
+    """Returns `[P]`: the soft maximum of Q-values `[P, A - 1]` minus the value of actions `[P]`."""
+    return jax.nn.logsumexp(q, axis=1) - losses.select_values(q, actions)
 
 
 CQL = Method(Settings, make_agent, rewards=True)

@@ -1,7 +1,7 @@
 """Decision Transformer (Chen et al., 2021): the action that leads to a return.
 
-Trained like behaviour cloning, but on what the demonstration gave from each state on. It acts
-by asking for a target return, less what the episode has given so far.
+It trains like behaviour cloning, conditioned on the return to go at each state. While acting, the
+return to go is a target return minus the return so far.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ class Settings:
     """The options of Decision Transformer alone.
 
     Attributes:
-        target_return: Return of an episode that is asked for while acting.
+        target_return: Return of an episode to aim for while acting.
     """
 
     target_return: float = 1.0
@@ -30,7 +30,7 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """Decision Transformer as an `Agent`."""
+    """Makes a Decision Transformer agent."""
     return make_imitator(setup, mesh, returns.condition_on_target(setup))
 
 

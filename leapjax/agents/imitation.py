@@ -48,8 +48,8 @@ def make_imitator(
             returns=compute_returns(window.context, window.return_to_go), tokens=tokens,
         )  # fmt: skip
         logits = outputs["logits"]  # [P, A - 1]
-        taken = losses.actions_taken(window.context, window.actions[0], len(logits), choices)
-        loss, accuracy = losses.imitation(logits, *taken)
+        taken = losses.find_actions_taken(window.context, window.actions[0], len(logits), choices)
+        loss, accuracy = losses.imitation_loss(logits, *taken)
         return loss, {"accuracy": accuracy}
 
     def touch(module: PolicyModel, context: Context, actions: jax.Array) -> jax.Array:

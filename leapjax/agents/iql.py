@@ -1,8 +1,7 @@
 """Implicit Q-learning for discrete actions (Kostrikov et al., 2022).
 
-The value of a state is a high expectile of the Q-values of what was done there, so that no action
-is ever tried that the data do not hold; the policy is behaviour cloning, weighted by the advantage
-of what was done.
+The value of a state is a high expectile of the Q-values of the data's actions, so learning never
+evaluates other actions. The policy is behaviour cloning, weighted by the advantages of the actions.
 """
 
 import dataclasses
@@ -23,7 +22,7 @@ from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
-from leapjax.models.policy import PolicyModel, Said
+from leapjax.models.policy import Outputs, PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
@@ -31,8 +30,8 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 class Settings:
     """The options of IQL alone.
 
-    The IQL paper has the expectile in its mazes of ants, the temperature in its locomotion; LEAP's
-    does not say what it took.
+    The expectile is the IQL paper's for mazes of ants, the temperature is its value for locomotion.
+    LEAP's paper gives neither.
 
     Attributes:
         expectile: Expectile of the Q-values that the value network learns.
@@ -56,51 +55,62 @@ class Settings:
 
 
 class Networks(nn.Module):
-    """A policy and its critic: two networks, of which neither sees the other's gradients."""
+    """A policy and its critic: two networks without common parameters.
 
-    policy: PolicyModel  # says logits
-    critic: PolicyModel  # says the value, and two Q-values
+    Attributes:
+        policy: has the head "logits".
+        critic: has the heads "value", "q1" and "q2".
+    """
 
-    def __call__(self, context: Context) -> tuple[Said, Said]:
-        """What both say of a context."""
+    policy: PolicyModel
+    critic: PolicyModel
+
+    def __call__(self, context: Context) -> tuple[Outputs, Outputs]:
+        """Applies both networks to a context."""
         return self.policy(context), self.critic(context)
 
     def act(
         self, context: Context, tokens: jax.Array | None = None, deterministic: bool = True
-    ) -> Said:
-        """What the policy says of a context, given its tokens or not."""
+    ) -> Outputs:
+        """Applies the policy to a context.
+
+        Args:
+            context: context to act from.
+            tokens: encoder's tokens; None: encode the context.
+            deterministic: whether to leave out dropout.
+        """
         return self.policy(context, deterministic, tokens=tokens)
 
     def judge(
         self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
-    ) -> tuple[Said, Said]:
-        """What the critic says before and after the step of a transition."""
-        return self.critic.transition(context, tokens, deterministic)
+    ) -> tuple[Outputs, Outputs]:
+        """Applies the critic before and after the step of a transition."""
+        return self.critic.apply_transition(context, tokens, deterministic)
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Returns the policy's tokens of a context, given those of its past states."""
+        """Returns the policy's tokens of a context, given the tokens of its past states."""
         return self.policy.encode_next(context, known)
 
     def encode_transitions(
         self, contexts: Context
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Returns the policy's tokens before the steps of transitions, the critic's around them."""
+        """Returns the policy's tokens before steps, and the critic's tokens before and after."""
         earlier = jax.vmap(windows.before)(contexts)
         return self.policy.encode_batch(earlier), self.critic.encode_transitions(contexts)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """IQL as an `Agent`; its energy is minus the policy's logits."""
-    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    """Makes an IQL agent; its energy is minus the policy's logits."""
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # all but the end
     critic = setup.make_policy(("value", 1), ("q1", choices), ("q2", choices))
     module = Networks(setup.make_policy(("logits", choices)), critic)
     optimizer = make_optimizer(setup.training)
 
-    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+    def apply(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens, method="act")
 
     def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
-        """Tokens of policy and critic, and those of the target network before the steps."""
+        """Encodes with policy and critic, and with the target network before the steps."""
         earlier = jax.vmap(windows.before)(batch.context)
         return (
             module.apply(params, batch.context, method="encode_transitions"),
@@ -114,40 +124,46 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         tokens: PyTree,
         key: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Of the value (equation 5), of both Q-functions (6) and of the policy (7)."""
+        """Returns the losses of value (equation 5), Q-functions (6) and policy (7)."""
         context = transition.context
         earlier = windows.before(context)
-        (seen, around), before = tokens
+        (policy_tokens, critic_tokens), target_tokens = tokens
         options: Any = {"deterministic": False, "rngs": {"dropout": key}}
-        policy: Any = module.apply(params, earlier, seen, method="act", **options)
-        judged: Any = module.apply(params, context, around, method="judge", **options)
-        held: Any = critic.apply(target, earlier, tokens=before)
-        now, later = judged
-        taken, known = losses.last_actions(context, len(held["value"]), choices)
-        least = jnp.minimum(*(losses.of_action(held[name], taken) for name in ("q1", "q2")))
+        policy: Any = module.apply(params, earlier, policy_tokens, method="act", **options)
+        critics: Any = module.apply(params, context, critic_tokens, method="judge", **options)
+        target_outputs: Any = critic.apply(target, earlier, tokens=target_tokens)
+        now, after = critics
+        taken, known = losses.find_transition_actions(
+            context, len(target_outputs["value"]), choices
+        )
+        least = jnp.minimum(
+            *(losses.select_values(target_outputs[name], taken) for name in ("q1", "q2"))
+        )
 
         value, logits = now["value"][:, 0], policy["logits"]
-        returns = losses.bellman(transition, later["value"][:, 0], settings.discount)
-        each = loss(settings, value, (now["q1"], now["q2"]), least, logits, taken, returns)
+        returns = losses.bellman_targets(transition, after["value"][:, 0], settings.discount)
+        each = compute_losses(
+            settings, value, (now["q1"], now["q2"]), least, logits, taken, returns
+        )
 
         hits = jnp.argmax(logits, axis=1) == taken
-        return losses.mean_where(each, known), {
-            "accuracy": losses.mean_where(hits, known),
-            "value": losses.mean_where(value, known),
-            "advantage": losses.mean_where(least - value, known),
+        return losses.average_where(each, known), {
+            "accuracy": losses.average_where(hits, known),
+            "value": losses.average_where(value, known),
+            "advantage": losses.average_where(least - value, known),
         }
 
-    init = make_init(setup, module, apply_to_context, optimizer, target=_critic)
+    init = make_init(setup, module, apply_to_context, optimizer, target=_select_critic)
     mean_loss = average_loss(setup, transition_loss, encode)
     update = make_update(
-        mean_loss, optimizer, mesh, follow_parameters(settings.target_rate, _critic)
+        mean_loss, optimizer, mesh, follow_parameters(settings.target_rate, _select_critic)
     )
-    energy = make_acting_energy(setup, say)
-    encode_next = make_encode_next(setup, module, say)
+    energy = make_acting_energy(setup, apply)
+    encode_next = make_encode_next(setup, module, apply)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 
-def loss(
+def compute_losses(
     settings: Settings,
     value: jax.Array,
     qs: Sequence[jax.Array],
@@ -156,27 +172,27 @@ def loss(
     taken: jax.Array,
     returns: jax.Array,
 ) -> jax.Array:
-    """The losses `[P]` of the value (equation 5), of all Q-functions (6) and of the policy (7).
+    """Sums the losses `[P]` of value (equation 5), all Q-functions (6) and policy (7).
 
     Args:
-        settings: the expectile, and how advantages weigh.
-        value: `[P]` of each state.
-        qs: Q-values `[P, A - 1]`, each of a function of its own.
-        least: `[P]` the least of the target's, of the action that was taken.
-        logits: `[P, A - 1]` of the policy.
-        taken: `[P]` the actions.
-        returns: `[P]` what they gave, and the value of what they led to.
+        settings: expectile, and weights of advantages.
+        value: values `[P]` of the states.
+        qs: Q-values `[P, A - 1]` of each Q-function.
+        least: smallest Q-values `[P]` of the actions, over the target network's functions.
+        logits: logits `[P, A - 1]` of the policy.
+        taken: actions `[P]`.
+        returns: Bellman targets `[P]` of the actions.
     """
     advantages = jax.lax.stop_gradient(least) - value
-    values = losses.expectile(advantages, settings.expectile)
-    differences = sum(jnp.square(losses.of_action(q, taken) - returns) for q in qs)
+    values = losses.expectile_loss(advantages, settings.expectile)
+    differences = sum(jnp.square(losses.select_values(q, taken) - returns) for q in qs)
     weights = jnp.exp(settings.inverse_temperature * jax.lax.stop_gradient(advantages))
-    likelihoods = losses.of_action(jax.nn.log_softmax(logits), taken)
+    likelihoods = losses.select_values(jax.nn.log_softmax(logits), taken)
     return values + differences - jnp.minimum(weights, settings.largest_weight) * likelihoods
 
 
-def _critic(params: Params) -> Params:
-    """The critic's own parameters, as its network has them."""
+def _select_critic(params: Params) -> Params:
+    """Selects the critic's parameters."""
     return {"params": params["params"]["critic"]}
 
 

@@ -1,4 +1,4 @@
-"""LEAP: train a masked language model on demonstrations, plan by Gibbs sampling."""
+"""LEAP: it trains a masked language model on demonstrations, and plans by Gibbs sampling."""
 
 import dataclasses
 
@@ -29,11 +29,11 @@ class Settings:
     Attributes:
         masking: Actions to mask in training: "one", "each", "all", "random" or "stratified". The
             function `leapjax.schedules.sample_masks` explains them.
-        end: A plan may end early. If not, what follows the end is padding that nothing predicts.
+        end: A plan may end early. If not, padding follows the end, and the loss skips it.
         repeat_state: Every position sees the whole state (eq. 4). If not, later ones see it without
             the agent's pose.
         returns: Condition plans on the return to go, as Decision Transformer does.
-        target_return: Return of an episode that is asked for while acting. It needs `returns`.
+        target_return: Return of an episode to aim for while acting. It needs `returns`.
     """
 
     masking: str = "one"
@@ -51,87 +51,89 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """LEAP as an `Agent`.
+    """Makes a LEAP agent.
 
     Args:
-        setup: what it is made from.
-        mesh: of devices to train on (see `leapjax.sharding`); None for one device.
+        setup: domain, sizes and settings.
+        mesh: devices to train on (see `leapjax.sharding`); None for one device.
     """
     sizes, masking = setup.sizes, setup.settings.masking
     conditioned = setup.settings.returns
     module = build_masked_model(
         setup.model, sizes, setup.make_encoder(), conditioned, setup.settings.repeat_state
     )
-    to_go = returns.condition_on_target(setup) if conditioned else returns.omit_returns
+    compute_returns = returns.condition_on_target(setup) if conditioned else returns.omit_returns
     optimizer = make_optimizer(setup.training)
     mask, pad = mask_token(sizes.num_actions), pad_token(sizes.num_actions)
     last = sizes.num_actions - 1  # the end action
 
-    def allowed(logits: jax.Array) -> jax.Array:
+    def forbid_end(logits: jax.Array) -> jax.Array:
         return logits if setup.settings.end else logits.at[:, last].set(-jnp.inf)
 
     def encode(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
-        return module.apply(params, context, returns=to_go(context), tokens=tokens, method="encode")
+        return module.apply(
+            params, context, returns=compute_returns(context), tokens=tokens, method="encode"
+        )
 
     def logits(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         result = module.apply(params, memory, actions, positions, method="logits")
         assert isinstance(result, jax.Array)
-        return allowed(result)
+        return forbid_end(result)
 
     energy = pseudo_likelihood(make_encode(setup, encode), logits, sizes.num_actions)
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Masked cross-entropy of one window (paper, equation 1), and its accuracy."""
+        """Returns the masked cross-entropy of one window (paper, equation 1), and its accuracy."""
         del extra
         mask_key, encode_key, *_ = keys = jax.random.split(key, 2 + sizes.horizon)
         masks = schedules.sample_masks(mask_key, sizes.horizon, masking)  # [C, T]
         memory = module.apply(
             params, window.context, deterministic=False, method="encode",
-            rngs={"dropout": encode_key}, returns=to_go(window.context, window.return_to_go),
-            tokens=tokens,
+            rngs={"dropout": encode_key}, tokens=tokens,
+            returns=compute_returns(window.context, window.return_to_go),
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
-            # Only what is masked is predicted: where that is one action, only it is computed.
+            # The network predicts masked actions only. With one of them it computes one position.
             single = masking in schedules.SINGLE
             positions = jnp.argmax(masked)[None] if single else jnp.arange(sizes.horizon)
             beyond = (window.actions == last) & (not setup.settings.end)
-            masked &= window.imitated  # what is not learned is always shown
+            masked &= window.imitated  # other actions always stay visible
             tokens = jnp.where(masked, mask, jnp.where(beyond, pad, window.actions))
             logits = module.apply(
                 params, memory, tokens, positions, deterministic=False, method="logits",
                 rngs={"dropout": drop_key},
             )  # fmt: skip
             assert isinstance(logits, jax.Array)
-            logits, targets = allowed(logits), window.actions[positions]
+            logits, targets = forbid_end(logits), window.actions[positions]
             likelihoods = jnp.take_along_axis(jax.nn.log_softmax(logits), targets[:, None], axis=1)
             hits = jnp.argmax(logits, axis=1) == targets
             return likelihoods[:, 0], hits, (masked & ~beyond)[positions]
 
         likelihoods, hits, counted = jax.vmap(score)(masks, keys[2 : 2 + masks.shape[0]])  # [C, P]
-        # What is not masked is not predicted: its terms are left out, not zeroed after the
-        # fact, so that a -inf there cannot become NaN. Every action that is has the same weight.
+        # `where` leaves out the terms of unmasked actions, because -inf times 0 would be NaN. All
+        # masked actions have equal weights.
         accuracy = jnp.where(counted, hits, 0).sum() / jnp.maximum(counted.sum(), 1)
         return -jnp.where(counted, likelihoods, 0).sum() / masks.sum(), {"accuracy": accuracy}
 
     def run_loss(
         params: Params, extra: PyTree, run: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The mean of S windows in a row, `[S, ...]`, of which each state is encoded once.
+        """Averages the losses of S consecutive windows, whose states were encoded once.
 
-        So a state sees the frames before it even at the front of a window, where those before
-        the window are unknown if it is encoded alone (Atari's first three).
+        So the first states of a window see the frames before the window, which encoding the window
+        alone would not show them (Atari's first three frames).
 
         Args:
-            params: of the network.
-            extra: nothing.
-            run: the windows.
-            tokens: `[K + S, D]` of their states.
-            key: of masks and dropout.
+            params: parameters of the network.
+            extra: unused.
+            run: windows `[S, ...]`.
+            tokens: tokens `[K + S, D]` of the windows' states.
+            key: key of masks and dropout.
         """
         keys = jax.random.split(key, run.actions.shape[0])
 
@@ -143,11 +145,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return jax.tree.map(jnp.mean, jax.vmap(loss)(run, keys))
 
     def encode_runs(params: Params, extra: PyTree, runs: Window) -> PyTree:
-        """Tokens `[B, K + S, D]` of the states of B runs."""
+        """Encodes the states of B runs: tokens `[B, K + S, D]`."""
         del extra
         return module.apply(params, jax.vmap(windows.joined)(runs), method="encode_batch")
 
-    # To the other architecture, what a state is depends on the window that it is seen in.
+    # The other architecture's tokens depend on the whole context, so windows cannot share them.
     in_runs = setup.training.consecutive > 1 and setup.model.architecture == "paper"
     if in_runs and not setup.settings.repeat_state:
         raise UserError(
@@ -162,7 +164,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: MaskedModel, context: Context, actions: jax.Array) -> jax.Array:
-        memory: PyTree = module.encode(context, returns=to_go(context))
+        memory: PyTree = module.encode(context, returns=compute_returns(context))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = make_init(setup, module, touch, optimizer)

@@ -1,82 +1,111 @@
-"""Losses that methods share: of one context, at its last P states."""
+"""Losses that methods share. Each takes one example: a context with its last P states."""
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from leapjax.models.policy import past_and_present
+from leapjax.models.policy import append_present
 from leapjax.types import Context, TransitionWindow
 
 
-def actions_taken(
+def find_actions_taken(
     context: Context, action: jax.Array, count: int, choices: int
 ) -> tuple[jax.Array, jax.Array]:
-    """The action `[P]` that was taken at each of the last states, and where there was one.
+    """Returns the action taken at each of the last P states, and whether the episode had begun.
 
     Args:
-        context: of the current state.
-        action: `[]` what was done there.
-        count: P.
-        choices: as many actions as can be chosen; 0 stands where the episode had not begun.
+        context: context of the current state.
+        action: action `[]` taken at the current state.
+        count: P, number of states.
+        choices: number of actions that can be chosen.
+
+    Returns:
+        Actions `[P]`, 0 before the episode began, and booleans `[P]`.
     """
-    taken = past_and_present(context.actions, action, count)
+    taken = append_present(context.actions, action, count)
     known = taken < choices
     return jnp.where(known, taken, 0), known
 
 
-def last_actions(context: Context, count: int, choices: int) -> tuple[jax.Array, jax.Array]:
-    """The same for the context of a `TransitionWindow`: up to the step that was taken."""
-    return actions_taken(
+def find_transition_actions(
+    context: Context, count: int, choices: int
+) -> tuple[jax.Array, jax.Array]:
+    """Does the same as `find_actions_taken` for a transition, whose last action is in its context.
+
+    Args:
+        context: context of a `TransitionWindow`.
+        count: P, number of states.
+        choices: number of actions that can be chosen.
+    """
+    return find_actions_taken(
         context._replace(actions=context.actions[:-1]), context.actions[-1], count, choices
     )
 
 
-def bellman(transition: TransitionWindow, values: jax.Array, discount: float) -> jax.Array:
-    """Each reward, and the discounted value of the state that it led to.
+def bellman_targets(transition: TransitionWindow, values: jax.Array, discount: float) -> jax.Array:
+    """Adds each reward and the discounted value of the next state. It passes no gradient.
 
-    Values are `[P]`, or `[P, N]` where there are several of each state; so are the results. No
-    gradient flows through them. Only a transition's last step can have come to an end.
+    Args:
+        transition: has the rewards. The episode can terminate at its last step only.
+        values: values of the next states, `[P]`, or N of each, `[P, N]`.
+        discount: discount per step.
+
+    Returns:
+        Targets of the shape of `values`.
     """
     rewards = transition.context.rewards[-values.shape[0] :]
     goes_on = jnp.ones(values.shape[0]).at[-1].set(1.0 - transition.terminated)
     return jax.lax.stop_gradient((rewards + discount * goes_on * values.T).T)
 
 
-def mean_where(values: jax.Array, known: jax.Array) -> jax.Array:
-    """The mean `[]` of values `[P]` where they are known, which is once at least."""
+def average_where(values: jax.Array, known: jax.Array) -> jax.Array:
+    """Averages values `[P]` where `known [P]` is True, which it is at least once."""
     return jnp.where(known, values, 0).sum() / known.sum()
 
 
-def of_action(values: jax.Array, actions: jax.Array) -> jax.Array:
-    """Which of values `[P, choices, ...]` belong to actions `[P]`: `[P, ...]`."""
+def select_values(values: jax.Array, actions: jax.Array) -> jax.Array:
+    """Selects the values of actions: `[P, choices, ...]` and `[P]` to `[P, ...]`."""
     chosen = jnp.expand_dims(actions, range(1, values.ndim))
     return jnp.take_along_axis(values, chosen, axis=1)[:, 0]
 
 
-def imitation(
+def imitation_loss(
     logits: jax.Array, actions: jax.Array, known: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The cross-entropy `[]` of actions `[P]` under logits `[P, choices]`; and the accuracy."""
-    likelihoods = of_action(jax.nn.log_softmax(logits), actions)
+    """Returns the cross-entropy `[]` of actions, and the accuracy `[]`.
+
+    Args:
+        logits: logits `[P, choices]`.
+        actions: actions `[P]`.
+        known: booleans `[P]`: which actions count.
+    """
+    likelihoods = select_values(jax.nn.log_softmax(logits), actions)
     hits = jnp.argmax(logits, axis=1) == actions
-    return -mean_where(likelihoods, known), mean_where(hits, known)
+    return -average_where(likelihoods, known), average_where(hits, known)
 
 
-def expectile(differences: jax.Array, share: float) -> jax.Array:
-    """Squared differences, target minus estimate, whose mean is least at their expectile.
+def expectile_loss(differences: jax.Array, share: float) -> jax.Array:
+    """Returns the asymmetric squares whose mean is least at an expectile.
 
-    Weighted by `share` where the target is above the estimate and by `1 - share` where it is
-    below (Kostrikov et al., Implicit Q-Learning, equation 5).
+    Source: Kostrikov et al., Implicit Q-Learning, equation 5.
+
+    Args:
+        differences: targets minus estimates, of any shape.
+        share: weight of positive differences; negative ones weigh `1 - share`.
     """
     return jnp.where(differences > 0, share, 1 - share) * differences**2
 
 
-def quantile_huber(estimates: jax.Array, targets: jax.Array, kappa: float = 1.0) -> jax.Array:
-    """The loss `[P]` that is least where estimates `[P, N]` are quantiles of targets `[P, M]`.
+def quantile_huber_loss(estimates: jax.Array, targets: jax.Array, kappa: float = 1.0) -> jax.Array:
+    """Returns the loss `[P]` that is least where the estimates are quantiles of the targets.
 
-    Smooth where they differ by less than kappa; the sum over estimates, the mean over targets
-    (Dabney et al., Distributional Reinforcement Learning with Quantile Regression, equation 10
-    and algorithm 1).
+    It is the sum over estimates of the mean over targets. Source: Dabney et al., Distributional
+    Reinforcement Learning with Quantile Regression, equation 10 and algorithm 1.
+
+    Args:
+        estimates: estimates `[P, N]` of the N quantiles.
+        targets: samples `[P, M]`.
+        kappa: the loss is quadratic where estimate and target differ by less.
     """
     count = estimates.shape[1]
     shares = (jnp.arange(count) + 0.5) / count  # lemma 2
@@ -87,7 +116,7 @@ def quantile_huber(estimates: jax.Array, targets: jax.Array, kappa: float = 1.0)
         weights = jnp.abs(shares - (errors < 0))
         return total + weights * optax.losses.huber_loss(errors, delta=kappa), None
 
-    # One target after the other, computed again for the gradient: a sum over [P, N, M] at once
-    # takes XLA on a CPU twenty times as long.
+    # The scan takes one target at a time, and recomputes it for the gradient: XLA on a CPU takes
+    # twenty times as long for a sum over [P, N, M].
     total, _ = jax.lax.scan(add, jnp.zeros_like(estimates), targets.T)
     return total.sum(axis=1) / targets.shape[1]

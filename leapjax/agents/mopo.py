@@ -1,13 +1,13 @@
 """Model-based offline policy optimisation for discrete actions (MOPO; Yu et al., 2020).
 
-An ensemble learns what a step leads to. A policy, here IQL's as in the paper (appendix), learns
-from the data and from steps that are only imagined, whose reward is less by as much as the
-ensemble disagrees: where the data say nothing, nothing is to be gained.
+An ensemble learns to predict steps. A policy, here IQL's as in the paper (appendix), learns from
+the data and from imagined steps. The ensemble's disagreement lowers the reward of an imagined step,
+so the policy stays near the data.
 
-States are imagined as features of the network, not as observations, so any domain will do: the
-ensemble predicts the features that a slowly following target network has of the next state. What
-shapes them are the values and the imitation of the data; the policy only reads them, because its
-weighted gradients would drown the rest.
+Imagined states are features of the network, not observations, so every domain works. The ensemble
+predicts the features of the next state in a slowly moving target network. The losses of values and
+of imitation shape the features. The policy only reads them, because its weighted gradients are so
+much larger.
 """
 
 import dataclasses
@@ -27,19 +27,19 @@ from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_at_least, check_within
-from leapjax.models.policy import PolicyModel, Said
+from leapjax.models.policy import Outputs, PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings(iql.Settings):
-    """The options of MOPO, and those of the IQL that it trains.
+    """The options of MOPO, beside the options of its IQL.
 
     Attributes:
         members: Dynamics models in the ensemble.
         rollout: Steps to imagine from the current state of each context.
-        penalty: Weight of the ensemble's disagreement, which is taken off imagined rewards.
-        real_share: Share of the loss that is of the data; the rest is of imagined steps.
+        penalty: Weight of the ensemble's disagreement, subtracted from imagined rewards.
+        real_share: Weight of the data's loss; imagined steps have the rest.
     """
 
     members: int = 5
@@ -56,17 +56,29 @@ class Settings(iql.Settings):
 
 
 class Predicted(NamedTuple):
-    """What each of M members expects of a step, at P states."""
+    """The predictions of M members for steps from P states.
 
-    features: jax.Array  # [M, P, D] of the state that it leads to
-    reward: jax.Array  # [M, P]
-    ending: jax.Array  # [M, P] logits: that the episode comes to its end
+    Attributes:
+        features: features `[M, P, D]` of the next states.
+        reward: rewards `[M, P]`.
+        ending: logits `[M, P]` of the end of the episode.
+    """
+
+    features: jax.Array
+    reward: jax.Array
+    ending: jax.Array
 
 
 class Networks(nn.Module):
-    """Features of states, and all that is said of features."""
+    """Features of states, and perceptrons that read them.
 
-    trunk: PolicyModel  # says features
+    Attributes:
+        trunk: network with the head "features".
+        choices: number of actions that can be chosen.
+        members: M, number of dynamics models.
+    """
+
+    trunk: PolicyModel
     choices: int
     members: int
 
@@ -84,53 +96,58 @@ class Networks(nn.Module):
         self.dynamics = ensemble(width + 2, 2 * width)
 
     def __call__(self, context: Context) -> PyTree:
-        """Touches every parameter, to initialise them."""
+        """Uses every parameter, to initialise them."""
         features = self.features(context)
         actions = jnp.zeros(features.shape[0], jnp.int32)
-        said = self.logits(features), self.behaviour(features)
-        return self.judge(features), said, self.predict(features, actions)
+        logits = self.logits(features), self.behaviour(features)
+        return self.judge(features), logits, self.predict(features, actions)
 
     def features(self, context: Context) -> jax.Array:
-        """Of the last P states, `[P, D]`, of variance 1 each: errors in them have a scale."""
+        """Returns features `[P, D]` of the last P states, normalised to variance 1."""
         return self.norm(self.trunk(context)["features"])
 
-    def act(self, context: Context, tokens: jax.Array | None = None) -> Said:
-        """The policy's logits, `[P, A - 1]`, given the tokens of the context or not."""
+    def act(self, context: Context, tokens: jax.Array | None = None) -> Outputs:
+        """Returns the policy's logits `[P, A - 1]`.
+
+        Args:
+            context: context to act from.
+            tokens: encoder's tokens; None: encode the context.
+        """
         return {"logits": self.logits(self.norm(self.trunk(context, tokens=tokens)["features"]))}
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Returns the tokens of a context, given those of its past states."""
+        """Returns the tokens of a context, given the tokens of its past states."""
         return self.trunk.encode_next(context, known)
 
     def encode_transitions(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
         """Returns the tokens before and after the steps of transitions."""
         return self.trunk.encode_transitions(contexts)
 
-    def transition(
+    def apply_transition(
         self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
     ) -> tuple[jax.Array, jax.Array]:
-        """Features `[P, D]` before and after the step of a transition."""
-        now, later = self.trunk.transition(context, tokens, deterministic)
-        return self.norm(now["features"]), self.norm(later["features"])
+        """Returns features `[P, D]` before and after the step of a transition."""
+        before, after = self.trunk.apply_transition(context, tokens, deterministic)
+        return self.norm(before["features"]), self.norm(after["features"])
 
     def logits(self, features: jax.Array) -> jax.Array:
-        """The policy's, `[P, A - 1]`; no gradient flows to the features."""
+        """Returns the policy's logits `[P, A - 1]`; the features get no gradient."""
         return self.policy(jax.lax.stop_gradient(features))
 
     def behaviour(self, features: jax.Array) -> jax.Array:
-        """Logits `[P, A - 1]` of what the data do."""
+        """Returns logits `[P, A - 1]` of the data's actions."""
         return self.cloned(features)
 
     def judge(self, features: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The value `[P]`, and two Q-values `[P, A - 1]`."""
+        """Returns the value `[P]`, and two Q-values `[P, A - 1]`."""
         first, second = (q(features) for q in self.q)
         return self.value(features)[:, 0], first, second
 
     def predict(self, features: jax.Array, actions: jax.Array) -> Predicted:
-        """What each member expects of actions `[P]`."""
+        """Predicts the steps of actions `[P]` with each member."""
         chosen = jax.nn.one_hot(actions, self.choices)
-        said = self.dynamics(jnp.concatenate([features, chosen], axis=1))  # [M, P, D + 2]
-        return Predicted(features + said[..., :-2], said[..., -2], said[..., -1])
+        steps = self.dynamics(jnp.concatenate([features, chosen], axis=1))  # [M, P, D + 2]
+        return Predicted(features + steps[..., :-2], steps[..., -2], steps[..., -1])
 
 
 class _Perceptron(nn.Module):
@@ -144,18 +161,19 @@ class _Perceptron(nn.Module):
         return nn.Dense(self.features)(nn.gelu(nn.Dense(self.hidden)(x)))
 
 
-def disagreement(predicted: Predicted) -> jax.Array:
-    """How much members differ about a step, `[P]`.
+def measure_disagreement(predicted: Predicted) -> jax.Array:
+    """Measures how much the members' predictions differ, `[P]`.
 
-    Their standard deviation about the reward, and the root mean square of those about features.
+    It is the standard deviation of the rewards, plus the root mean square over features of their
+    standard deviations.
     """
     features = jnp.sqrt(predicted.features.var(axis=0).mean(axis=-1))
     return features + predicted.reward.std(axis=0)
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """MOPO as an `Agent`; its energy is minus the policy's logits."""
-    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    """Makes a MOPO agent; its energy is minus the policy's logits."""
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # all but the end
     trunk = setup.make_policy(("features", setup.model.width))
     module = Networks(trunk, choices, settings.members)
     optimizer = make_optimizer(setup.training)
@@ -171,20 +189,26 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         taken: jax.Array,
         returns: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """IQL's losses `[P]` of actions that were taken, given what they returned; the values.
+        """Computes IQL's losses `[P]` of actions, and the values `[P]` of their states.
 
-        States are given twice, as the network sees them and as its target does, `[P, D]` each.
+        Args:
+            params: parameters of the network.
+            target: parameters of the target network.
+            features: features `[P, D]` of the states in the network.
+            target_features: features `[P, D]` of the states in the target network.
+            taken: actions `[P]`.
+            returns: Bellman targets `[P]` of the actions.
         """
         value, *qs = call(params, "judge", features)
-        held = call(target, "judge", target_features)[1:]
-        least = jnp.minimum(*(losses.of_action(q, taken) for q in held))
+        target_qs = call(target, "judge", target_features)[1:]
+        least = jnp.minimum(*(losses.select_values(q, taken) for q in target_qs))
         logits = call(params, "logits", features)
-        return iql.loss(settings, value, qs, least, logits, taken, returns), value
+        return iql.compute_losses(settings, value, qs, least, logits, taken, returns), value
 
     def imagine(
         params: Params, target: Params, features: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The mean loss of a rollout from features `[P, D]`, and its mean disagreement."""
+        """Imagines a rollout from features `[P, D]`: its mean loss and mean disagreement."""
 
         def step(
             carry: tuple[jax.Array, jax.Array], step_key: jax.Array
@@ -194,7 +218,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
             logits = jax.lax.stop_gradient(call(params, "logits", features))
             taken = jax.random.categorical(action_key, logits)
             predicted = jax.lax.stop_gradient(call(params, "predict", features, taken))
-            differ = disagreement(predicted)
+            differ = measure_disagreement(predicted)
             rewards = predicted.reward.mean(axis=0) - settings.penalty * differ
             goes_on = 1 - jax.nn.sigmoid(predicted.ending).mean(axis=0)
             member = jax.random.randint(member_key, (), 0, settings.members)
@@ -206,14 +230,14 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
         start = features, jnp.ones(features.shape[0])
         keys = jax.random.split(key, settings.rollout)
-        _, (found, differ) = jax.lax.scan(step, start, keys)
-        return found.mean(), differ.mean()
+        _, (each_loss, differ) = jax.lax.scan(step, start, keys)
+        return each_loss.mean(), differ.mean()
 
-    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+    def apply(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return call(params, "act", context, tokens)
 
     def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
-        """Tokens of the network and of its target, before and after the steps."""
+        """Encodes the states before and after the steps, with the network and its target."""
         return tuple(call(p, "encode_transitions", batch.context) for p in (params, target))
 
     def transition_loss(
@@ -223,45 +247,45 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         tokens: PyTree,
         key: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Of the policy on the data and on what is imagined, and of the ensemble."""
+        """Sums the losses of the policy, on data and imagined steps, and of the ensemble."""
         context = transition.context
         drop_key, rollout_key = jax.random.split(key)
         options = {"deterministic": False, "rngs": {"dropout": drop_key}}
-        mine, held = tokens
-        now, later = call(params, "transition", context, mine, **options)
-        seen, seen_later = call(target, "transition", context, held)
-        taken, known = losses.last_actions(context, len(now), choices)
-        rewards = context.rewards[-len(now) :]
+        own_tokens, target_tokens = tokens
+        before, after = call(params, "apply_transition", context, own_tokens, **options)
+        target_before, target_after = call(target, "apply_transition", context, target_tokens)
+        taken, known = losses.find_transition_actions(context, len(before), choices)
+        rewards = context.rewards[-len(before) :]
 
-        values = call(params, "judge", later)[0]
-        returns = losses.bellman(transition, values, settings.discount)
-        real, value = improve(params, target, now, seen, taken, returns)
+        values = call(params, "judge", after)[0]
+        returns = losses.bellman_targets(transition, values, settings.discount)
+        real, value = improve(params, target, before, target_before, taken, returns)
 
-        predicted = call(params, "predict", seen, taken)
-        ending = jnp.zeros(len(now)).at[-1].set(transition.terminated)
+        predicted = call(params, "predict", target_before, taken)
+        ending = jnp.zeros(len(before)).at[-1].set(transition.terminated)
         ensemble = (
-            ((predicted.features - seen_later) ** 2).mean(axis=-1)
+            ((predicted.features - target_after) ** 2).mean(axis=-1)
             + (predicted.reward - rewards) ** 2
             + optax.losses.sigmoid_binary_cross_entropy(predicted.ending, ending)
         ).sum(axis=0)
 
-        imagined, differ = imagine(params, target, seen[-1:], rollout_key)
-        cloning, accuracy = losses.imitation(call(params, "behaviour", now), taken, known)
+        imagined, differ = imagine(params, target, target_before[-1:], rollout_key)
+        cloning, accuracy = losses.imitation_loss(call(params, "behaviour", before), taken, known)
         share = settings.real_share
-        of_data = losses.mean_where(share * real + ensemble, known)
+        of_data = losses.average_where(share * real + ensemble, known)
         loss = of_data + (1 - share) * imagined + cloning
         return loss, {
             "accuracy": accuracy,
-            "value": losses.mean_where(value, known),
-            "ensemble": losses.mean_where(ensemble, known),
+            "value": losses.average_where(value, known),
+            "ensemble": losses.average_where(ensemble, known),
             "disagreement": differ,
         }
 
     init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
     mean_loss = average_loss(setup, transition_loss, encode)
     update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
-    energy = make_acting_energy(setup, say)
-    encode_next = make_encode_next(setup, module, say)
+    energy = make_acting_energy(setup, apply)
+    encode_next = make_encode_next(setup, module, apply)
     return Agent(init, transition_batches(setup), update, energy, encode_next)
 
 

@@ -1,4 +1,4 @@
-"""PlaTe (Sun et al., 2021): states and actions are predicted in turn; plans by beam search."""
+"""PlaTe (Sun et al., 2021): it predicts states and actions in turn, and plans by beam search."""
 
 import dataclasses
 from typing import Any
@@ -29,7 +29,7 @@ class Settings:
     """The options of PlaTe alone.
 
     Attributes:
-        state_weight: Weight of the loss of predicted states beside that of actions.
+        state_weight: Weight of the loss of predicted states; the loss of actions has weight 1.
     """
 
     state_weight: float = 1.0
@@ -40,7 +40,7 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """PlaTe as an `Agent`; its energy is the negative log-likelihood of a plan."""
+    """Makes a PlaTe agent; its energy is the negative log-likelihood of a plan."""
     sizes, last = setup.sizes, setup.domain.num_actions - 1  # the end action
     if setup.model.architecture != "paper" and setup.horizon > MOST_LAYERS:
         raise UserError(
@@ -52,14 +52,14 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     optimizer = make_optimizer(setup.training)
 
     def encode(params: Params, context: Context) -> PyTree:
-        return module.apply(params, context, method="begin")
+        return module.apply(params, context, method="make_memory")
 
     def logits(
         params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         result = module.apply(params, memory, actions, positions, method="logits")
         assert isinstance(result, jax.Array)
-        # Past an end nothing is chosen, and nothing was learned: the end goes on.
+        # After an end only the end can follow; training skips these positions.
         ended = jnp.cumsum(actions == last) - (actions == last) > 0
         goes_on = jnp.where(jnp.arange(sizes.num_actions) == last, 0.0, -jnp.inf)
         return jnp.where(ended[positions, None], goes_on, result)
@@ -69,19 +69,23 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Cross-entropy of the actions; squared error of the states that they lead to."""
+        """Sums the cross-entropy of actions and the squared errors of predicted states."""
         del extra
         states, actions = module.apply(params, window.context, tokens, method="encode_unrolled")
-        found: Any = module.apply(
+        outputs: Any = module.apply(
             params, states, actions, deterministic=False, rngs={"dropout": key}, method="read"
         )
-        chosen, led = found
-        # Up to the first end: past it nothing is chosen.
+        logits, predicted = outputs
+        # The loss counts actions up to the first end.
         ended = jnp.cumsum(window.actions == last) - (window.actions == last)
-        cloning, accuracy = losses.imitation(chosen, window.actions, ended == 0)
+        cloning, accuracy = losses.imitation_loss(logits, window.actions, ended == 0)
         acted = (window.actions < last)[:-1]
-        targets = jax.lax.stop_gradient(states[-led.shape[0] :]) if led.shape[0] else led
-        errors = ((led - targets) ** 2).mean(axis=1)
+        targets = (
+            jax.lax.stop_gradient(states[-predicted.shape[0] :])
+            if predicted.shape[0]
+            else predicted
+        )
+        errors = ((predicted - targets) ** 2).mean(axis=1)
         error = jnp.where(acted, errors, 0).sum() / jnp.maximum(acted.sum(), 1)
         loss = cloning + setup.settings.state_weight * error
         return loss, {"accuracy": accuracy, "state_error": error}
@@ -93,7 +97,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
 
 def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.Array) -> PyTree:
-    """Touches every parameter, to initialise them."""
+    """Uses every parameter, to initialise them."""
     states, before = module.encode(context)
     plan = jnp.concatenate([states, jnp.zeros((actions.shape[0] - 1, states.shape[1]))])
     return module.read(plan, jnp.concatenate([before, actions[:-1]]))

@@ -1,4 +1,4 @@
-"""What methods share that learn Q-values from transitions alone, and act by the highest."""
+"""The agent that CQL, QR-DQN and REM share: it learns Q-values, and acts by the highest."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import check_types, check_within
 from leapjax.data import windows
-from leapjax.models.policy import PolicyModel, Said
+from leapjax.models.policy import Outputs, PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of each of them.
+    """The options that every such method has.
 
     The originals copy the network to the target network every few thousand steps: 8,000 in Agarwal
     et al., 2,000 in d3rlpy.
@@ -41,17 +41,28 @@ class Settings:
         check_within(self, 0, 1, "discount", "target_rate")
 
 
-class Judged(NamedTuple):
-    """A step that was taken, and the W numbers that networks say of the states around it."""
+class TransitionOutputs(NamedTuple):
+    """The network's W outputs at the states of a transition, and its actions.
 
-    now: jax.Array  # [P, W] before the step
-    later: jax.Array  # [P, W] after it
-    held: jax.Array  # [P, W] after it, by the target network
-    taken: jax.Array  # [P] int32: the action
+    Attributes:
+        before: outputs `[P, W]` at the P states before the steps.
+        after: outputs `[P, W]` at the states after them.
+        target_after: outputs `[P, W]` of the target network at the states after them.
+        actions: actions `[P]` of the steps, int32.
+    """
+
+    before: jax.Array
+    after: jax.Array
+    target_after: jax.Array
+    actions: jax.Array
 
 
-def encode_around(module: PolicyModel) -> EncodeExamples:
-    """Encodes the contexts before and after the steps of transitions, for `look_around`."""
+def make_transition_encoder(module: PolicyModel) -> EncodeExamples:
+    """Makes the `encode` of `average_loss` for transitions; `apply_to_transition` takes its tokens.
+
+    Args:
+        module: network.
+    """
 
     def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
         after = jax.vmap(windows.after)(batch.context)
@@ -63,35 +74,37 @@ def encode_around(module: PolicyModel) -> EncodeExamples:
     return encode
 
 
-def look_around(
+def apply_to_transition(
     module: PolicyModel,
     params: Params,
     target: Params,
     context: Context,
     tokens: PyTree,
     key: jax.Array,
-) -> tuple[Said, Said, Said]:
-    """What is said before and after the step of a transition, and after it by the target network.
+) -> tuple[Outputs, Outputs, Outputs]:
+    """Applies a network before and after the step of a transition, and the target network after.
 
     Args:
-        module: the network.
-        params: its parameters.
-        target: those of the target network.
-        context: of the transition.
-        tokens: of the transition, from `encode_around`.
-        key: of dropout; the target network has none.
+        module: network.
+        params: parameters of the network.
+        target: parameters of the target network.
+        context: context of the transition.
+        tokens: tokens of the transition, from `make_transition_encoder`.
+        key: key of the network's dropout; the target network has no dropout.
     """
     around, after = tokens
-    said: Any = module.apply(
-        params, context, around, deterministic=False, rngs={"dropout": key}, method="transition"
-    )
-    held: Any = module.apply(target, windows.after(context), tokens=after)
-    return *said, held
+    outputs: Any = module.apply(
+        params, context, around, deterministic=False, rngs={"dropout": key},
+        method="apply_transition",
+    )  # fmt: skip
+    target_after: Any = module.apply(target, windows.after(context), tokens=after)
+    return *outputs, target_after
 
 
-Returns = Callable[[jax.Array], jax.Array]
-# values of the states after a step, [P] or [P, N] -> targets of the same shape: `losses.bellman`
-Loss = Callable[[Judged, Returns, jax.Array], jax.Array]  # (judged, returns, key) -> [P]
+MakeTargets = Callable[[jax.Array], jax.Array]
+# values of the states after the steps, [P] or [P, N] -> Bellman targets of the same shape
+Loss = Callable[[TransitionOutputs, MakeTargets, jax.Array], jax.Array]
+# (outputs, make_targets, key) -> [P]
 
 
 def make_agent(
@@ -99,22 +112,22 @@ def make_agent(
     mesh: Mesh | None,
     width: int,
     loss: Loss,
-    values: Callable[[jax.Array], jax.Array],
+    read_values: Callable[[jax.Array], jax.Array],
 ) -> Agent:
-    """An `Agent` whose energy is minus its Q-values.
+    """Makes an agent whose energy is minus its Q-values.
 
     Args:
-        setup: what it is made from.
-        mesh: of devices to train on; None for one.
-        width: W, how many numbers its network says of a state.
-        loss: of each step.
-        values: of what is said, `[P, W]`: the Q-values, `[P, A - 1]`.
+        setup: arguments of a method's `make_agent`.
+        mesh: devices to train on; None for one device.
+        width: W, number of outputs of the network at a state.
+        loss: loss `[P]` of the steps of a transition.
+        read_values: outputs `[P, W]` -> Q-values `[P, A - 1]`.
     """
-    settings, choices = setup.settings, setup.domain.num_actions - 1  # the end is not chosen
+    settings, choices = setup.settings, setup.domain.num_actions - 1  # all but the end action
     module = setup.make_policy(("q", width))
     optimizer = make_optimizer(setup.training)
 
-    def say(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
+    def apply(params: Params, context: Context, tokens: jax.Array | None = None) -> PyTree:
         return module.apply(params, context, tokens=tokens)
 
     def transition_loss(
@@ -126,23 +139,27 @@ def make_agent(
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         context = transition.context
         dropout_key, loss_key = jax.random.split(key)
-        said = look_around(module, params, target, context, tokens, dropout_key)
-        now, later, held = (each["q"] for each in said)
-        taken, known = losses.last_actions(context, len(now), choices)
+        outputs = apply_to_transition(module, params, target, context, tokens, dropout_key)
+        before, after, target_after = (each["q"] for each in outputs)
+        actions, known = losses.find_transition_actions(context, len(before), choices)
 
-        def returns(values: jax.Array) -> jax.Array:
-            return losses.bellman(transition, values, settings.discount)
+        def make_targets(values: jax.Array) -> jax.Array:
+            return losses.bellman_targets(transition, values, settings.discount)
 
-        each = loss(Judged(now, later, held, taken), returns, loss_key)
-        q = values(now)
-        return losses.mean_where(each, known), {
-            "accuracy": losses.mean_where(jnp.argmax(q, axis=1) == taken, known),
-            "value": losses.mean_where(losses.of_action(q, taken), known),
+        steps = TransitionOutputs(before, after, target_after, actions)
+        each = loss(steps, make_targets, loss_key)
+        q = read_values(before)
+        return losses.average_where(each, known), {
+            "accuracy": losses.average_where(jnp.argmax(q, axis=1) == actions, known),
+            "value": losses.average_where(losses.select_values(q, actions), known),
         }
 
-    init = make_init(setup, module, apply_to_context, optimizer, target=lambda params: params)
-    mean_loss = average_loss(setup, transition_loss, encode_around(module))
-    update = make_update(mean_loss, optimizer, mesh, follow_parameters(settings.target_rate))
-    energy = make_acting_energy(setup, say, lambda said: values(said["q"]))
-    encode_next = make_encode_next(setup, module, say)
-    return Agent(init, transition_batches(setup), update, energy, encode_next)
+    mean_loss = average_loss(setup, transition_loss, make_transition_encoder(module))
+    follow = follow_parameters(settings.target_rate)
+    return Agent(
+        init=make_init(setup, module, apply_to_context, optimizer, target=lambda params: params),
+        batch=transition_batches(setup),
+        update=make_update(mean_loss, optimizer, mesh, follow),
+        energy=make_acting_energy(setup, apply, lambda outputs: read_values(outputs["q"])),
+        encode_next=make_encode_next(setup, module, apply),
+    )

@@ -12,11 +12,11 @@ from leapjax.types import Agent, Context, Params, PyTree
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """There is nothing to choose."""
+    """Random actions have no options."""
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """Uniform random actions as an `Agent`, whose parameters are empty."""
+    """Makes an agent of uniform random actions; its parameters are `()`."""
     del mesh
     setup.check_single_action()
     choices = setup.domain.num_actions - 1

@@ -1,4 +1,4 @@
-"""Planning by what a domain knows of itself: its rules as an energy, without any learning."""
+"""Planning by the rules of a domain, written as an energy; it learns from no data."""
 
 import dataclasses
 
@@ -11,14 +11,14 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """There is nothing to choose."""
+    """Rules have no options."""
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """The domain's rules as an `Agent`.
+    """Makes an agent of the domain's rules.
 
     Raises:
-        UserError: it has none.
+        UserError: the domain has no rules.
     """
     del mesh
     if setup.domain.rules is None:

@@ -22,23 +22,34 @@ from leapjax.types import Context
 
 
 class Memory(NamedTuple):
-    """What all plans from one context share."""
+    """The part of a pass that all plans from one context share.
 
-    known: list[KeysValues]  # of the tokens up to the current state, per layer, with room for more
-    first: jax.Array  # [A] logits of the first action
+    Attributes:
+        known: keys and values of the tokens up to the current state, per layer, with room for more.
+        first: logits `[A]` of the first action.
+    """
+
+    known: list[KeysValues]
+    first: jax.Array
 
 
 class AlternatingModel(nn.Module):
-    """Tokens s_1 a_1 s_2 a_2 ... s_T, each of which sees those before it.
+    """Tokens s_1 a_1 s_2 a_2 ... s_T with causal attention.
 
-    An action is read off its state, and off an action the state that it leads to, as a vector:
-    the encoding that the network has of states that it sees. Architecture `paper` has the past
-    before that, in the same way; of architecture `leapjax` the encoder knows it.
+    The network reads an action off the token of its state, and the next state off the token of the
+    action. A predicted state is a vector: the network's own encoding of the observed state. With
+    architecture `paper` the past states and actions come first, in the same way; with architecture
+    `leapjax` the encoder summarises the past.
+
+    Attributes:
+        config: architecture and size of the network.
+        sizes: sizes of contexts and plans.
+        encoder: encoder of the domain, with tokens `[K + 1, D]` or `[C, D]` of a context.
     """
 
     config: ModelConfig
     sizes: Sizes
-    encoder: Encoder  # the domain's: context -> [K + 1, D], or [C, D]
+    encoder: Encoder
 
     def setup(self) -> None:  # noqa: D102
         c, sizes = self.config, self.sizes
@@ -47,7 +58,7 @@ class AlternatingModel(nn.Module):
         tokens = 2 * (self.past + sizes.horizon)
         self.position = nn.Embed(tokens, c.width, embedding_init=zeros)
         self.summary = dense(c.width, scale=0.1)
-        # Without weights, so that a vector cannot be made easy to predict by making it small.
+        # Without weights: otherwise training would shrink the states, to predict them more easily.
         self.norm = nn.LayerNorm(use_scale=False, use_bias=False)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
@@ -56,11 +67,11 @@ class AlternatingModel(nn.Module):
 
     @property
     def past(self) -> int:
-        """Past states that are tokens of their own."""
+        """The number of past states with tokens of their own."""
         return self.sizes.context if self.config.architecture == "paper" else 0
 
     def encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
-        """States `[past + 1, D]` up to the current one, and the actions `[past]` between them."""
+        """Encodes the states `[past + 1, D]`; also returns the actions `[past]` between them."""
         return self._states(self.encoder(context)), context.actions[
             context.actions.shape[0] - self.past :
         ]
@@ -68,8 +79,8 @@ class AlternatingModel(nn.Module):
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Returns the encoder's tokens of B unrolled windows.
 
-        Architecture `paper`: `[B, K + T, D]`, each state is encoded once; `leapjax`:
-        `[B, T, C, D]`, those of the context at each state of the plan.
+        They are `[B, K + T, D]` with architecture `paper`, a token for each state; and
+        `[B, T, C, D]` with `leapjax`, the tokens of T contexts, one at each state of the plan.
         """
         if self.config.architecture == "paper":
             return self.encoder.encode_batch(contexts)
@@ -83,11 +94,11 @@ class AlternatingModel(nn.Module):
         return jnp.stack([self.encoder.encode_batch(at(place)) for place in places], axis=1)
 
     def encode_unrolled(self, context: Context, tokens: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The same of an unrolled window: states `[past + T, D]`, actions `[past + T - 1]`.
+        """Returns states `[past + T, D]` and actions `[past + T - 1]` of an unrolled window.
 
         Args:
-            context: of the window.
-            tokens: its row of what `encode_batch` returned.
+            context: context of the window.
+            tokens: row of the result of `encode_batch`.
         """
         count = self.past + self.sizes.horizon
         actions = context.actions[context.actions.shape[0] - (count - 1) :]
@@ -101,19 +112,19 @@ class AlternatingModel(nn.Module):
         return self.norm(self.summary(tokens))
 
     def _tokens(self, states: jax.Array, actions: jax.Array) -> jax.Array:
-        """`[2 n - 1, D]` of n states and the actions between them."""
+        """Returns tokens `[2 n - 1, D]` of n states and the actions between them."""
         tokens = interleave(states, jnp.tanh(self.action(actions)))
         return tokens + self.position(jnp.arange(tokens.shape[0]))
 
     def read(
         self, states: jax.Array, actions: jax.Array, deterministic: bool = True
     ) -> tuple[jax.Array, jax.Array]:
-        """Logits `[T, A]` of each action of the plan, and the states `[T - 1, D]` they lead to.
+        """Predicts each action, logits `[T, A]`, and the states `[T - 1, D]` after the actions.
 
         Args:
-            states: `[past + T, D]`.
-            actions: `[past + T - 1]` those between them.
-            deterministic: without dropout.
+            states: encoded states `[past + T, D]`.
+            actions: actions `[past + T - 1]` between the states.
+            deterministic: whether to leave out dropout.
         """
         tokens = self._tokens(states, actions)
         h = self.transformer(
@@ -123,39 +134,41 @@ class AlternatingModel(nn.Module):
         )  # fmt: skip
         return self.choose(h[::2]), self.norm(self.predict(h[1::2]))
 
-    def begin(self, context: Context) -> Memory:
-        """What every plan from here on shares."""
+    def make_memory(self, context: Context) -> Memory:
+        """Encodes a context, once for all plans."""
         states, actions = self.encode(context)
         x = self._tokens(states, actions)
-        room = self.transformer.nothing_yet(2 * (self.past + self.sizes.horizon) - 1)
+        room = self.transformer.make_empty_memory(2 * (self.past + self.sizes.horizon) - 1)
         h, memory = self.transformer.extend(x, room, 0)
         return Memory(memory, self.choose(h[-1]))
 
     def logits(self, memory: Memory, actions: jax.Array, positions: jax.Array) -> jax.Array:
-        """Logits `[P, A]` at `positions [P]`, given the actions before each: states are predicted.
+        """Returns logits `[P, A]` at some positions of a plan, given the actions before each.
+
+        The network predicts the states in between.
 
         Args:
-            memory: from `begin`.
-            actions: `[T]`; what is not chosen yet may be MASK.
-            positions: P of them.
+            memory: result of `make_memory`.
+            actions: plan `[T]`, which may hold MASK.
+            positions: positions `[P]`.
         """
         check_plan(actions, self.sizes.horizon)
         embedded = jnp.tanh(self.action(actions))
 
-        def go_on(
+        def take_action(
             place: int | jax.Array, carry: tuple[list[KeysValues], jax.Array]
         ) -> tuple[list[KeysValues], jax.Array]:
-            """One action, the state that it leads to, and the logits of the next."""
-            known, chosen = carry
+            """Appends one action and the predicted next state; reads off the next logits."""
+            known, logits = carry
             token = 2 * (self.past + place) + 1
             h, known = self.transformer.extend(
                 (embedded[place] + self.position(token))[None], known, token
             )
             state = self.norm(self.predict(h)) + self.position(token + 1)
             h, known = self.transformer.extend(state, known, token + 1)
-            return known, chosen.at[place + 1].set(self.choose(h[0]))
+            return known, logits.at[place + 1].set(self.choose(h[0]))
 
-        chosen = jnp.zeros((self.sizes.horizon, self.sizes.num_actions)).at[0].set(memory.first)
-        # Only as far as is asked for.
-        _, chosen = jax.lax.fori_loop(0, positions.max(), go_on, (memory.known, chosen))
-        return forbid_early_end(chosen[positions], positions)
+        logits = jnp.zeros((self.sizes.horizon, self.sizes.num_actions)).at[0].set(memory.first)
+        # It stops at the last of the positions.
+        _, logits = jax.lax.fori_loop(0, positions.max(), take_action, (memory.known, logits))
+        return forbid_early_end(logits[positions], positions)

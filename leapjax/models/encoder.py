@@ -1,4 +1,4 @@
-"""What a domain's encoder offers to every network: tokens of a context, and optional abilities."""
+"""The interface of a domain's encoder: tokens of a context, and optional abilities."""
 
 import flax.linen as nn
 import jax
@@ -10,8 +10,8 @@ from leapjax.types import Context
 class Encoder(nn.Module):
     """Turns a context into tokens. A subclass defines `__call__`; the rest has defaults.
 
-    For architecture `paper` there is a token for each state of the context, the current one
-    last: C = K + 1. For `leapjax` C is any number.
+    An encoder for architecture `paper` makes a token for each state of the context, C = K + 1; the
+    last one is the current state's. For `leapjax` C is any number.
     """
 
     def __call__(self, context: Context) -> jax.Array:
@@ -21,7 +21,7 @@ class Encoder(nn.Module):
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Returns the tokens `[B, C, D]` of B contexts, for training.
 
-        An encoder overrides this if it can do better than one context after the other.
+        An encoder overrides this if it can encode a batch faster than one context after the other.
         """
         each = nn.vmap(
             lambda encoder, context: encoder(context),
@@ -31,14 +31,14 @@ class Encoder(nn.Module):
         return tokens
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Returns the tokens `[C, D]` of a context whose past states have been encoded before.
+        """Returns the tokens `[C, D]` of a context, given the tokens of its past states.
 
         An encoder with a token for each state overrides this, to encode the new state only.
 
         Args:
-            context: the current one, K > 0.
-            known: `[K, D]` the tokens of its past states, from the plan before; None: the
-                episode begins.
+            context: current context, K > 0.
+            known: tokens `[K, D]` of its past states, from the plan before; None when an episode
+                begins.
         """
         del known
         return self(context)
@@ -46,16 +46,16 @@ class Encoder(nn.Module):
     def encode_positions(self, context: Context, horizon: int) -> jax.Array | None:
         """Returns an embedding `[T, D]` of each position of a plan, such as a cell of a board.
 
-        None: the network learns an embedding of the position's number.
+        It returns None by default; the network then learns an embedding of each position.
         """
         del context, horizon
         return None
 
     def add_later_state(self) -> "Encoder":
-        """Returns this encoder with one more token: of later states, whose pose is unknown.
+        """Returns this encoder with one more token, for later states with unknown poses.
 
         Raises:
-            UserError: it cannot tell a pose from the rest of a state.
+            UserError: the encoder does not separate the pose from the rest of a state.
         """
         raise UserError(
             "states that are not repeated are for architecture 'paper' on BabyAI: no other encoder "

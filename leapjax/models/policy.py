@@ -10,24 +10,30 @@ from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
 
-Said = dict[str, jax.Array]  # by head: [P, count]
+Outputs = dict[str, jax.Array]  # by head: [P, outputs of the head]
 
 
 class PolicyModel(nn.Module):
-    """Logits, values or whatever a method needs, read off the states of a context.
+    """Linear heads (logits, values, features) on the last P states of a context.
 
-    Architecture `paper`: tokens s_1 a_1 s_2 a_2 ... s_n, each of which sees those before it, and
-    something is said at every state. Architecture `leapjax`: the encoder's few tokens and one
-    that asks, so that something is said at the current state only. `P` states in all. Where it
-    is conditioned on returns to go, their tokens precede the states', or join the one that asks
-    (Chen et al., Decision Transformer).
+    Architecture `paper` reads every state, P = K + 1: tokens s_1 a_1 s_2 a_2 ... s_n with causal
+    attention. Architecture `leapjax` reads the current state, P = 1: the encoder's few tokens, and
+    one query token. A network that is conditioned on returns to go has a return token before each
+    state's, or adds the return's embedding to the query (Chen et al., Decision Transformer).
+
+    Attributes:
+        config: architecture and size of the network.
+        sizes: sizes of contexts.
+        encoder: encoder of the domain, with tokens `[K + 1, D]` or `[C, D]` of a context.
+        heads: name and number of outputs of each head.
+        conditioned: whether the network is conditioned on returns to go.
     """
 
     config: ModelConfig
     sizes: Sizes
-    encoder: Encoder  # the domain's: context -> [K + 1, D], or [C, D]
-    heads: tuple[tuple[str, int], ...]  # what is said: a name, and how many numbers
-    conditioned: bool = False  # on returns to go
+    encoder: Encoder
+    heads: tuple[tuple[str, int], ...]
+    conditioned: bool = False
 
     def setup(self) -> None:  # noqa: D102
         c = self.config
@@ -43,7 +49,7 @@ class PolicyModel(nn.Module):
             self.goal = dense(c.width, scale=1.0)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
-        self.said = [dense(count, name=name) for name, count in self.heads]
+        self.outputs = [dense(count, name=name) for name, count in self.heads]
 
     def __call__(
         self,
@@ -51,63 +57,64 @@ class PolicyModel(nn.Module):
         deterministic: bool = True,
         returns: jax.Array | None = None,
         tokens: jax.Array | None = None,
-    ) -> Said:
-        """What each head says, `[P, count]`, at the last P states, the current one last.
+    ) -> Outputs:
+        """Returns the outputs of each head at the last P states, the current one last.
 
         Args:
-            context: what is known.
-            deterministic: without dropout.
-            returns: `[K + 1]` the return to go at each state, where it is conditioned on them.
-            tokens: the encoder's, from `encode_batch` or `encode_next`; None: encode the context.
+            context: context to read.
+            deterministic: whether to leave out dropout.
+            returns: returns to go `[K + 1]` at each state; None if not conditioned.
+            tokens: encoder's tokens, from `encode_batch` or `encode_next`; None: encode the
+                context.
         """
         tokens = self.encoder(context) if tokens is None else tokens
-        return self._say(tokens, context, deterministic, returns)
+        return self._apply_heads(tokens, context, deterministic, returns)
 
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Returns the encoder's tokens `[B, C, D]` of B contexts."""
         return self.encoder.encode_batch(contexts)
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Returns the encoder's tokens of a context, given those of its past states."""
+        """Returns the encoder's tokens of a context, given the tokens of its past states."""
         return self.encoder.encode_next(context, known)
 
     def encode_transitions(self, contexts: Context) -> tuple[jax.Array, jax.Array]:
         """Returns the encoder's tokens before and after the steps of transitions, `[B, C, D]` each.
 
         Args:
-            contexts: of B `TransitionWindow`s.
+            contexts: contexts of B `TransitionWindow`s.
         """
         if self.config.architecture != "paper":
             earlier, later = (jax.vmap(f)(contexts) for f in (windows.before, windows.after))
             return self.encode_batch(earlier), self.encode_batch(later)
-        states = self.encode_batch(contexts)  # [B, K + 2, D]: each is encoded once
+        states = self.encode_batch(contexts)  # [B, K + 2, D]: encodes each state once
         return states[:, :-1], states[:, 1:]
 
-    def transition(
+    def apply_transition(
         self, context: Context, tokens: tuple[jax.Array, jax.Array], deterministic: bool = True
-    ) -> tuple[Said, Said]:
-        """What is said before and after the step of a transition.
+    ) -> tuple[Outputs, Outputs]:
+        """Returns the outputs before and after the step of a transition.
 
         Args:
-            context: of the `TransitionWindow`.
-            tokens: its rows of what `encode_transitions` returned.
-            deterministic: without dropout.
+            context: context of the `TransitionWindow`.
+            tokens: rows of the results of `encode_transitions`, `[C, D]` each.
+            deterministic: whether to leave out dropout.
         """
         earlier, later = tokens
         return (
-            self._say(earlier, windows.before(context), deterministic, None),
-            self._say(later, windows.after(context), deterministic, None),
+            self._apply_heads(earlier, windows.before(context), deterministic, None),
+            self._apply_heads(later, windows.after(context), deterministic, None),
         )
 
-    def _say(
+    def _apply_heads(
         self, tokens: jax.Array, context: Context, deterministic: bool, returns: jax.Array | None
-    ) -> Said:
+    ) -> Outputs:
         goals = None if returns is None else jnp.tanh(self.goal(returns[:, None]))  # [K + 1, D]
-        read = self._sequence if self.config.architecture == "paper" else self._question
+        read = self._read_sequence if self.config.architecture == "paper" else self._read_query
         h = read(tokens, context, deterministic, goals)
-        return {name: said(h) for (name, _), said in zip(self.heads, self.said, strict=True)}
+        return {name: head(h) for (name, _), head in zip(self.heads, self.outputs, strict=True)}
 
-    def _sequence(
+    def _read_sequence(
         self, states: jax.Array, context: Context, deterministic: bool, goals: jax.Array | None
     ) -> jax.Array:
         actions = jnp.tanh(self.action(context.actions))  # [K, D]
@@ -121,17 +128,23 @@ class PolicyModel(nn.Module):
             mask=causal_mask(tokens.shape[0]), deterministic=deterministic,
         )  # fmt: skip
 
-    def _question(
+    def _read_query(
         self, tokens: jax.Array, context: Context, deterministic: bool, goals: jax.Array | None
     ) -> jax.Array:
         del context
         tokens = self.drop(tokens, deterministic=deterministic)
         memory = self.transformer.prefix(tokens, deterministic=deterministic)
         first = jnp.zeros(1, jnp.int32)
-        question = self.question(first) if goals is None else self.question(first) + goals[-1:]
-        return self.transformer(question, first, memory, deterministic=deterministic)
+        query = self.question(first) if goals is None else self.question(first) + goals[-1:]
+        return self.transformer(query, first, memory, deterministic=deterministic)
 
 
-def past_and_present(past: jax.Array, present: jax.Array, count: int) -> jax.Array:
-    """What belongs to each of the last `count` states: `[K]` and `[]` to `[count]`."""
+def append_present(past: jax.Array, present: jax.Array, count: int) -> jax.Array:
+    """Appends the current state's value to the past ones, and keeps the last `count`.
+
+    Args:
+        past: values `[K]` of the past states.
+        present: value `[]` of the current state.
+        count: number of values to keep, at most K + 1.
+    """
     return jnp.append(past, present)[past.shape[0] + 1 - count :]

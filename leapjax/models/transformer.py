@@ -1,8 +1,8 @@
 """A pre-norm transformer whose keys and values of a fixed prefix are computed once.
 
-`Transformer.prefix` runs the prefix tokens through all layers among themselves;
-`Transformer.__call__` runs the tokens that change, which also attend to the prefix, and
-computes the last layer only where it is asked for. All for one sequence, `[tokens, D]`.
+`Transformer.prefix` runs the prefix tokens through all layers. `Transformer.__call__` runs the
+other tokens, which also attend to the prefix; it computes the last layer at the queried tokens
+only. Both take one sequence, `[tokens, D]`.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,15 @@ WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
 
 
 class KeysValues(NamedTuple):
-    """What one layer remembers of a sequence."""
+    """Keys and values of a sequence in one layer.
 
-    keys: jax.Array  # [tokens, heads, D / heads]
-    values: jax.Array  # [tokens, heads, D / heads]
+    Attributes:
+        keys: `[tokens, heads, D / heads]`.
+        values: `[tokens, heads, D / heads]`.
+    """
+
+    keys: jax.Array
+    values: jax.Array
 
 
 def dense(
@@ -30,13 +35,13 @@ def dense(
     name: str | None = None,
     dtype: Dtype | None = None,
 ) -> nn.Dense:
-    """A linear layer with the initialisation of this transformer."""
+    """Makes a linear layer with the initialisation of this transformer."""
     init = nn.initializers.normal(scale)
     return nn.Dense(features, use_bias, dtype=dtype, kernel_init=init, name=name)
 
 
 def embed(count: int, width: int, name: str | None = None) -> nn.Embed:
-    """A table of embeddings with the initialisation of this transformer."""
+    """Makes a table of embeddings with the initialisation of this transformer."""
     return nn.Embed(count, width, embedding_init=_small, name=name)
 
 
@@ -45,12 +50,16 @@ def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float3
 
 
 def causal_mask(tokens: int, prefix: int = 0) -> jax.Array:
-    """`[tokens, prefix + tokens]`: each token sees the prefix, itself and those before it."""
+    """Makes a mask `[tokens, prefix + tokens]`: tokens see the prefix and no later token."""
     return jnp.tril(jnp.ones((tokens, prefix + tokens), bool), prefix)
 
 
 def interleave(*sequences: jax.Array) -> jax.Array:
-    """One token of each in turn, `[k n - 1, D]`: k sequences `[n, D]`, the last of `[n - 1, D]`."""
+    """Takes one token of each sequence in turn, `[k n - 1, D]`.
+
+    Args:
+        sequences: k sequences, `[n, D]` each but the last one, `[n - 1, D]`.
+    """
     *whole, last = sequences
     last = jnp.concatenate([last, jnp.zeros_like(whole[0][:1])])
     return jnp.stack([*whole, last], axis=1).reshape(-1, last.shape[1])[:-1]
@@ -59,11 +68,17 @@ def interleave(*sequences: jax.Array) -> jax.Array:
 class Block(nn.Module):
     """One layer: attention, then a two-layer perceptron, each on a normalised residual.
 
-    With a `dtype` of lower precision the matrix products have it, as have keys and values;
-    parameters, the residual, the statistics of norms and the softmax stay float32.
+    Parameters, the residual, the statistics of norms and the softmax are float32.
+
+    Attributes:
+        width: D.
+        heads: number of attention heads; divides D.
+        dropout: dropout rate of attention and residuals.
+        activation: activation of the perceptron.
+        dtype: type of matrix products, keys and values.
     """
 
-    width: int  # D
+    width: int
     heads: int
     dropout: float
     activation: Callable[[jax.Array], jax.Array]
@@ -82,14 +97,21 @@ class Block(nn.Module):
         self.drop = nn.Dropout(self.dropout)
 
     def keys_values(self, x: jax.Array) -> KeysValues:
-        """What others attend to in tokens `[tokens, D]`."""
+        """Returns the keys and values of tokens `[tokens, D]`."""
         h = self.norm_attention(x)
         return KeysValues(self._heads(self.key(h)), self._heads(self.value(h)))
 
     def __call__(
         self, x: jax.Array, memory: KeysValues, mask: jax.Array | None, deterministic: bool
     ) -> jax.Array:
-        """Tokens `[Q, D]` after this layer, attending to `memory` where `mask [Q, M]` is."""
+        """Returns tokens `[Q, D]` after this layer.
+
+        Args:
+            x: tokens `[Q, D]`.
+            memory: keys and values of the M tokens to attend to.
+            mask: booleans `[Q, M]`: which tokens (columns) each token (row) attends to; None: all.
+            deterministic: whether to leave out dropout.
+        """
         queries = self._heads(self.query(self.norm_attention(x)))
         scores = jnp.einsum("qhd,mhd->hqm", queries, memory.keys).astype(jnp.float32)
         scores /= jnp.sqrt(self.width / self.heads)
@@ -107,10 +129,14 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Layers of `Block` and a final norm."""
+    """Layers of `Block` and a final norm. The attributes other than `layers` are `Block`'s.
+
+    Attributes:
+        layers: number of blocks.
+    """
 
     layers: int
-    width: int  # D
+    width: int
     heads: int
     dropout: float = 0.0
     activation: Callable[[jax.Array], jax.Array] = nn.gelu
@@ -126,9 +152,12 @@ class Transformer(nn.Module):
     def prefix(
         self, x: jax.Array, mask: jax.Array | None = None, deterministic: bool = True
     ) -> list[KeysValues]:
-        """Keys and values, per layer, of prefix tokens `[M, D]` that see only each other.
+        """Returns the keys and values, per layer, of prefix tokens, which see only each other.
 
-        `mask [M, M]` is False where a token (row) may not attend to another (column).
+        Args:
+            x: prefix tokens `[M, D]`.
+            mask: booleans `[M, M]`: which tokens (columns) each token (row) attends to; None: all.
+            deterministic: whether to leave out dropout.
         """
         memory = []
         for block in self.blocks[:-1]:
@@ -144,10 +173,15 @@ class Transformer(nn.Module):
         mask: jax.Array | None = None,
         deterministic: bool = True,
     ) -> jax.Array:
-        """Outputs `[Q, D]` at token indices `queried [Q]` of tokens `x [tokens, D]`.
+        """Returns the outputs `[Q, D]` at some tokens of a sequence.
 
-        Every token attends to the prefix, where it is given, and to all tokens; or only where
-        `mask [tokens, prefix + tokens]` is True (see `causal_mask`).
+        Args:
+            x: tokens `[tokens, D]`.
+            queried: indices `[Q]` of the tokens to return.
+            prefix: keys and values of the prefix, from `prefix`; None: there is no prefix.
+            mask: booleans `[tokens, prefix + tokens]`: which tokens (columns) each token (row)
+                attends to (see `causal_mask`); None: all.
+            deterministic: whether to leave out dropout.
         """
         for index, block in enumerate(self.blocks):
             memory = block.keys_values(x)
@@ -161,22 +195,23 @@ class Transformer(nn.Module):
             x = block(x, memory, mask, deterministic)
         return self.norm(x)
 
-    def nothing_yet(self, tokens: int) -> list[KeysValues]:
-        """Room for the keys and values of so many tokens, per layer, for `extend`."""
+    def make_empty_memory(self, tokens: int) -> list[KeysValues]:
+        """Makes room for the keys and values of a number of tokens, per layer, for `extend`."""
         empty = jnp.zeros((tokens, self.heads, self.width // self.heads), self.dtype)
         return [KeysValues(empty, empty)] * self.layers
 
     def extend(
         self, x: jax.Array, memory: list[KeysValues], start: jax.Array | int
     ) -> tuple[jax.Array, list[KeysValues]]:
-        """Outputs `[n, D]` of the tokens `x [n, D]` that come next, with causal attention.
-
-        The same as of `__call__` with a `causal_mask`, a few tokens at a time, without dropout.
+        """Appends a few tokens to a sequence: `__call__` with a `causal_mask`, without dropout.
 
         Args:
-            x: tokens number `start` and after.
-            memory: of the tokens before them, with room for more.
-            start: `[]` how many there are before.
+            x: next n tokens, `[n, D]`.
+            memory: keys and values of the tokens before, per layer, with room for more.
+            start: number `[]` of tokens before.
+
+        Returns:
+            The outputs `[n, D]`, and the extended memory.
         """
         slots = jnp.arange(memory[0].keys.shape[0])
         mask = slots <= start + jnp.arange(x.shape[0])[:, None]
@@ -185,8 +220,8 @@ class Transformer(nn.Module):
             new = block.keys_values(x)
             joined = KeysValues(
                 *(
-                    jax.lax.dynamic_update_slice_in_dim(all_, some, start, axis=0)
-                    for all_, some in zip(old, new, strict=True)
+                    jax.lax.dynamic_update_slice_in_dim(before, added, start, axis=0)
+                    for before, added in zip(old, new, strict=True)
                 )
             )
             extended.append(joined)
