@@ -1,5 +1,7 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
+from collections import Counter
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +27,8 @@ from tests.programs import only_long
 
 STAR = Star(arms=3, length=4)
 LABELS = STAR.labels
+DOMAIN = make("Star3x4", Settings())
+same = np.testing.assert_array_equal
 
 
 def way(graph):
@@ -66,7 +70,7 @@ def test_the_path_is_rewarded_and_any_other_step_is_the_last():
     steps = [adapter.step(int(node)) for node in path]
     assert [step.reward for step in steps] == [0, 0, 0, 1]
     assert [step.terminated for step in steps] == [False, False, False, True]
-    assert steps[-1].success and not any(step.success for step in steps[:-1])
+    assert [step.success for step in steps] == [False, False, False, True]
     graph = adapter.reset(3)
     others = [child for parent, child in graph.edges if parent == graph.node and child != path[0]]
     assert len(others) == STAR.arms - 1
@@ -78,75 +82,65 @@ def test_the_path_is_rewarded_and_any_other_step_is_the_last():
     assert adapter.step(int(graph.node)).terminated  # to where it is
 
 
-def collected(count=4, seed=0):
-    return (
-        make("Star3x4", Settings())
-        .demonstrations.collect(count, seed, lambda done: None)
-        .demonstrations
-    )
+def collected():
+    return DOMAIN.demonstrations.collect(4, 0, lambda done: None).demonstrations
 
 
 def test_demonstrations_are_the_way():
     for demonstration in collected():
         graph, path = graphs.draw(STAR, demonstration.seed)
-        np.testing.assert_array_equal(demonstration.actions, path)
-        nodes = demonstration.observations.node
-        np.testing.assert_array_equal(nodes, [graph.node, *path])
+        same(demonstration.actions, path)
+        same(demonstration.observations.node, [graph.node, *path])
         assert demonstration.rewards.tolist() == [0, 0, 0, 1] and demonstration.terminated
 
 
-def test_a_relabelled_window_is_that_of_another_graph_with_its_way():
+def changed_by(change, keys):
+    """Windows of two graphs before and after an augmentation: the way is still the way."""
     steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
-    relabel = jax.jit(lambda key, window: graphs.relabel(key, window, LABELS))
     cut = jax.jit(lambda index: windows.window(steps, index, 2, STAR.length, LABELS))
-    seen = set()
+    change = jax.jit(change)
     for index in range(8):
-        window = cut(index)
-        for seed in range(3):
-            new = jax.tree.map(np.asarray, relabel(jax.random.key(10 * index + seed), window))
-            graph, known = new.context.observation, np.asarray(window.actions) < LABELS
-            assert new.actions[known].tolist() == way(graph)
+        window = jax.device_get(cut(index))
+        for seed in range(keys):
+            new = jax.device_get(change(jax.random.key(10 * index + seed), window))
+            known = window.actions < LABELS
+            assert new.actions[known].tolist() == way(new.context.observation)
             assert (new.actions[~known] == LABELS).all()  # the end action has no other name
-            past = new.context.actions
-            padded = np.asarray(window.context.actions) == pad_token(LABELS + 1)
-            assert (past[padded] == pad_token(LABELS + 1)).all()
-            if not padded.all():  # the action before led to where the agent is
-                assert past[-1] == graph.node
-                assert (new.context.past.edges[-1] == graph.edges).all()
-            seen.add(int(graph.goal))
-    assert len(seen) > 10
+            if window.context.step:
+                same(new.context.past.edges[-1], new.context.observation.edges)
+            yield window, new
+
+
+def test_a_relabelled_window_is_that_of_another_graph_with_its_way():
+    goals = set()
+    for window, new in changed_by(lambda key, window: graphs.relabel(key, window, LABELS), 3):
+        padded = window.context.actions == pad_token(LABELS + 1)
+        assert (new.context.actions[padded] == pad_token(LABELS + 1)).all()
+        if not padded.all():  # the action before led to where the agent is
+            assert new.context.actions[-1] == new.context.observation.node
+        goals.add(int(new.context.observation.goal))
+    assert len(goals) > 10
 
 
 def test_a_window_without_some_arms_is_that_of_a_smaller_graph_with_the_same_way():
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
-    prune = jax.jit(lambda key, window: graphs.leave_out_arms(key, window, STAR))
-    cut = jax.jit(lambda index: windows.window(steps, index, 2, STAR.length, LABELS))
-    arms, dropped = [], set()
-    for index in range(8):
-        window = jax.tree.map(np.asarray, cut(index))
-        for seed in range(6):
-            new = jax.tree.map(np.asarray, prune(jax.random.key(10 * index + seed), window))
-            graph, before = new.context.observation, window.context.observation
-            known = new.actions < LABELS
-            assert new.actions[known].tolist() == way(graph)
-            edges = {tuple(edge) for edge in graph.edges.tolist()}
-            left_out = {tuple(edge) for edge in before.edges.tolist()} - edges
-            assert len(graph.edges) == len(before.edges) == len(edges | left_out)
-            starts = [start for start, _ in edges]
-            centre = max(starts, key=starts.count) if len(edges) > STAR.length else None
-            arms.append(len(edges) // STAR.length)
-            # Whole arms are left: each node but their ends has an edge that leads on.
-            assert len(edges) == arms[-1] * STAR.length
-            assert centre is None or starts.count(centre) == arms[-1]
-            assert (new.context.past.edges[-1] == graph.edges).all() or not window.context.step
-            dropped.add(frozenset(left_out))
+    arms, dropped = set(), set()
+    for window, new in changed_by(lambda key, window: graphs.leave_out_arms(key, window, STAR), 6):
+        before, after = (x.context.observation.edges.tolist() for x in (window, new))
+        edges = set(map(tuple, after))
+        assert len(before) == len(after) and edges <= set(map(tuple, before))
+        # Whole arms are left: each node but their ends has an edge that leads on.
+        count, odd = divmod(len(edges), STAR.length)
+        starts = Counter(start for start, _ in edges)
+        assert not odd and starts.most_common(1)[0][1] == count
+        arms.add(count)
+        dropped.add(frozenset(map(tuple, before)) - edges)
     # Of two graphs: each of the other two arms, both or none of them.
-    assert set(arms) == {1, 2, 3} and len(dropped) == 2 * 3 + 1
+    assert arms == {1, 2, 3} and len(dropped) == 2 * 3 + 1
 
 
 def test_edges_that_are_learned_from_are_in_no_order():
     """Arms are left out with the goal's first: that must not be seen."""
-    agent, _ = agent_and_domain(fewer_arms=True)
+    agent = make_agent(fewer_arms=True)
     steps = jax.tree.map(jnp.asarray, windows.concatenate(collected()))
     drawn = jax.tree.map(np.asarray, jax.jit(agent.batch)(jax.random.key(0), steps))
     graph = drawn.context.observation
@@ -158,20 +152,19 @@ def test_edges_that_are_learned_from_are_in_no_order():
     assert counts.min() > 0 and counts.max() < 3 * counts.mean()
 
 
-def agent_and_domain(method="leap", **settings):
-    domain = make("Star3x4", Settings(**settings))
-    config = find_preset("stars", "Star3x4", method, "leapjax")
+def make_agent(**settings):
+    config = find_preset("stars", "Star3x4", "leap", "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
+    domain = make("Star3x4", Settings(**settings))
     setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
-    return find_method(method).make_agent(setup, None), domain
+    return find_method("leap").make_agent(setup, None)
 
 
 def test_the_order_of_edges_means_nothing_to_the_network():
-    agent, domain = agent_and_domain()
+    agent, context = make_agent(), blank_context(DOMAIN, 0)
     params = random_parameters(agent)
-    context = blank_context(domain, 0)
     graph, _ = graphs.draw(STAR, 0)
-    blank = np.full(STAR.length, domain.num_actions)
+    blank = np.full(STAR.length, DOMAIN.num_actions)
 
     @jax.jit
     def energies(graph):
@@ -190,7 +183,6 @@ def test_the_order_of_edges_means_nothing_to_the_network():
     [
         ("Star3", "unknown level 'Star3': expected Star<arms>x<edges of an arm>"),
         ("star3x5", "did you mean Star3x5"),
-        ("Star0x5", "unknown level"),
         ("Star100x100", "has 10001 nodes: at most 1000"),
     ],
 )
@@ -205,11 +197,10 @@ def test_unknown_levels_are_one_line(name, message, capsys):
 def test_presets_and_data_that_there_are_not(capsys):
     assert stars.main(["--preset", "paper"]) == 2
     assert "no encoder for architecture 'paper': expected one of leapjax" in capsys.readouterr().err
-    domain = make("Star3x4", Settings())
-    states = collected()[0].observations
-    domain.demonstrations.check(states, "here")
+    states, check = collected()[0].observations, DOMAIN.demonstrations.check
+    check(states, "here")
     with pytest.raises(UserError, match="here: goal run from 50 to 50, expected 0 to 49"):
-        domain.demonstrations.check(states._replace(goal=np.full(5, 50)), "here")
+        check(states._replace(goal=np.full(5, 50)), "here")
 
 
 @only_long
@@ -242,14 +233,8 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     assert stars.main([*again, "Star5x2"]) == 0
     (*_, row) = results.read(tmp_path / "runs" / "stars.jsonl")
     assert (row["level"], row["played"]) == ("Star2x2", "Star5x2")
-    rows.append(row)
     for other, message in (
         ("Star2x3", "whose length is 2: it cannot play Star2x3, where it is 3"),
-        ("Star30x2", "whose labels is 50"),
-        ("Star", "unknown level"),
     ):
         assert stars.main([*again, other]) == 2
         assert message in capsys.readouterr().err
-    # One action at a time: one row, and nothing to animate.
-    assert stars.main([*arguments, "--method", "bc", "--steps", "0", "--no-pictures"]) == 0
-    assert len(results.read(tmp_path / "runs" / "stars.jsonl")) == len(rows) + 1
