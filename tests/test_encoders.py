@@ -59,14 +59,6 @@ def test_distances_are_dijkstras(field):
         np.testing.assert_allclose(distance[..., channel], expected, rtol=1e-5)
 
 
-def test_a_way_is_found_only_within_the_sweeps():
-    start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[0, 0].set(0.0)
-    distance = distances.find_distances(start, jnp.ones((SIDE, SIDE, 1)), 3)
-    x, y = np.indices((SIDE, SIDE))
-    expected = np.where(x + y <= 3, x + y, distances.FAR)
-    np.testing.assert_array_equal(distance[..., 0], expected)
-
-
 def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
     odds = np.full((SIDE, SIDE, 1), 0.001 / 0.999)  # of being blocked
     odds[2, :-1] = 0.95 / 0.05  # a wall with a gap at its end
@@ -104,24 +96,6 @@ def test_a_convolution_is_xlas(side, padding, stride):
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )[0]  # fmt: skip
     np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
-
-
-def test_without_distance_fields_a_goal_is_only_known_nearby():
-    """Convolutions alone carry what is in a cell as many cells as there are rounds of them."""
-    encoder = distances.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
-    grid = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
-    agent, near, far = jnp.array([0, 0]), jnp.array([2, 2]), jnp.array([3, 0])
-    params = jax.jit(encoder.init)(jax.random.key(1), grid, agent, near)
-    features, here = encoder.apply(params, grid, agent, near)
-    assert features.shape == (SIDE, SIDE, 8)
-    assert here.shape == (0,)
-    assert {"source", "step"} == params["params"].keys()
-
-    def read(changed):
-        return encoder.apply(params, grid.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
-
-    assert not np.allclose(read(near), features[0, 0])
-    np.testing.assert_array_equal(read(far), features[0, 0])
 
 
 def test_reading_around_and_at_a_cell():
