@@ -31,8 +31,6 @@ def _count(jaxpr: Jaxpr) -> float:
         if name == "dot_general":
             (axes, _), _ = params["dimension_numbers"]
             total += 2 * results * math.prod(shapes[0][axis] for axis in axes)
-        elif name == "rows_times_matrix":  # leapjax.models.linear
-            total += 2 * results * shapes[1][0]
         elif name == "conv_general_dilated":
             out = params["dimension_numbers"].rhs_spec[0]
             total += 2 * results * math.prod(shapes[1]) / shapes[1][out]

@@ -13,7 +13,6 @@ from benchmarks.flops import matmul_flops
 from leapjax import pretrained, sharding
 from leapjax.configuration import make_domain, specify
 from leapjax.domain import blank_context
-from leapjax.models.linear import rows_times_matrix
 from leapjax.presets import find_preset
 from leapjax.running.jax_setup import Cluster
 from tests.programs import only_long, with_options
@@ -60,7 +59,6 @@ def test_flops_of_what_is_repeated_and_what_is_convolved():
 
     assert matmul_flops(power, square) == 5 * 2 * 4**3
     assert matmul_flops(jax.vmap(power), jnp.ones((7, 4, 4))) == 7 * 5 * 2 * 4**3
-    assert matmul_flops(rows_times_matrix, square, square) == 2 * 4**3
     split = sharding.split_batches(lambda _, x, rows: rows @ x, sharding.make_mesh(8))
     assert matmul_flops(split, None, square, jnp.ones((8, 4))) == 2 * 8 * 4**2
     convolve = functools.partial(jax.lax.conv, window_strides=(1, 1), padding="VALID")

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.config import ModelConfig, Sizes
-from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
 from leapjax.models.plans import check_plan, forbid_early_end
 from leapjax.models.transformer import (
@@ -51,7 +50,7 @@ class AlternatingModel(nn.Module):
         # Without weights, so that a vector cannot be made easy to predict by making it small.
         self.norm = nn.LayerNorm(use_scale=False, use_bias=False)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = Dropout(c.dropout)
+        self.drop = nn.Dropout(c.dropout)
         self.choose = dense(sizes.num_actions, use_bias=False)
         self.predict = dense(c.width)
 

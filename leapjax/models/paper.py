@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.models.config import ModelConfig, Sizes
-from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
 from leapjax.models.plans import check_plan, forbid_early_end, make_attention_mask
 from leapjax.models.transformer import KeysValues, Transformer, causal_mask, dense, embed
@@ -63,7 +62,7 @@ class PaperModel(nn.Module):
         if self.conditioned:
             self.goal = dense(c.width, scale=1.0)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = Dropout(c.dropout)
+        self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode_batch(self, contexts: Context) -> jax.Array:

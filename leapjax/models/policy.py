@@ -6,7 +6,6 @@ import jax.numpy as jnp
 
 from leapjax.data import windows
 from leapjax.models.config import ModelConfig, Sizes
-from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import Transformer, causal_mask, dense, embed, interleave
 from leapjax.types import Context
@@ -43,7 +42,7 @@ class PolicyModel(nn.Module):
         if self.conditioned:
             self.goal = dense(c.width, scale=1.0)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = Dropout(c.dropout)
+        self.drop = nn.Dropout(c.dropout)
         self.said = [dense(count, name=name) for name, count in self.heads]
 
     def __call__(

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.models.config import ModelConfig, Sizes
-from leapjax.models.dropout import Dropout
 from leapjax.models.encoder import Encoder
 from leapjax.models.plans import check_plan, forbid_early_end, make_attention_mask
 from leapjax.models.transformer import KeysValues, Transformer, dense, embed
@@ -59,7 +58,7 @@ class PrefixModel(nn.Module):
             self.before = dense(c.width, use_bias=False, scale=scale)
             self.after = dense(c.width, use_bias=False, scale=scale)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
-        self.drop = Dropout(c.dropout)
+        self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode_batch(self, contexts: Context) -> jax.Array:

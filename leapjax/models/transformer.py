@@ -13,9 +13,6 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
-from leapjax.models.dropout import Dropout
-from leapjax.models.linear import linear
-
 WEIGHT_SCALE = 0.02  # normal initialisation of GPT-2, as in the authors' code
 
 
@@ -35,7 +32,7 @@ def dense(
 ) -> nn.Dense:
     """A linear layer with the initialisation of this transformer."""
     init = nn.initializers.normal(scale)
-    return linear(features, init, use_bias, name, dtype)
+    return nn.Dense(features, use_bias, dtype=dtype, kernel_init=init, name=name)
 
 
 def embed(count: int, width: int, name: str | None = None) -> nn.Embed:
@@ -82,7 +79,7 @@ class Block(nn.Module):
         self.norm_perceptron = nn.LayerNorm(dtype=self.dtype)
         self.expand = dense(4 * self.width, dtype=self.dtype)
         self.contract = dense(self.width, dtype=self.dtype)
-        self.drop = Dropout(self.dropout)
+        self.drop = nn.Dropout(self.dropout)
 
     def keys_values(self, x: jax.Array) -> KeysValues:
         """What others attend to in tokens `[tokens, D]`."""

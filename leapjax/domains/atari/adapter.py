@@ -11,9 +11,13 @@ from leapjax.environments import Transition
 class AtariAdapter:
     """One game: up to 30 no-ops at the start, over when the game is.
 
-    A planner sees rewards as the data have them, clipped; what counts is the score. It succeeds
-    with as high a score as a gamer's. What is to be seen now, and the score so far, are
-    `frame` and `score`.
+    A planner sees rewards clipped, as the data have them; the episode's score counts. It succeeds
+    with a gamer's score.
+
+    Attributes:
+        num_actions: of the game, with the end action.
+        frame: the current frame `[84, 84]` uint8.
+        score: of the game so far.
     """
 
     def __init__(self, game: Game, sticky: float, max_steps: int) -> None:
@@ -32,7 +36,7 @@ class AtariAdapter:
     def reset(self, seed: int) -> np.ndarray:
         """Starts the game of a seed: the frame `[84, 84]` uint8."""
         check_integer("the seed of a game", seed)  # ALE's are int32
-        if self._begun is not None:  # what it is busy with is of the game before
+        if self._begun is not None:  # it still takes an action of the game before
             self._env.recv()
             self._begun = None
         observations, _ = self._env.reset(seed=seed)
@@ -42,7 +46,7 @@ class AtariAdapter:
     def close(self) -> None:
         """Ends the game; `frame` and `score` stay."""
         self._env.close()
-        del self._env  # ale-py ends a game's thread when nothing refers to it
+        del self._env  # ale-py ends a game's thread when its last reference is gone
 
     def begin(self, action: int) -> None:
         """Begins to take an action, in a thread of the game's own."""

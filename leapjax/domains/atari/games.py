@@ -12,30 +12,50 @@ MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # decisions
 
 
 class Mirror(NamedTuple):
-    """A reflection that the rules of a game do not notice."""
+    """A reflection that keeps the rules of a game.
 
-    axis: int  # of frames that is reversed: 0 exchanges above and below, 1 the sides
-    rows: tuple[int, int]  # from and up to which frames are reflected: scores stay as they are
+    Attributes:
+        axis: of frames that is reversed: 0 exchanges top and bottom, 1 the sides.
+        rows: first row of the reflected part, and the row after its last; scores stay outside.
+        columns: first column of the reflected part, and the column after its last.
+        actions: new name of each action that changes.
+    """
+
+    axis: int
+    rows: tuple[int, int]
     columns: tuple[int, int]
-    actions: Mapping[str, str]  # what becomes of those that change
+    actions: Mapping[str, str]
 
 
 class Game(NamedTuple):
-    """One game of the Arcade Learning Environment."""
+    """One game of the Arcade Learning Environment.
 
-    name: str  # as the paper and DQN-Replay write it
-    rom: str  # as ale-py does
-    actions: tuple[str, ...]  # those that it has a use for, in ale-py's order
-    random: float  # score of random actions (Mnih et al., 2015)
-    human: float  # score of a professional tester of games
-    target: float  # return to ask for, of clipped rewards
-    return_scale: float  # what returns are divided by before a network sees them
+    Attributes:
+        name: in the paper and in DQN-Replay.
+        rom: name in ale-py.
+        actions: the game's own actions, in ale-py's order.
+        random: score of random actions (Mnih et al., 2015).
+        human: score of a professional tester of games.
+        target: return to ask for, of clipped rewards.
+        return_scale: divisor of returns before a network sees them.
+        mirror: reflection that keeps the rules.
+        paper: gamer-normalised scores by method (paper, table 2), in percent.
+        paper_without_return: LEAP's score without a target return (paper, table 9).
+    """
+
+    name: str
+    rom: str
+    actions: tuple[str, ...]
+    random: float
+    human: float
+    target: float
+    return_scale: float
     mirror: Mirror
-    paper: Mapping[str, float]  # gamer-normalised scores by method (paper, table 2), in percent
-    paper_without_return: float  # LEAP's, not conditioned on a return (paper, table 9)
+    paper: Mapping[str, float]
+    paper_without_return: float
 
     def normalised(self, score: float) -> float:
-        """A score, 0 as high as random actions' and 100 as a gamer's."""
+        """Normalises a score: 0 for random actions, 100 for a gamer."""
         return 100 * (score - self.random) / (self.human - self.random)
 
 
@@ -90,10 +110,10 @@ GAMES: dict[str, Game] = {
 
 
 def find_game(name: str) -> Game:
-    """The game of that name.
+    """Finds a game by name.
 
     Raises:
-        UserError: there is none; names those that there are.
+        UserError: the game is unknown; names the known games.
     """
     if name not in GAMES:
         raise UserError(

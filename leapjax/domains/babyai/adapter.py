@@ -24,8 +24,8 @@ class BabyAIAdapter:
         self.level = level
         self.env = levels.make_environment(level)
         self.side = max(self.env.width, self.env.height)
-        # MiniGrid would draw the agent's partial view at every step: nobody looks at it,
-        # and it costs more than the step itself.
+        # MiniGrid would draw the agent's partial view at every step, which is not used here and
+        # costs more than the step itself.
         self.env.gen_obs = lambda: {}  # type: ignore[method-assign]
         self.goal = observations.NO_GOAL
         self.taken = END  # the last action as it was executed
@@ -56,7 +56,7 @@ class BabyAIAdapter:
         return observations.observe(self.env, self.side, self.goal, self._instruction)
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions; where turns slip, maybe another one."""
+        """Takes an action of MiniGrid's first six, or another if the level's turns slip."""
         self.taken = action
         if action in TURNS and self._random.random() < self.level.slip:
             self.taken = int(self._random.choice([a for a in range(END) if a != action]))

@@ -54,14 +54,14 @@ class FullViewBot(BabyAIBot):
         self.vis_mask[:] = True
 
     def _process_obs(self) -> None:
-        """What the view adds to what has been seen: nothing, all of it has."""
+        """Adds no view to the explored cells: all are explored."""
 
     def _breadth_first_search(self, initial_states, accept_fn, ignore_blockers):  # noqa: ANN001, ANN202
         """The bot's search, in which a closed door is on the way like an open one."""
         grid = self.mission.unwrapped.grid
         closed = [cell for cell in grid.grid if isinstance(cell, Door) and not cell.is_open]
-        # The search asks a door only whether it is open: answer yes while it runs. What is
-        # accepted is asked of the doors as they are.
+        # The search only asks whether a door is open: all are while it runs. `accept` sees the
+        # doors as they are.
         states = {id(door): False for door in closed}
 
         def accept(position, cell):  # noqa: ANN001, ANN202
@@ -83,10 +83,9 @@ class FullViewBot(BabyAIBot):
 
 
 def make_bot(env: RoomGridLevel) -> BabyAIBot:
-    """The demonstrator of a level that was reset.
+    """Makes the demonstrator of a level that was reset.
 
-    Where a door is locked the bot must look for its key, which it does by exploring: there
-    it keeps its own partial view.
+    If a door is locked, the bot explores to find its key: it then keeps its own partial view.
     """
     locked = any(isinstance(cell, Door) and cell.is_locked for cell in env.grid.grid)
     return BabyAIBot(env) if locked else FullViewBot(env)
@@ -98,7 +97,7 @@ def collect(
     seed: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Collection:
-    """`count` demonstrations of a level, drawn anew for each training seed.
+    """Collects `count` demonstrations of a level, drawn anew for each training seed.
 
     Args:
         level: what to demonstrate.
@@ -129,10 +128,10 @@ def collect(
 
 
 def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Demonstration | None:
-    """One episode of the bot; None, counted in `dropped`, where it is no use.
+    """Records an episode of the bot; returns `None` and counts in `dropped` if it fails.
 
-    Where it makes mistakes, they are executed, and it goes on from where they lead. The actions
-    are those that were executed, unless the level says that some are mislabelled.
+    In levels with mistakes, they are executed, and the bot goes on from there. The recorded
+    actions are the executed ones, except in levels that mislabel some.
     """
     level, random = adapter.level, np.random.default_rng([seed, MISTAKES])
     states, actions, rewards = [adapter.reset(seed)], [], []

@@ -1,6 +1,6 @@
-"""What an agent sees of a BabyAI level: `observe`, and the goal fixed at reset.
+"""Observations of a BabyAI level: the full state, and the goal fixed at reset.
 
-Everything here reads MiniGrid's state and changes nothing. Shape letters beside those of
+All functions read MiniGrid's state without changing it. Shape letters, in addition to
 `leapjax.types`: S the side of the grid, L the tokens of an instruction.
 """
 
@@ -21,17 +21,25 @@ Cell = tuple[int, int]
 
 
 class Observation(NamedTuple):
-    """One state of a grid world, as numbers. Positions are `[x, y]`, `grid[x, y]`."""
+    """One state of a grid world, as numbers. Positions are `[x, y]`, `grid[x, y]`.
 
-    grid: Array  # [S, S, 3] uint8: object, colour and state of every cell, agent included
-    pose: Array  # [3] int32: x, y, direction (0 right, 1 down, 2 left, 3 up)
-    carried: Array  # [2] int32: object and colour held; (0, 0) is nothing
-    goal: Array  # [2] int32: x, y of the target; (-1, -1) where it is not available
-    instruction: Array  # [L] int32: token ids; 0 pads on the right
+    Attributes:
+        grid: `[S, S, 3]` uint8, object, colour and state of every cell, agent included.
+        pose: `[3]` int32, x, y and direction (0 right, 1 down, 2 left, 3 up).
+        carried: `[2]` int32, object and colour held; (0, 0) for empty hands.
+        goal: `[2]` int32, x and y of the target; (-1, -1) if it is not observed.
+        instruction: `[L]` int32, token ids; 0 pads on the right.
+    """
+
+    grid: Array
+    pose: Array
+    carried: Array
+    goal: Array
+    instruction: Array
 
 
 def blank(side: int, words: int) -> Observation:
-    """An observation of the right shapes and types, all zeros."""
+    """Makes an observation of zeros with a level's shapes and types."""
     return Observation(
         np.zeros((side, side, 3), np.uint8),
         np.zeros(3, np.int32),
@@ -42,12 +50,12 @@ def blank(side: int, words: int) -> Observation:
 
 
 def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) -> Observation:
-    """The full state of a level as an `Observation` of NumPy arrays.
+    """Reads the full state of a level as an `Observation` of NumPy arrays.
 
     Args:
         env: a level that was reset.
         side: S; smaller or non-square grids are padded at the far ends with zeros.
-        goal: what `nearest_goal` said at reset.
+        goal: found by `nearest_goal` at reset.
         instruction: `[L]` token ids.
 
     Raises:

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Dtype
 
-from leapjax.models.linear import linear
-
 NORM_GROUPS = 8  # groups of channels that are normalised together
 
 
@@ -53,7 +51,7 @@ class Convolution(nn.Module):
     def __call__(self, image: jax.Array) -> jax.Array:
         """Maps `[X, Y, C]` to `[X', Y', features]`."""
         kernel_init = nn.initializers.he_normal()
-        product = linear(self.features, kernel_init, dtype=self.dtype)
+        product = nn.Dense(self.features, dtype=self.dtype, kernel_init=kernel_init)
         near = stack_patches(image, self.side, self.padding)
         return product(near[:: self.stride, :: self.stride])
 
