@@ -70,23 +70,13 @@ def test_distances_are_dijkstras_and_their_gradient_autodiffs(field):
         np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
-def far_but(cell):
-    """A start that is one cell."""
-    return jnp.full((SIDE, SIDE, 1), distances.FAR).at[cell].set(0.0)
-
-
-def test_a_way_is_found_only_within_the_sweeps():
-    distance = distances.find_distances(far_but((0, 0)), jnp.ones((SIDE, SIDE, 1)), 3)
-    steps = np.indices((SIDE, SIDE)).sum(axis=0)
-    np.testing.assert_array_equal(distance[..., 0], np.where(steps <= 3, steps, distances.FAR))
-
-
 def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
     odds = np.full((SIDE, SIDE, 1), 0.001 / 0.999)  # of being blocked
     odds[2, :-1] = 0.95 / 0.05  # a wall with a gap at its end
     cost = distances.compute_entering_cost(jnp.log(odds))
     np.testing.assert_allclose(cost[2, 0, 0], 1 - distances.BARRIER * np.log(0.05), rtol=1e-5)
-    distance = distances.find_distances(far_but((3, 0)), cost, SIDE**2)[..., 0]
+    start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[3, 0].set(0.0)
+    distance = distances.find_distances(start, cost, SIDE**2)[..., 0]
     np.testing.assert_allclose(distance[1, 0], 2 * (SIDE - 1) + 2, rtol=0.01)  # around it
 
 
@@ -103,22 +93,6 @@ def test_a_convolution_is_xlas(side, padding, stride):
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     )[0]  # fmt: skip
     np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
-
-
-def test_without_distance_fields_a_goal_is_only_known_nearby():
-    """Convolutions alone carry what is in a cell as many cells as there are rounds of them."""
-    encoder = distances.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
-    grid = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
-    agent, near, far = jnp.array([0, 0]), jnp.array([2, 2]), jnp.array([3, 0])
-    params = jax.jit(encoder.init)(jax.random.key(1), grid, agent, near)
-    features, here = encoder.apply(params, grid, agent, near)
-    assert features.shape == (SIDE, SIDE, 8) and here.shape == (0,)
-
-    def read(changed):
-        return encoder.apply(params, grid.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
-
-    assert not np.allclose(read(near), features[0, 0])
-    np.testing.assert_array_equal(read(far), features[0, 0])
 
 
 def test_reading_around_and_at_a_cell():
