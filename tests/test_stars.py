@@ -1,5 +1,6 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
+import dataclasses
 from collections import Counter
 
 import jax
@@ -238,3 +239,16 @@ def test_every_planner_has_a_row(tmp_path, monkeypatch, capsys, quick_begin):
     ):
         assert stars.main([*again, other]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_with_neighbours_the_token_of_an_action_also_holds_those_beside_it():
+    config = ModelConfig(layers=1, heads=1, width=8, dropout=0.0)
+    tokens = jax.random.normal(jax.random.key(0), (4, 8))
+    for neighbours, changed in ((False, [1]), (True, [0, 1, 2])):
+        encoder = make("Star3x4", Settings(neighbours=neighbours)).encoders["leapjax"](config, 0)
+        mix, params = encoder.init_with_output(jax.random.key(1), tokens, method="mix_actions")
+        after = encoder.apply(params, tokens.at[1].add(1.0), method="mix_actions")
+        same(np.flatnonzero(np.any(mix != after, axis=1)), changed)
+    causal = dataclasses.replace(config, attention="causal")
+    with pytest.raises(UserError, match="neighbours with attention 'causal'"):
+        make("Star3x4", Settings(neighbours=True)).encoders["leapjax"](causal, 0)
