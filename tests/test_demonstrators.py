@@ -47,9 +47,7 @@ def test_frames_and_rewards_are_those_of_the_native_environment(name):
     assert emulator.num_actions == native.single_action_space.n == len(game.actions)
     observations, _ = native.reset(seed=0)
     np.testing.assert_array_equal(emulator.frame(), observations[0, -1])
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        action = int(rng.integers(emulator.num_actions))
+    for action in np.random.default_rng(0).integers(emulator.num_actions, size=200).tolist():
         reward = emulator.step(action)
         if emulator.over:  # the native one stops in the middle of the last four frames
             break
@@ -68,29 +66,27 @@ def test_a_restored_game_goes_on_the_same(name):
     saved, frame = emulator.save(), emulator.frame()
 
     def future(step):
+        emulator.restore(saved)
+        assert emulator.action == actions[29]
+        np.testing.assert_array_equal(emulator.frame(), frame)
         return [(step(action), emulator.lives, *emulator.ram()) for action in actions[30:]]
 
     first, last = future(emulator.step), emulator.frame()
-    emulator.restore(saved)
-    assert emulator.action == actions[29]
-    np.testing.assert_array_equal(emulator.frame(), frame)
-    assert future(emulator.advance) == first
-    emulator.restore(saved)
-    assert future(emulator.step) == first
+    assert future(emulator.advance) == first == future(emulator.step)
     np.testing.assert_array_equal(emulator.frame(), last)
 
 
 @games
 def test_a_game_is_what_its_seed_and_noise_say_and_can_be_played_again(name):
-    game = played(name, noise=0.5)
+    game, noisy = played(name, noise=0.5), played(name, noise=1.0)
     assert game.frames.shape == (12, 84, 84) and game.frames.dtype == np.uint8
     assert game.actions.dtype == np.int32 and game.rewards.dtype == np.float32
     assert game.score == game.rewards.sum()
     assert same(game, play(GAMES[name], 0, 0.5, 12))
     assert not same(game, played(name, seed=1, noise=0.5))
-    assert not same(played(name), played(name, noise=1.0))
+    assert len(set(noisy.actions)) >= 4 and not same(played(name), noisy)
     levels = [choose_noise(GAMES[name], number) for number in range(6)]
-    assert levels[:3] == levels[3:] == sorted(set(levels)) and levels[0] > 0
+    assert levels[:3] == levels[3:] == sorted(set(levels)) and 0 < levels[0] < levels[2] <= 0.7
     emulator = Emulator(GAMES[name])
     starts = np.random.default_rng(np.random.SeedSequence(0).spawn(3)[0])
     emulator.reset(int(starts.integers(31)))
@@ -109,28 +105,28 @@ def test_recorded_games_are_played_again(name):
 
 
 def test_demonstrators_play_well_and_never_wait():
-    """Where nothing can be done they ask for a ball or a hop: waiting is not to be learned."""
-    pong, breakout = played("Pong", most_steps=200), played("Breakout", most_steps=250)
-    assert not (pong.rewards < 0).any() and play_at_random("Pong", 200) < 0
-    assert breakout.score >= 8 and 0 not in breakout.actions
-    qbert, seaquest = played("Qbert", most_steps=80), played("Seaquest", 1, most_steps=1500)
-    assert qbert.score >= 100 and (qbert.actions > 1).all()
-    assert seaquest.score >= 1500 > 3 * play_at_random("Seaquest", 1500)
-    assert len(seaquest.actions) == 1500 and 0 not in seaquest.actions  # it is alive
+    """To do nothing asks for something, too: it shall not be learned as a moment apart."""
+    assert not (played("Pong", most_steps=200).rewards < 0).any()
+    assert play_at_random("Pong", 200) < 0
+    for name, seed, steps, score, least in (
+        ("Breakout", 0, 250, 8, 1),
+        ("Qbert", 0, 80, 100, 2),
+        ("Seaquest", 1, 1500, 1500, 1),  # it shoots, fetches divers and stays alive
+    ):
+        game = played(name, seed=seed, most_steps=steps)
+        assert game.score >= score and (game.actions >= least).all()
+    assert len(game.actions) == 1500 and play_at_random("Seaquest", 1500) < 500
 
 
 def test_seaquest_sees_what_is_on_the_screen():
     emulator, demonstrator = Emulator(GAMES["Seaquest"]), make_demonstrator(GAMES["Seaquest"])
     emulator.reset(0)
     seen = 0
-    for _ in range(40):
-        for _ in range(15):
-            emulator.step(demonstrator(emulator, np.random.default_rng(0)))
+    for step in range(600):
+        emulator.step(demonstrator(emulator, np.random.default_rng(0)))
         scene = read_scene(emulator.ram())
-        found = scene.enemies + scene.divers
-        for across, lane, _ in found:
-            rows, columns = slice(56 - 10 * lane, 62 - 10 * lane), across * 84 // 160
-            there = emulator.frame()[rows, max(columns - 2, 0) : columns + 9]
-            assert there.max() > 40  # the water is 32
-        seen += len(found)
+        for across, lane, _ in scene.enemies + scene.divers if step % 15 == 14 else ():
+            rows, column = slice(56 - 10 * lane, 62 - 10 * lane), across * 84 // 160
+            assert emulator.frame()[rows, max(column - 2, 0) : column + 9].max() > 40  # water: 32
+            seen += 1
     assert seen > 20

@@ -1,5 +1,6 @@
 """The grid's building blocks against slow or independent oracles."""
 
+import functools
 import heapq
 
 import flax.linen as nn
@@ -51,20 +52,22 @@ def unrolled(start, cost, sweeps):
     return jax.lax.scan(sweep, start, length=sweeps)[0]
 
 
-def test_distances_are_dijkstras(field):
-    start, cost = map(np.asarray, field)
-    distance = distances.find_distances(*field, SIDE**2)
-    for channel in range(start.shape[-1]):
-        expected = dijkstra(start[..., channel], cost[..., channel])
+def test_distances_are_dijkstras_and_their_gradient_autodiffs(field):
+    weights = jax.random.normal(jax.random.key(2), (SIDE, SIDE, 2))
+
+    def differentiate(function):
+        def loss(start, cost):
+            distance = function(start, cost, SIDE**2)
+            return (weights * distance).sum(), distance
+
+        return jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(*field)
+
+    gradient, distance = differentiate(distances.find_distances)
+    for channel in range(2):
+        expected = dijkstra(*(np.asarray(x)[..., channel] for x in field))
         np.testing.assert_allclose(distance[..., channel], expected, rtol=1e-5)
-
-
-def test_a_way_is_found_only_within_the_sweeps():
-    start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[0, 0].set(0.0)
-    distance = distances.find_distances(start, jnp.ones((SIDE, SIDE, 1)), 3)
-    x, y = np.indices((SIDE, SIDE))
-    expected = np.where(x + y <= 3, x + y, distances.FAR)
-    np.testing.assert_array_equal(distance[..., 0], expected)
+    for ours, expected in zip(gradient, differentiate(unrolled)[0], strict=True):
+        np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
 def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
@@ -74,21 +77,7 @@ def test_a_long_way_that_is_free_is_nearer_than_a_short_one_that_is_blocked():
     np.testing.assert_allclose(cost[2, 0, 0], 1 - distances.BARRIER * np.log(0.05), rtol=1e-5)
     start = jnp.full((SIDE, SIDE, 1), distances.FAR).at[3, 0].set(0.0)
     distance = distances.find_distances(start, cost, SIDE**2)[..., 0]
-    around = 2 * (SIDE - 1) + 2
-    np.testing.assert_allclose(distance[1, 0], around, rtol=0.01)
-
-
-def test_the_gradient_is_autodiffs(field):
-    weights = jax.random.normal(jax.random.key(2), (SIDE, SIDE, 2))
-
-    def gradient(function):
-        def loss(start, cost):
-            return (weights * function(start, cost, SIDE**2)).sum()
-
-        return jax.jit(jax.grad(loss, argnums=(0, 1)))(*field)
-
-    for ours, expected in zip(gradient(distances.find_distances), gradient(unrolled), strict=True):
-        np.testing.assert_allclose(ours, expected, atol=1e-5)
+    np.testing.assert_allclose(distance[1, 0], 2 * (SIDE - 1) + 2, rtol=0.01)  # around it
 
 
 @pytest.mark.parametrize(
@@ -106,24 +95,6 @@ def test_a_convolution_is_xlas(side, padding, stride):
     np.testing.assert_allclose(layer.apply(params, image), expected, atol=1e-5)
 
 
-def test_without_distance_fields_a_goal_is_only_known_nearby():
-    """Convolutions alone carry what is in a cell as many cells as there are rounds of them."""
-    encoder = distances.GridEncoder(channels=8, fields=0, sweeps=4, rounds=1)
-    grid = jax.random.normal(jax.random.key(0), (SIDE, SIDE, 3))
-    agent, near, far = jnp.array([0, 0]), jnp.array([2, 2]), jnp.array([3, 0])
-    params = jax.jit(encoder.init)(jax.random.key(1), grid, agent, near)
-    features, here = encoder.apply(params, grid, agent, near)
-    assert features.shape == (SIDE, SIDE, 8)
-    assert here.shape == (0,)
-    assert {"source", "step"} == params["params"].keys()
-
-    def read(changed):
-        return encoder.apply(params, grid.at[tuple(changed)].add(1.0), agent, near)[0][0, 0]
-
-    assert not np.allclose(read(near), features[0, 0])
-    np.testing.assert_array_equal(read(far), features[0, 0])
-
-
 def test_reading_around_and_at_a_cell():
     image = jnp.arange(SIDE * SIDE * 2, dtype=jnp.float32).reshape(SIDE, SIDE, 2)
     padded = np.pad(np.asarray(image), ((2, 2), (2, 2), (0, 0)))
@@ -136,33 +107,30 @@ def test_reading_around_and_at_a_cell():
 
 
 def test_the_state_after_the_last_word_ignores_padding():
-    encoder = instructions.InstructionEncoder(10, 8)
-    words = jnp.array([3, 1, 4, 0, 0])
+    encoder, words = instructions.InstructionEncoder(10, 8), jnp.array([3, 1, 4, 0, 0])
     params = jax.jit(encoder.init)(jax.random.key(0), words)
-    encode = jax.jit(encoder.apply)
-    short, long = encode(params, words[:3]), encode(params, words)
+    encode = functools.partial(jax.jit(encoder.apply), params)
+    short, long = encode(words[:3]), encode(words)
     np.testing.assert_allclose(long.whole, short.whole, atol=1e-6)
     np.testing.assert_allclose(long.words[:3], short.words, atol=1e-6)
     assert long.given.tolist() == [True] * 3 + [False] * 2
     for other in ([1, 3, 4], [3, 1, 0], [3, 1, 6]):
-        assert not np.allclose(encode(params, jnp.array(other)).whole, short.whole)
+        assert not np.allclose(encode(jnp.array(other)).whole, short.whole)
 
 
 def test_cells_attend_to_the_words_that_are_given():
     encoder, attention = instructions.InstructionEncoder(10, 8), instructions.WordAttention(2, 4)
     grid = jax.random.normal(jax.random.key(0), (3, 4, 5))
-    words = jnp.array([3, 1, 4])
-    encoded = jax.jit(encoder.init_with_output)(jax.random.key(1), words)[0]
+    encoded = jax.jit(encoder.init_with_output)(jax.random.key(1), jnp.array([3, 1, 4]))[0]
     params = jax.jit(attention.init)(jax.random.key(2), grid, encoded)
-    attend = jax.jit(attention.apply)
-    said = attend(params, grid, encoded)
+    attend = functools.partial(jax.jit(attention.apply), params)
+    said = attend(grid, encoded)
     assert said.shape == grid.shape
     padded = jax.tree.map(lambda x: jnp.concatenate([x, 100 * x]), encoded)
     padded = padded._replace(given=jnp.arange(6) < 3, whole=encoded.whole)
-    np.testing.assert_allclose(attend(params, grid, padded), said, atol=1e-6)
+    np.testing.assert_allclose(attend(grid, padded), said, atol=1e-6)
     # Each cell by itself, and none is told the same as another.
-    alone = attend(params, grid[1:2, 2:3], encoded)
-    np.testing.assert_allclose(alone[0, 0], said[1, 2], atol=1e-6)
+    np.testing.assert_allclose(attend(grid[1:2, 2:3], encoded)[0, 0], said[1, 2], atol=1e-6)
     assert np.unique(np.asarray(said).reshape(12, -1).round(4), axis=0).shape[0] == 12
 
 
@@ -170,13 +138,11 @@ def test_cells_attend_to_the_words_that_are_given():
 def test_halving_is_max_pooling(shape):
     """Its gradient too, where the largest is one cell."""
     image = jax.random.normal(jax.random.key(0), shape)
-
-    def loss(pool):
-        return jax.value_and_grad(lambda x: (pool(x) ** 2).sum())(image)
-
-    usual = loss(lambda x: nn.max_pool(x, (2, 2), (2, 2)))
-    for ours, theirs in zip(loss(convolutions.halve), usual, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    ours, usual = (
+        jax.value_and_grad(lambda x, pool=pool: (pool(x) ** 2).sum())(image)
+        for pool in (convolutions.halve, lambda x: nn.max_pool(x, (2, 2), (2, 2)))
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), ours, usual)
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 16), (3, 5, 24), (1, 1, 8)])

@@ -85,14 +85,6 @@ def test_a_plan_of_turns_and_moves_is_rolled_as_minigrid_does(name):
     assert (entered > 0) == (name == "GoToLavaHard")
 
 
-@pytest.mark.parametrize("stop", [END, MASK])
-def test_nothing_moves_after_the_end_nor_after_what_is_not_chosen_yet(stop):
-    observation = BabyAIAdapter(find_level("GoToLocalS8N1")).reset(0)
-    poses = np.asarray(rolled(observation, jnp.array([LEFT, stop, LEFT, RIGHT, RIGHT])))
-    assert poses[1, 2] == (observation.pose[2] - 1) % 4
-    assert (poses[1:] == poses[1]).all()
-
-
 def facing(thing, fill=False):
     """A context whose agent faces a thing; or every free cell of the room holds it."""
     observation = BabyAIAdapter(find_level("GoToLocalS8N1")).reset(1)
@@ -239,27 +231,13 @@ def test_there_is_as_much_lava_as_said_and_a_way_around_it(name):
     counts = []
     for seed in EPISODES:
         adapter, context = first(name, seed)
-        found, grid = cells_of(context, LAVA), adapter.env.grid
-        counts.append(len(found))
+        counts.append(len(cells_of(context, LAVA)))
         start = observations.agent_cell(adapter.env)
-        assert adapter.goal in observations.path_lengths(grid, start, through_objects=False)
-        if name != "GoToLavaHard":
-            straight(context.observation, adapter.goal, found, wide=name == "GoToLavaMedium")
+        assert adapter.goal in observations.path_lengths(
+            adapter.env.grid, start, through_objects=False
+        )
     low, high = LAVA_LEVELS[name]
     assert low <= min(counts) and max(counts) == high
-
-
-def straight(observation, goal, lava, wide):
-    """Lava is on the straight ways of agent and object, or beside them where it is wide."""
-    x, y = map(int, observation.pose[:2])
-    columns = range(min(x, goal[0]) + 1, max(x, goal[0]))
-    rows = range(min(y, goal[1]) + 1, max(y, goal[1]))
-    on_row = {(a, b) for a, b in lava if a in columns and abs(b - y) <= wide}
-    on_column = {(a, b) for a, b in lava if b in rows and abs(a - x) <= wide}
-    assert lava == on_row | on_column
-    if not wide:
-        assert len(on_row) <= 1 and len(on_column) <= 1
-        assert len(columns) == 0 or on_row or (goal in [(a, y) for a in columns])
 
 
 def test_the_planner_sees_no_lava_and_everything_else():

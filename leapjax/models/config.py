@@ -23,8 +23,6 @@ class ModelConfig:
         dtype: Type of matrix products, "float32" or "bfloat16"; parameters are always float32.
         attention: Attention between the actions of a plan: "full", or "causal", where no action
             sees a later one.
-        neighbours: The token of an action also holds the actions beside it. Only LEAP with
-            architecture "leapjax" has this.
     """
 
     architecture: str = "leapjax"
@@ -34,7 +32,6 @@ class ModelConfig:
     dropout: float = 0.1
     dtype: str = "float32"
     attention: str = "full"
-    neighbours: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -49,11 +46,6 @@ class ModelConfig:
             )
         check_at_least(self, 1, "layers", most=MOST_LAYERS)
         check_at_least(self, 1, "heads", "width")
-        if self.neighbours and (self.architecture, self.attention) != ("leapjax", "full"):
-            raise ValueError(
-                "neighbours needs architecture 'leapjax', where actions stand side by side, and "
-                "attention 'full': with 'causal' a token may not hold a later action"
-            )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout must be in [0, 1), got {self.dropout}")
         if self.dtype not in DTYPES:

@@ -51,6 +51,13 @@ class Encoder(nn.Module):
         del context, horizon
         return None
 
+    def mix_actions(self, tokens: jax.Array) -> jax.Array:
+        """Returns the tokens `[T, D]` of a plan's actions, changed by each other; here unchanged.
+
+        An encoder overrides this if an action means little without its neighbours.
+        """
+        return tokens
+
     def add_later_state(self) -> "Encoder":
         """Returns this encoder with one more token, for later states with unknown poses.
 

@@ -33,7 +33,7 @@ class PrefixModel(nn.Module):
     conditioned on the return to go has one more token of the context.
 
     The encoder may embed the positions of a plan (`encode_positions`); otherwise this network
-    learns an embedding of each.
+    learns an embedding of each. It may also mix the tokens of a plan's actions (`mix_actions`).
 
     Attributes:
         config: size of the network.
@@ -53,10 +53,6 @@ class PrefixModel(nn.Module):
         if self.conditioned:
             self.goal = dense(c.width, scale=1.0)
         self.position = embed(sizes.horizon, c.width)
-        if c.neighbours:
-            scale = c.width**-0.5
-            self.before = dense(c.width, use_bias=False, scale=scale)
-            self.after = dense(c.width, use_bias=False, scale=scale)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
         self.head = dense(sizes.num_actions, use_bias=False)
@@ -106,23 +102,9 @@ class PrefixModel(nn.Module):
             deterministic: whether to leave out dropout.
         """
         check_plan(actions, self.sizes.horizon)
-        x = self.drop(self._tokens(actions) + memory.places, deterministic=deterministic)
+        tokens = self.context.mix_actions(self.action(actions)) + memory.places
+        x = self.drop(tokens, deterministic=deterministic)
         cached = memory.known[0].keys.shape[0]
         mask = make_attention_mask(self.config, self.sizes.horizon, cached)
         h = self.transformer(x, positions, memory.known, mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)
-
-    def _tokens(self, actions: jax.Array) -> jax.Array:
-        """`[T, D]` of the actions of a plan.
-
-        With those beside each of them a layer finds what goes with its neighbour. Otherwise one
-        has to learn to fetch the neighbour before the next can learn to use it, neither of which
-        is of use alone (short convolutions: Fu et al., 2023, H3).
-        """
-        each = self.action(actions)
-        if not self.config.neighbours:
-            return each
-        nothing = jnp.zeros_like(each[:1])
-        before = self.before(jnp.concatenate([nothing, each[:-1]]))
-        after = self.after(jnp.concatenate([each[1:], nothing]))
-        return each + before + after

@@ -1,7 +1,6 @@
 """What the presets of all domains share: networks, training and search by method."""
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from leapjax.agents import leap
@@ -96,7 +95,6 @@ def configure(
     training: Mapping[str, Any],
     planner: PlannerConfig,
     domain_settings: Any,
-    model: Mapping[str, Any] = MappingProxyType({}),
     **others: Any,
 ) -> AnyConfig:
     """Makes the configuration of a preset that stands for a network and how it is trained alone.
@@ -110,7 +108,6 @@ def configure(
         training: changes of the preset's training.
         planner: how plans are found.
         domain_settings: of the domain.
-        model: changes of the preset's network.
         others: fields of `Config`.
     """
     ours = preset == "leapjax"
@@ -120,7 +117,7 @@ def configure(
         method=method,
         preset=preset,
         demos=demonstrations(method, demos),
-        model=(our_model if ours else paper_model)(method, **model),
+        model=(our_model if ours else paper_model)(method),
         training=(our_training if ours else paper_training)(method, **training),
         planner=planner,
         method_settings=settings(method, masking="random" if ours else "each"),

@@ -19,7 +19,6 @@ class Puzzle(NamedTuple):
         demonstrations: to learn from.
         settings: of the domain.
         training: changes of the training.
-        model: changes of the network.
     """
 
     domain: str
@@ -28,7 +27,6 @@ class Puzzle(NamedTuple):
     demonstrations: int
     settings: Any
     training: Mapping[str, Any]
-    model: Mapping[str, Any] = {}
 
 
 def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
@@ -48,6 +46,5 @@ def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
         training=training,
         planner=common.search(method, puzzle.length, puzzle.length, fill="confident"),
         domain_settings=puzzle.settings,
-        model=puzzle.model,
         episodes=EPISODES,
     )

@@ -28,9 +28,8 @@ def leapjax(name: str, method: str) -> AnyConfig:
     if method == "leap" and graphs.find_level(name).nodes > LARGE:
         # A network takes long to learn by itself which edge leads where.
         puzzle = puzzle._replace(
-            settings=Settings(fewer_arms=True),
+            settings=Settings(fewer_arms=True, neighbours=True),
             training={**TRAINING, "batch": 64},
-            model={"neighbours": True},
         )
     return configure(puzzle, method, "leapjax")
 

@@ -14,6 +14,7 @@ from leapjax.data.solved import collect_solved
 from leapjax.domain import Augmentation, Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
+from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense
@@ -24,41 +25,66 @@ LARGE = 20  # nodes: in a larger graph it takes long to find out by itself which
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Star graphs: augmentation.
+    """Star graphs: augmentation, and the encoder.
 
     Attributes:
         augment: Draw the names of nodes and the order of edges anew in every training window, which
             makes it a new graph.
         fewer_arms: With `augment`: also leave out a random number of arms.
+        neighbours: The token of a planned action also holds the actions beside it. Only LEAP with
+            attention "full" has this.
     """
 
     augment: bool = True
     fewer_arms: bool = False
+    neighbours: bool = False
 
     def __post_init__(self) -> None:
         check_types(self)
 
 
 class GraphTokens(Encoder):
-    """A token for each edge, and one for where the agent is and where it should be."""
+    """A token for each edge, and one for where the agent is and where it should be.
+
+    Attributes:
+        labels: number of names of nodes.
+        width: D.
+        neighbours: whether the token of an action also holds the actions beside it.
+        dtype: type of matrix products.
+    """
 
     labels: int
     width: int
+    neighbours: bool = False
     dtype: Dtype = jnp.float32
 
-    @nn.compact
-    def __call__(self, context: Context) -> jax.Array:
-        """Tokens `[E + 1, D]`."""
-        graph = context.observation
-        names = nn.Embed(self.labels, self.width, embedding_init=nn.initializers.normal(1.0))
+    def setup(self) -> None:  # noqa: D102
         scale = (2 * self.width) ** -0.5
-        edges = names(graph.edges).reshape(-1, 2 * self.width)
-        task = names(jnp.stack([graph.node, graph.goal])).reshape(1, -1)
-        read = [
-            dense(self.width, scale=scale, name=name, dtype=self.dtype)(tokens)
-            for name, tokens in {"edge": edges, "task": task}.items()
-        ]
-        return jnp.concatenate(read)
+        self.names = nn.Embed(self.labels, self.width, embedding_init=nn.initializers.normal(1.0))
+        self.edge = dense(self.width, scale=scale, dtype=self.dtype)
+        self.task = dense(self.width, scale=scale, dtype=self.dtype)
+        self.before = dense(self.width, use_bias=False, scale=self.width**-0.5)
+        self.after = dense(self.width, use_bias=False, scale=self.width**-0.5)
+
+    def __call__(self, context: Context) -> jax.Array:
+        """Returns the tokens `[E + 1, D]`."""
+        graph = context.observation
+        edges = self.names(graph.edges).reshape(-1, 2 * self.width)
+        task = self.names(jnp.stack([graph.node, graph.goal])).reshape(1, -1)
+        return jnp.concatenate([self.edge(edges), self.task(task)])
+
+    def mix_actions(self, tokens: jax.Array) -> jax.Array:
+        """Adds to the token of each action those of the actions before and after it, `[T, D]`.
+
+        One layer then finds the edge between an action and its neighbour. Otherwise a layer must
+        learn to fetch the neighbour before the next can learn to use it (short convolutions: Fu et
+        al., 2023, H3).
+        """
+        if not self.neighbours:
+            return tokens
+        blank = jnp.zeros_like(tokens[:1])
+        before = self.before(jnp.concatenate([blank, tokens[:-1]]))
+        return tokens + before + self.after(jnp.concatenate([tokens[1:], blank]))
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -80,7 +106,13 @@ def make(name: str, settings: Settings) -> Domain:
 
     def tokens(model: ModelConfig, context: int) -> Encoder:
         del context
-        return GraphTokens(labels, model.width, model.dtype)
+        if settings.neighbours and model.attention == "causal":
+            raise UserError(
+                "neighbours with attention 'causal': there a token may not hold a later action; "
+                "use attention 'full'",
+                "neighbours", "attention",
+            )  # fmt: skip
+        return GraphTokens(labels, model.width, settings.neighbours, model.dtype)
 
     return Domain(
         level=name,
