@@ -61,11 +61,13 @@ def parse(
     shell.check_values(arguments)
     choice, others = choose(kind, arguments)
     data = storage.describe_dataset(choice.demonstrations) if choice.demonstrations else Described()
-    methods = choose_methods(choice)
+    methods, folder = choose_methods(choice), choice.checkpoint
+    trained = None if folder is None else pretrained.read_specification(folder)
     configs = []
-    for level in choose_levels(domain, choice, data):
-        folder = pretrained.find_published(level) if choice.pretrained else choice.checkpoint
-        trained = pretrained.read_specification(folder) if folder else None
+    for level in choose_levels(domain, choice, data, trained):
+        if choice.pretrained:
+            folder = pretrained.find_published(level)
+            trained = pretrained.read_specification(folder)
         for method in methods or [trained.method if trained else Config.method]:
             default = make_default(kind, domain, level, method, choice, data, trained)
             default = dataclasses.replace(default, checkpoint=folder)
@@ -103,24 +105,24 @@ def choose(kind: type[AnyConfig], arguments: Sequence[str]) -> tuple[Choice, lis
     return choice, others
 
 
-def choose_levels(domain: str, choice: Choice, data: Described) -> Sequence[str]:
+def choose_levels(
+    domain: str, choice: Choice, data: Described, trained: Specification | None
+) -> Sequence[str]:
     """Returns the levels to run: the named ones, or the level of the checkpoint or data set.
 
     Args:
         domain: name of the domain; its first level is the default.
         choice: options of the command line.
         data: metadata of the data set that the command line names.
+        trained: specification of the checkpoint that the command line names.
 
     Raises:
-        UserError: an unknown domain, a checkpoint that cannot be read, or a level whose module
-            only a file names.
+        UserError: an unknown domain, or a level whose module only a file names.
     """
     levels = find_domain(domain).levels
     if choice.level is not None:
         return levels if choice.level == "all" else [choice.level]
-    level = data.level or levels[0]
-    if choice.checkpoint is not None:
-        level = pretrained.read_specification(choice.checkpoint).level
+    level = trained.level if trained else data.level or levels[0]
     check_imported(level, str(choice.checkpoint or choice.demonstrations))
     return [level]
 

@@ -13,8 +13,6 @@ from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from leapjax.domains.babyai import vocabulary, worlds
 from leapjax.errors import UserError, did_you_mean
 
-DOORS = ("none", "open", "closed")
-
 
 @dataclasses.dataclass(frozen=True)
 class Level:
