@@ -154,7 +154,7 @@ def replace_section(text: str, name: str, section: str) -> str:
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row is in a table; one that is in none is stale."""
+    """Tells whether today's code makes such a row; any other row is stale."""
     if row.get("experiment") in ANALYSES:
         return analyses.is_used(row)
     if row["domain"] in PUZZLES:

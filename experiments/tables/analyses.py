@@ -20,7 +20,7 @@ ERRANDS = ("constraints-errand", "constraints-detour")
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row is in a table."""
+    """Tells whether today's code makes such a row, of any way of a case; tables show some ways."""
     of = ANALYSES[row["experiment"]]
     return any(
         select_rows(of, [row], case, way, row["preset"]) for case in of.cases for way in case.ways

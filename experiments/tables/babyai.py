@@ -59,11 +59,11 @@ USED = (
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row is in a table."""
+    """Tells whether a row is in a table or a figure."""
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
-def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting] = SETTINGS) -> str:
+def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting]) -> str:
     """Success of the paper's LEAP and of some settings, by level, and the interquartile mean.
 
     A cell is the mean over seeds, its 95% interval, and the number of seeds.

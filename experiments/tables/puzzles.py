@@ -24,7 +24,7 @@ ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it i
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row is in a table."""
+    """Tells whether a row is of a search or of other arms; tables and figures show some."""
     return bool(group_by_search([row])) or any(
         of for _, by_count in group_by_arms([row]) for of in by_count
     )
