@@ -106,6 +106,8 @@ class Plan(NamedTuple):
         trace: `[N, T]` int32, the actions after every iteration.
         satisfied: `[]` bool, no constraint of the energy is violated.
         valid: `[]` bool, no energy met on the way was NaN or -inf.
+        passes: `[]` int32, passes of the model that the plan took: one for each conditional of each
+            restart or beam, T for each total energy.
         energy: `[]` float32, of the plan; only if asked for (`score`), since it costs T passes.
         trace_energies: `[N]` float32, after every iteration; only if asked for (`score_trace`),
             since it costs N * T passes.
@@ -115,6 +117,7 @@ class Plan(NamedTuple):
     trace: jax.Array
     satisfied: jax.Array
     valid: jax.Array
+    passes: jax.Array
     energy: jax.Array | None = None
     trace_energies: jax.Array | None = None
 

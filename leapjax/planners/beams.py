@@ -1,0 +1,171 @@
+"""Beam search over partial plans, in any order of positions."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.planners.configs import BeamConfig, find_selection, make_commitment
+from leapjax.planners.guard import guard_shapes, is_undefined
+from leapjax.planners.positions import choose_open
+from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
+
+
+class _Beams(NamedTuple):
+    """W partial plans, the best first.
+
+    Attributes:
+        plans: actions `[W, T]`, MASK at open positions.
+        sums: sum `[W]` of the conditional energies of the chosen actions.
+        likelihoods: log-probability `[W]` of drawing the choices, at the temperature.
+        ranks: likelihoods `[W]` with noise; the highest ranks survive.
+        dead: booleans `[W]`: no plan, or a plan that breaks a constraint whatever follows.
+    """
+
+    plans: jax.Array
+    sums: jax.Array
+    likelihoods: jax.Array
+    ranks: jax.Array
+    dead: jax.Array
+
+
+def beam_search(
+    energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: BeamConfig
+) -> Plan:
+    """Searches for the plan of least energy among W partial plans, in at most T passes for each.
+
+    In every pass each beam chooses its next position (`BeamConfig.fill`) while the others stay
+    open, and branches there: one continuation for each action. The best W continuations of all
+    beams survive. If the conditionals are those of a joint distribution, a sum of energies along a
+    path is the negative log-probability of the actions chosen so far, in any order of positions.
+
+    At temperature 0 the W least sums survive; with W = A^(T - 1) it finds the plan of least sum.
+    Above it, W continuations are drawn without replacement, each action with probability
+    proportional to `exp(-energy / temperature)` (stochastic beam search, Kool et al., 2019). One
+    beam then draws a plan action by action. A beam that breaks a constraint of infinite penalty is
+    kept only if too few others are left. The trace holds the first beam after every pass.
+
+    Raises:
+        ValueError: the energy does not accept MASK.
+    """
+    if not energy.accepts_mask:
+        raise ValueError(
+            "beam search begins plans that it ends later, and this energy scores complete plans "
+            "only (accepts_mask is False): use another planner"
+        )
+    energy = guard_shapes(energy)
+    actions, width, horizon = energy.num_actions, config.beams, config.horizon
+    mask, everywhere = mask_token(actions), jnp.arange(horizon)
+    select, commitment = find_selection(config.fill), make_commitment(config)
+
+    def grow(plan: jax.Array, select_key: jax.Array) -> tuple[jax.Array, ...]:
+        """Chooses the next position of a beam.
+
+        Returns:
+            The plan with the positions that are filled and do not branch, the sum of their
+            energies, the position to branch at, its energies `[A]`, and whether all energies are
+            defined.
+        """
+        open_ = plan == mask
+        energies = energy.conditional(
+            params, memory, plan, jnp.where(open_, everywhere, jnp.argmax(open_))
+        )
+        where, chosen = choose_open(energies, open_, select(energies, select_key), commitment)
+        branch = where[jnp.maximum(chosen.sum() - 1, 0)]
+        sure = jnp.zeros(horizon, bool).at[where].set(chosen).at[branch].set(False)
+        filled = jnp.where(sure, jnp.argmin(energies, axis=-1).astype(jnp.int32), plan)
+        paid = jnp.where(sure, energies.min(axis=-1), 0).sum()
+        # A complete plan has one continuation: itself.
+        same = jnp.where(jnp.arange(actions) == plan[branch], 0.0, jnp.inf)
+        branches = jnp.where(open_.any(), energies[branch], same)
+        return filled, paid, branch, branches, ~jnp.any(is_undefined(energies))
+
+    def extend(
+        state: tuple[_Beams, jax.Array, jax.Array, jax.Array],
+    ) -> tuple[_Beams, jax.Array, jax.Array, jax.Array]:
+        beams, done, trace, valid = state
+        grown = jax.vmap(grow, in_axes=(0, None))(beams.plans, select_key)
+        plans, paid, branch, energies, defined = grown
+        sums = (beams.sums + paid)[:, None] + energies  # [W, A]
+        likelihoods = ranks = -sums
+        if config.temperature:
+            likelihoods, ranks = _draw_ranks(draw_keys[done], beams, energies, config.temperature)
+        children = jax.vmap(
+            lambda plan, at: jnp.tile(plan, (actions, 1)).at[:, at].set(jnp.arange(actions))
+        )(plans, branch)  # [W, A, T]
+        dead = jnp.broadcast_to(beams.dead[:, None], sums.shape)
+        if energy.violation is not no_violation:
+            dead |= jnp.isposinf(jax.vmap(jax.vmap(violate))(children))
+        order = jnp.lexsort((-ranks.reshape(-1), dead.reshape(-1)))[:width]
+        beams = _Beams(
+            children.reshape(-1, horizon)[order],
+            *(leaf.reshape(-1)[order] for leaf in (sums, likelihoods, ranks, dead)),
+        )
+        return beams, done + 1, trace.at[done].set(beams.plans[0]), valid & defined.all()
+
+    def violate(plan: jax.Array) -> jax.Array:
+        return energy.violation(params, memory, plan)
+
+    def is_incomplete(state: tuple[_Beams, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        open_ = jnp.any(state[0].plans == mask, axis=-1)
+        return jnp.any(open_ & (~state[0].dead | state[0].dead.all()))
+
+    blank = jnp.full((width, horizon), mask, jnp.int32)
+    # One beam starts; copies of it would only repeat its continuations.
+    missing = jnp.arange(width) > 0
+    sums = jnp.where(missing, jnp.inf, 0.0)
+    # One key per pass draws beams; one key ranks positions, the same in every pass.
+    draw_keys, select_key = jax.random.split(key, horizon), jax.random.fold_in(key, 1)
+    start = _Beams(blank, sums, -sums, -sums, missing)
+    beams, passes, trace, valid = jax.lax.while_loop(
+        is_incomplete, extend, (start, jnp.zeros((), jnp.int32), blank[:1].repeat(horizon, 0), True)
+    )
+    passes = passes * width
+    judged = beams.sums
+    if config.judge == "energy":
+        judged = jax.vmap(lambda plan: energy.total(params, memory, plan))(beams.plans)
+        valid &= ~jnp.any(is_undefined(judged))
+        passes += width * horizon
+    found = jnp.lexsort((judged, beams.dead))[0]
+    best = beams.plans[found]
+    trace = jnp.where(everywhere[:, None] < passes // width - 1, trace, best)
+    plan = Plan(best, trace, violate(best) <= 0, valid, passes)
+    if config.score:
+        total = energy.total(params, memory, best)
+        plan = plan._replace(
+            energy=total, valid=valid & ~is_undefined(total), passes=passes + horizon
+        )
+    return plan
+
+
+def _draw_ranks(
+    key: jax.Array, beams: _Beams, energies: jax.Array, temperature: float
+) -> tuple[jax.Array, jax.Array]:
+    """`likelihoods` and `ranks` `[W, A]` of plans that are one action longer.
+
+    The highest rank of what a plan becomes is the plan's own (Kool et al., 2019, algorithm 1):
+    so complete plans have ranks as if noise had been added to each of all that are possible.
+
+    Args:
+        key: of the noise.
+        beams: that are made longer.
+        energies: `[W, A]` of every action.
+        temperature: of the draw, positive.
+    """
+    # Measured from the least first, so that the lowest temperature is a greedy choice.
+    least = energies.min(axis=1, keepdims=True)
+    hopeless = jnp.isinf(least) | jnp.isinf(beams.likelihoods)[:, None]  # nothing, or no plan
+    likelihoods = jnp.where(hopeless, 0, jax.nn.log_softmax((least - energies) / temperature))
+    noisy = likelihoods + jax.random.gumbel(key, energies.shape)
+    highest = noisy.max(axis=1, keepdims=True)
+    wanted = jnp.where(hopeless, 0, (beams.ranks - beams.likelihoods)[:, None])
+    # -log(exp(-wanted) - exp(-highest) + exp(-noisy)), in a form that overflows nowhere.
+    excess = wanted - noisy + jnp.log1p(-jnp.exp(noisy - highest))
+    ranks = wanted - jnp.maximum(excess, 0) - jnp.log1p(jnp.exp(-jnp.abs(excess)))
+
+    def after(each: jax.Array) -> jax.Array:
+        return jnp.where(hopeless, -jnp.inf, each + beams.likelihoods[:, None])
+
+    return after(likelihoods), after(ranks)
+
+

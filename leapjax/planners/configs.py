@@ -1,0 +1,232 @@
+"""The configurations of planners: frozen dataclasses that name strategies and hold numbers."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from leapjax.checks import check_at_least, check_number, check_types
+from leapjax.planners.positions import SELECTIONS, Commitment, Select
+
+# The files and command lines that hold a configuration name a strategy; programs may pass a
+# function of their own.
+if TYPE_CHECKING:
+    Fill = str | Select
+else:
+    Fill = str
+
+HOTTEST = 1e30  # a limit so that temperature times noise stays finite
+FILLS = ("together", *SELECTIONS)
+ORDERS = ("random", "sequential", "uncertain")
+KEPT = ("last", "best")
+JUDGES = ("sum", "energy")
+
+
+def check_temperature(temperature: float) -> None:
+    """Checks a temperature.
+
+    Raises:
+        ValueError: the temperature is not a number, is negative or NaN, or is too large.
+    """
+    check_number("a temperature", temperature, 0, HOTTEST)
+
+
+def check_name(field: str, value: Any, known: Sequence[str]) -> None:
+    """Checks the name of a strategy.
+
+    Raises:
+        ValueError: the name is unknown.
+    """
+    if value not in known:
+        raise ValueError(f"unknown {field} {value!r}: expected one of {', '.join(known)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class GibbsConfig:
+    """Iterative planning through energy minimisation (paper, algorithm 1).
+
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, passes of the model at most, those that fill the plan included.
+        resampled: P, positions that a pass chooses together, unless it fills all.
+        fill: How passes fill the first plan. "together": all positions in one pass, as in the
+            paper. Otherwise P positions in each pass, while the others stay MASK: those with the
+            likeliest actions ("confident"), those whose likeliest action leads the second by
+            most ("margin"), those from left to right ("sequential"), or those in "random" order.
+            A program may pass its own function (energies `[T, A]`, key) -> ranks `[T]`; the highest
+            rank comes first.
+        order: Which P positions every later iteration resamples: "random" ones, the next from left
+            to right ("sequential"), or the least certain ones when they were chosen, each once
+            before any is again ("uncertain").
+        temperature: Temperature at which actions are drawn; 0 takes the most likely action.
+        restarts: R, independent plans; the planner keeps the one of least energy.
+        score: Also return the energy of the plan, for T more passes.
+        score_trace: Also return the energy after every iteration, for N * T more passes.
+        threshold: A filling pass also fills each next position whose likeliest action has at least
+            this probability. Then the plan takes fewer passes. 1 fills P positions.
+        entropy_bound: A filling pass also fills each next position while the sum of their
+            entropies, less the largest, is at most this, in nats (EB-Sampler, arXiv 2505.24857).
+            0 fills P positions.
+        cool_to: Temperature of the last iteration; it changes linearly after the first plan. None
+            keeps the temperature.
+        keep: The plan to return: the "last" one, or the "best" one of the whole trace, whose
+            energies cost N * T more passes.
+    """
+
+    horizon: int = 5
+    iterations: int = 10
+    resampled: int = 1
+    fill: Fill = "together"
+    order: str = "random"
+    temperature: float = 0.0
+    restarts: int = 1
+    score: bool = False
+    score_trace: bool = False
+    threshold: float = 1.0
+    entropy_bound: float = 0.0
+    cool_to: float | None = None
+    keep: str = "last"
+
+    def __post_init__(self) -> None:
+        check_types(self, strategies=("fill",))
+        check_at_least(self, 1, "horizon", "iterations", "resampled", "restarts")
+        if self.resampled > self.horizon:
+            raise ValueError(
+                f"resampled is {self.resampled}, more positions than the horizon {self.horizon}"
+            )
+        check_temperature(self.temperature)
+        check_fill(self, FILLS)
+        if self.cool_to is not None:
+            check_temperature(self.cool_to)
+        check_name("order", self.order, ORDERS)
+        check_name("keep", self.keep, KEPT)
+        if self.iterations < self.fill_iterations:
+            raise ValueError(
+                f"fill {self.fill!r} chooses {self.resampled} of {self.horizon} actions in a pass, "
+                f"so it needs {self.fill_iterations} iterations, got {self.iterations}"
+            )
+
+    @property
+    def fill_iterations(self) -> int:
+        """The passes after which no position is MASK, at most."""
+        return 1 if self.fill == "together" else -(-self.horizon // self.resampled)
+
+
+def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None:
+    """Checks how a configuration fills plans.
+
+    Raises:
+        ValueError: an unknown name, or a bound out of range.
+    """
+    if not callable(config.fill):
+        check_name("fill", config.fill, known)
+    check_number("threshold", config.threshold, 0, 1)
+    check_number("entropy_bound", config.entropy_bound, 0)
+    if config.fill == "together" and make_commitment(config).adapts:
+        raise ValueError(
+            "threshold and entropy_bound choose how many positions a pass fills, and fill "
+            "'together' fills all: use another fill, such as 'confident'"
+        )
+
+
+def make_commitment(config: "GibbsConfig | BeamConfig") -> Commitment:
+    """Returns how many positions a filling pass of a configuration fills."""
+    least = config.resampled if isinstance(config, GibbsConfig) else 1
+    return Commitment(least, config.threshold, config.entropy_bound)
+
+
+def find_selection(fill: Fill) -> Select:
+    """Returns the function that a configuration names or holds."""
+    return fill if callable(fill) else SELECTIONS[fill]
+
+
+@dataclasses.dataclass(frozen=True)
+class ShootingConfig:
+    """Random shooting (paper, appendix, ablation): the best of random plans.
+
+    Attributes:
+        horizon: T, planned actions.
+        candidates: Uniformly drawn plans; the planner keeps the one of least energy.
+        score: Also return the energy of the plan, which is known anyway.
+    """
+
+    horizon: int = 5
+    candidates: int = 30
+    score: bool = False
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_at_least(self, 1, "horizon", "candidates")
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossEntropyConfig:
+    """The cross-entropy method as the paper's appendix describes it.
+
+    Attributes:
+        horizon: T, planned actions.
+        iterations: N, rounds; the first draws uniform plans.
+        candidates: Plans in each round.
+        elites: Plans of least energy. They survive, and are the parents of the next round: each
+            child changes one action.
+        score: Also return the energy of the plan.
+    """
+
+    horizon: int = 5
+    iterations: int = 10
+    candidates: int = 30
+    elites: int = 3
+    score: bool = False
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        check_at_least(self, 1, "horizon", "iterations", "candidates", "elites")
+        if self.elites > self.candidates:
+            raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
+
+
+@dataclasses.dataclass(frozen=True)
+class BeamConfig:
+    """Beam search: the best of W partial plans, each of which branches at its next position.
+
+    Attributes:
+        horizon: T, planned actions.
+        beams: W, partial plans that are kept.
+        temperature: 0 keeps the best beams; above it beams are drawn, all different.
+        score: Also return the energy of the plan, for T more passes.
+        fill: Which open position a beam chooses next, as in `GibbsConfig`; from left to right
+            ("sequential") by default. Other orders let each beam take its own.
+        judge: Which complete beam is returned: the one of the least "sum" of the conditional
+            energies of its choices, or of the least total "energy", for W * T more passes.
+        threshold: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
+            beam branches at the last of them.
+        entropy_bound: As in `GibbsConfig`; the beam branches at the last position.
+    """
+
+    horizon: int = 5
+    beams: int = 10
+    temperature: float = 0.0
+    score: bool = False
+    fill: Fill = "sequential"
+    judge: str = "sum"
+    threshold: float = 1.0
+    entropy_bound: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_types(self, strategies=("fill",))
+        check_at_least(self, 1, "horizon", "beams")
+        check_temperature(self.temperature)
+        check_fill(self, tuple(SELECTIONS))
+        check_name("judge", self.judge, JUDGES)
+        if self.temperature and make_commitment(self).adapts:
+            raise ValueError(
+                "threshold and entropy_bound take the most likely actions, and a temperature "
+                "draws them: use one of the two"
+            )
+
+    @property
+    def iterations(self) -> int:
+        """Passes at most: each chooses at least one action of every plan."""
+        return self.horizon
+
+
+PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig

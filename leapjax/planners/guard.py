@@ -1,0 +1,39 @@
+"""Checks what an energy returns, while a planner is traced and while it runs."""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.checks import check_floats, check_kind
+from leapjax.types import Energy, Params, PyTree
+
+
+def is_undefined(energies: jax.Array) -> jax.Array:
+    """Tells where an energy is NaN or -inf: neither can be compared with others."""
+    return jnp.isnan(energies) | jnp.isneginf(energies)
+
+
+def guard_shapes(energy: Energy) -> Energy:
+    """Returns an energy that checks the shapes and types of its results.
+
+    Raises:
+        UserError: the argument is not an `Energy`.
+    """
+    check_kind(energy, Energy)
+
+    def conditional(
+        params: Params, memory: PyTree, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        energies = energy.conditional(params, memory, actions, positions)
+        return check_floats(
+            "conditional of the energy", energies, (positions.shape[0], energy.num_actions)
+        )
+
+    def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        found = energy.total(params, memory, actions)
+        return check_floats("total of the energy", found, ())
+
+    def violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
+        found = energy.violation(params, memory, actions)
+        return check_floats("violation of the energy", found, ())
+
+    return energy._replace(conditional=conditional, total=total, violation=violation)
