@@ -7,7 +7,7 @@ from leapjax.presets import common
 DEMONSTRATIONS = 500  # as in BabyAI
 EPISODES = 100
 STEPS = 2000
-HORIZON = 5  # planned actions, of which one is executed; so many passes fill each position
+HORIZON = 5  # T = N: the planner makes 5 passes, and executes the first of 5 actions
 
 
 def paper(domain: str, name: str, method: str) -> AnyConfig:
