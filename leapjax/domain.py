@@ -1,4 +1,4 @@
-"""`Domain`: what training and planning need of one level of a family of environments.
+"""`Domain`: a level of a family of environments, as training and planning need it.
 
 A family is BabyAI, the games of Atari, or one environment of your own. A `DomainType` makes the
 `Domain` of each of its levels. To add a family, write both in a folder of its own, and add a line

@@ -24,10 +24,10 @@ IMITATORS = ("leap", "bc", "dt")  # these draw actions: serving the ball can be 
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's network, data and training.
+    """Returns the paper's network, data and training.
 
     Raises:
-        UserError: an unknown game.
+        UserError: the game is unknown.
     """
     find_game(name)
     horizon, iterations, batch = PAPER[name]
@@ -49,10 +49,10 @@ def paper(name: str, method: str) -> AnyConfig:
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """A small network, which trains in ten minutes on one core, on few transitions.
+    """Returns a small network, which trains in ten minutes on one core, on few transitions.
 
     Raises:
-        UserError: an unknown game.
+        UserError: the game is unknown.
     """
     find_game(name)
     # Sprites in Seaquest face the way they move, so imitators need no past there. Imitators that

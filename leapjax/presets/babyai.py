@@ -13,10 +13,10 @@ _EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # one room, no word
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's network and training, as in the authors' code where the two differ.
+    """Returns the paper's network and training; follows the authors' code where they differ.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     level = find_level(name)
     horizon, iterations = level.horizon, level.iterations
@@ -38,10 +38,10 @@ def paper(name: str, method: str) -> AnyConfig:
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """Our encoder, augmentation and training: all chosen on validation levels.
+    """Returns our encoder, augmentation and training, all chosen on validation levels.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     level = find_level(name)
     # The usual 3e-3 is too high for LEAP in large levels.

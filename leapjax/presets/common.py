@@ -15,14 +15,14 @@ SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several action
 
 
 def paper_model(method: str, **changes: Any) -> ModelConfig:
-    """The network of the paper's appendix, table 5."""
+    """Returns the network of the paper's appendix, table 5."""
     if method in UNTRAINED:
         return ModelConfig(**changes)
     return ModelConfig(architecture="paper", dropout=0.1, **changes)
 
 
 def paper_training(method: str, **changes: Any) -> TrainingConfig:
-    """The training of the paper's appendix, table 5."""
+    """Returns the training of the paper's appendix, table 5."""
     if method in UNTRAINED:
         return TrainingConfig(**{**changes, "steps": 0})
     # This many examples fit into a core's cache. LEAP makes a copy of each for every action.
@@ -31,7 +31,7 @@ def paper_training(method: str, **changes: Any) -> TrainingConfig:
 
 
 def our_model(method: str, **changes: Any) -> ModelConfig:
-    """The network of preset `leapjax`."""
+    """Returns the network of preset `leapjax`."""
     if method in (*UNTRAINED, "classifier"):
         return ModelConfig(**changes)
     # Augmentation makes dropout useless: chosen on validation levels of BabyAI.
@@ -39,7 +39,7 @@ def our_model(method: str, **changes: Any) -> ModelConfig:
 
 
 def our_training(method: str, **changes: Any) -> TrainingConfig:
-    """The training of preset `leapjax`: its rates were chosen on validation levels of BabyAI."""
+    """Returns the training of preset `leapjax`, with rates chosen on BabyAI's validation levels."""
     if method in UNTRAINED:
         return TrainingConfig(**{**changes, "steps": 0})
     rate = 1.5e-3 if method == "classifier" else 3e-3

@@ -11,12 +11,12 @@ HORIZON = 5  # T = N: the planner makes 5 passes, and executes the first of 5 ac
 
 
 def paper(domain: str, name: str, method: str) -> AnyConfig:
-    """The paper's network."""
+    """Returns a configuration with the paper's network."""
     return _configure(domain, name, method, "paper", temperature=0.0)
 
 
 def leapjax(domain: str, name: str, method: str) -> AnyConfig:
-    """Our network."""
+    """Returns a configuration with our network."""
     temperature = 0.5 if method == "leap" else 0.0  # as in BabyAI
     return _configure(domain, name, method, "leapjax", temperature)
 

@@ -10,19 +10,19 @@ TRAINING = {"steps": 4000, "batch": 128, "learning_rate": 1e-3}
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's training; the paper's network cannot read graphs.
+    """Returns the paper's training; the paper's network cannot read graphs.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     return configure(_puzzle(name), method, "paper")
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """Our network.
+    """Returns our network and training.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     puzzle = _puzzle(name)
     if method == "leap" and graphs.find_level(name).nodes > LARGE:

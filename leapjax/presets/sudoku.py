@@ -7,19 +7,19 @@ from leapjax.presets.puzzles import Puzzle, configure
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's training; the paper's network cannot read boards.
+    """Returns the paper's training; the paper's network cannot read boards.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     return configure(_puzzle(name), method, "paper")
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """Our network.
+    """Returns our network and training.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     return configure(_puzzle(name), method, "leapjax")
 

@@ -113,7 +113,7 @@ def find_problem(value: Any, schema: Schema, name: str = "") -> str | None:
     Args:
         value: parsed JSON.
         schema: schema of the value.
-        name: path of the value from the outermost one.
+        name: path from the outermost value to this value.
     """
     if isinstance(schema, Absent):
         schema = schema.schema

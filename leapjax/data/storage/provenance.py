@@ -1,4 +1,4 @@
-"""Plays an episode of a data set again, to compare the environment with the recorded one."""
+"""Replays an episode of a data set, to compare the environment with the recorded environment."""
 
 import warnings
 from collections.abc import Sequence
