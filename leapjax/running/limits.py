@@ -118,10 +118,9 @@ def check_target_return(config: AnyConfig) -> None:
 
 
 def check_memory(config: AnyConfig, domain: Domain) -> None:
-    """Checks that the machine has the memory that a configuration needs at least.
+    """Compares the machine's memory with a lower bound on the need of a configuration.
 
-    This lower bound comes from the options. `memory.check_program` measures exactly, after
-    compilation.
+    The bound comes from the options. `memory.check_program` measures exactly, after compilation.
 
     Raises:
         UserError: the memory is too small; names the options that need too much.

@@ -21,8 +21,8 @@ from leapjax.types import Agent, TrainState
 if TYPE_CHECKING:
     from leapjax.running.run import Run
 
-# Number of plans in a chunk. A single size of chunks compiles soon. Larger chunks are a tenth
-# faster, but waste more on the last episodes of an evaluation.
+# Number of plans in a chunk. A single chunk size needs a single program, which compiles soon.
+# Larger chunks are a tenth faster, but suit the last episodes of an evaluation less.
 PLANS_TOGETHER = 32
 
 

@@ -42,7 +42,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     run = learn_statistics(run, data)
     processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
-    # As large as all frames of Atari: the host keeps one copy until the devices have theirs.
+    # In Atari these are all frames: the host keeps one copy until the devices have theirs.
     steps: Any = (
         windows.concatenate(data, run.domain.augmentations.extras, padded=True) if data else ()
     )
@@ -56,7 +56,8 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         jax.block_until_ready(step.draw(key, state.step, steps))
     run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
-    processes.run_on_first(lambda: files.check_room(folder, 3 * size))  # two, and the next
+    # Room for two checkpoints and the next.
+    processes.run_on_first(lambda: files.check_room(folder, 3 * size))
     saved = Checkpoints(
         folder / pretrained.CHECKPOINTS, pretrained.describe_identity(run.specification)
     )

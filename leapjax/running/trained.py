@@ -23,7 +23,8 @@ def load_trained(run: Run) -> Pretrained:
     """
     checkpoint = run.config.checkpoint
     assert checkpoint is not None
-    if run.config.play in (None, run.config.level):  # another level: other episodes
+    # On another level the same seeds give other episodes.
+    if run.config.play in (None, run.config.level):
         seeds.check_disjoint(find_demonstrated(checkpoint), run.played)
     trained = pretrained.read_specification(checkpoint)
     wanted, found = (_select_training_settings(s) for s in (run.specification, trained))
