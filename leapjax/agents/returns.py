@@ -9,8 +9,8 @@ from leapjax.agents.base import Setup
 from leapjax.types import Context
 
 ComputeReturns = Callable[..., jax.Array | None]
-# (context, return to go at the demonstration's current state, or `None` while acting)
-# -> returns to go [K + 1] that condition the network, or `None` if it has no such input
+# (context, return to go at a demonstration's current state) -> returns to go [K + 1] for the
+# network, or `None` if it has no such input. While acting, the second argument is `None`.
 
 
 def condition_on_target(setup: Setup) -> ComputeReturns:

@@ -43,7 +43,7 @@ class Settings:
         dqn_seed: Seed of the DQN whose games to learn from; DQN-Replay has 1 to 5 of each game.
         sticky: Probability that the game repeats the last action in place of the new one.
         max_steps: Decisions after which a game is cut off.
-        features: Features of the first convolution; the others have twice as many.
+        features: Features of the first convolution; later convolutions have twice as many.
         mirror: Reflect half of the training windows at random, with their actions.
     """
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from leapjax.errors import UserError, did_you_mean
 
-HEIGHT = WIDTH = 84  # of a frame, in pixels (Mnih et al., 2015)
+HEIGHT = WIDTH = 84  # size of a frame in pixels (Mnih et al., 2015)
 FRAME_SKIP = 4  # frames for which an action is repeated
 MAX_FRAMES = 108_000  # most frames of a game: half an hour
 MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # most decisions of a game
@@ -75,7 +75,7 @@ _SIDES = _exchange(
     ("right", "left"), ("upright", "upleft"), ("downright", "downleft"), ("rightfire", "leftfire"),
     ("uprightfire", "upleftfire"), ("downrightfire", "downleftfire"),
 )  # fmt: skip
-_HOPS = _exchange(("up", "left"), ("right", "down"))  # of Qbert, who hops along diagonals
+_HOPS = _exchange(("up", "left"), ("right", "down"))  # Qbert hops along diagonals
 
 
 def _paper(*scores: float) -> Mapping[str, float]:

@@ -64,7 +64,7 @@ class BabyAIAdapter:
         return observations.observe(self.env, self.side, self.goal, self._instruction)
 
     def step(self, action: int) -> Transition:
-        """Takes one action, or at random another action if it is a turn and the level's turns slip."""
+        """Takes an action; in levels with slips, a turn may become another action at random."""
         self.taken = action
         if action in TURNS and self._random.random() < self.level.slip:
             self.taken = int(self._random.choice([a for a in range(END) if a != action]))

@@ -46,8 +46,8 @@ def _find_repeats(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds groups of equal consecutive elements along axis 1.
 
     Returns:
-        The index `[B * n]` of the first element of each group among all B * n elements, then zeros;
-        the number `[]` of groups; the group `[B, n]` of each element.
+        Indices `[B * n]` of the groups' first elements among all B * n elements, then zeros; the
+        number `[]` of groups; and the group `[B, n]` of each element.
     """
 
     def differs(leaf: jax.Array) -> jax.Array:

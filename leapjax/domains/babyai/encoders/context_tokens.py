@@ -26,8 +26,8 @@ from leapjax.types import Context, pad_token
 class ContextTokens(Encoder):
     """Our encoder: four tokens for a whole context.
 
-    It turns the grid so that the agent faces right, computes learned distances on it, and reads
-    it at the agent, at the goal and as a whole.
+    It turns the grid so that the agent faces right, and computes learned distances on it. Then it
+    reads the grid at the agent, at the goal and as a whole.
 
     Attributes:
         settings: sizes of the encoder.

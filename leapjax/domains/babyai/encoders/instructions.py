@@ -53,9 +53,9 @@ class InstructionEncoder(nn.Module):
 class WordAttention(nn.Module):
     """Attention from cells to the words of an instruction.
 
-    For 'go to the red ball and the key, then ...', a single vector would have to say of every
-    object whether and when to go to it. With attention, the cell of an object finds the words that
-    name it.
+    A single vector of 'go to the red ball and the key, then ...' would have to say of every object
+    whether and when to go there. With attention, the cell of an object finds the words that name
+    it.
 
     Attributes:
         heads: number of heads.
