@@ -79,7 +79,7 @@ def collect_games(options: Collect) -> None:
     for name in ("transitions", "dqn_seed", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises if one is too large
+    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises if it is out of range
     memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
     if options.record and (options.dqn_seed, options.longest) != (1, LONGEST):
         raise UserError(

@@ -200,7 +200,7 @@ def compute_mean_energy(
 
 
 def measure_refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
-    """Plans, and returns the energies after each iteration: their mean, and those for 8 plans.
+    """Plans, and returns the energies after each iteration: their mean, and eight single curves.
 
     Plans with N = 10, the paper's for the default level, or more if the preset does. The contexts
     are beginnings of demonstrations, so that the energies compare.
