@@ -203,18 +203,18 @@ def search_beams(trained: GibbsConfig) -> BeamConfig:
 
 # If models disagree, the likeliest plan leads nowhere; noise leads out of such states.
 noisily = draw_at(2.0)
-# If the likeliest action is forbidden, the next likeliest leads to and fro; noise leads out of this.
+# If the likeliest action is forbidden, the next likeliest leads to and fro; noise breaks this up.
 wandering = draw_at(5.0)
 
 
 def refine_plan(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
-    """Fills a plan from left to right, then resamples it, so that later actions inform early ones."""
+    """Fills a plan from left to right, then resamples it: later actions inform earlier ones."""
     filled = fill_left_to_right(trained)
     return dataclasses.replace(filled, iterations=rounds * filled.iterations)
 
 
 def refine_once(trained: GibbsConfig) -> GibbsConfig:
-    """Fills a plan from left to right, then resamples each action, at temperature 1: for detours."""
+    """Fills a plan from left to right, then resamples each action once, to find detours."""
     return dataclasses.replace(refine_plan(trained, rounds=2), temperature=1.0)
 
 

@@ -22,7 +22,7 @@ PAPER = {
 
 
 def lower_temperature(trained: GibbsConfig) -> GibbsConfig:
-    """Lowers the temperature to at most 0.5: at 1, plans have as many mistakes as demonstrations."""
+    """Limits the temperature to 0.5: at 1, plans have as many mistakes as demonstrations."""
     return dataclasses.replace(trained, temperature=min(trained.temperature, 0.5))
 
 

@@ -75,9 +75,8 @@ class Way(NamedTuple):
     Attributes:
         name: names its rows.
         method: method of the models.
-        minimise: (energies of the case's models) -> the energy to minimise. See
-            `describe_function`.
-        search: (the planner's configuration in training) -> its configuration here.
+        minimise: (energies of the case's models) -> energy to minimise; see `describe_function`.
+        search: (trained planner's configuration) -> configuration of the search.
         executed: actions before replanning; `None` executes whole plans.
         paper: the paper's success, in percent.
         remembers: whether penalties see the whole episode; models still see their K steps.
