@@ -214,7 +214,7 @@ def refine_plan(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
 
 
 def refine_once(trained: GibbsConfig) -> GibbsConfig:
-    """Fills a plan from left to right, then resamples each action once, to find detours."""
+    """Fills a plan from left to right, then makes T Gibbs steps at temperature 1, for detours."""
     return dataclasses.replace(refine_plan(trained, rounds=2), temperature=1.0)
 
 
