@@ -11,10 +11,12 @@ if TYPE_CHECKING:
     from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
     from leapjax.domain import Domain
     from leapjax.energy import (
+        Factors,
         autoregressive,
         classifier,
         compose,
         constrain,
+        from_factors,
         from_total,
         neutral,
         pseudo_likelihood,
@@ -55,6 +57,7 @@ __all__ = [
     "Domain",
     "Energy",
     "Episodes",
+    "Factors",
     "GibbsConfig",
     "Plan",
     "Pretrained",
@@ -73,6 +76,7 @@ __all__ = [
     "cross_entropy_method",
     "evaluate",
     "fit",
+    "from_factors",
     "from_total",
     "gibbs",
     "interval_of_episodes",
@@ -93,10 +97,12 @@ _DEFINED = {
     "leapjax.batching": ("CompiledPlanner", "compile_planner", "plan_keys"),
     "leapjax.domain": ("Domain",),
     "leapjax.energy": (
+        "Factors",
         "autoregressive",
         "classifier",
         "compose",
         "constrain",
+        "from_factors",
         "from_total",
         "neutral",
         "pseudo_likelihood",

@@ -143,7 +143,8 @@ class Energy(NamedTuple):
         num_actions: A, the end action included.
         accepts_mask: whether actions may be MASK; if not, planning starts from uniform actions.
         violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
-            positive.
+            positive; +inf for a plan that is forbidden. For a plan that holds MASK: positive only
+            if every way to complete it breaks a constraint.
     """
 
     encode: Callable[[Params, PyTree], PyTree]

@@ -82,6 +82,10 @@ def _blind_to_other_actions(params, memory, actions, positions):
     return ENUMERABLE.conditional(params, memory, masked, positions)
 
 
+def _least_certain(energies, key):
+    return jnp.nanmin(jnp.where(jnp.isinf(energies), jnp.nan, energies), axis=-1)
+
+
 def likelier(pairs, joint=JOINT):
     """The distribution of the likelier plan of two that are drawn as such a pair `[A^T, A^T]`."""
     p, rows = joint.reshape(-1), np.arange(len(PLANS))
@@ -183,6 +187,14 @@ SAMPLERS = {
     "beam": Sampler(BeamConfig(HORIZON, 1, 1.0), JOINT, INDEPENDENT),
     "warm beam": Sampler(BeamConfig(HORIZON, 1, 2.0), action_by_action(2.0), JOINT),
     "two beams": Sampler(BeamConfig(HORIZON, 2, 1.0), *STEEP_BEAMS, params=STEEP),
+    "beam by certainty": Sampler(BeamConfig(HORIZON, 1, 1.0, fill="confident"), JOINT, INDEPENDENT),
+    "two beams by certainty": Sampler(
+        BeamConfig(HORIZON, 2, 1.0, fill="confident"), *STEEP_BEAMS, params=STEEP
+    ),
+    "a fill of one's own": Sampler(_gibbs(HORIZON, fill=_least_certain), JOINT, INDEPENDENT),
+    "cooled from infinity to 1": Sampler(
+        _gibbs(51, temperature=1e9, cool_to=1.0), JOINT, INDEPENDENT
+    ),
 }
 
 

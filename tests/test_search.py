@@ -1,0 +1,350 @@
+"""Search with an energy: positions by certainty, beams in any order, dead ends, local terms."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from leapjax import BeamConfig, Energy, Factors, GibbsConfig, constrain, from_factors, from_total
+from leapjax.planners import FILLS, bind
+from leapjax.planners.positions import Commitment, choose_open, most_certain
+from leapjax.types import mask_token
+from tests.enumerable import (
+    all_plans,
+    enumerable_energy,
+    fit_p_value,
+    joint_probabilities,
+    plan_counts,
+    random_table,
+)
+from tests.quick import quick_jit
+
+HORIZON, ACTIONS = 3, 3
+PLANS = all_plans(HORIZON, ACTIONS)
+ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
+NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
+assert_equal = np.testing.assert_array_equal
+assert_close = np.testing.assert_allclose
+
+
+@functools.cache
+def compile_one(energy, config):
+    return quick_jit(bind(energy, config))
+
+
+@functools.cache
+def compile_many(energy, config):
+    return quick_jit(jax.vmap(bind(energy, config), (None, 0, None)))
+
+
+def plan_for(config, energy=ENUMERABLE, params=None, context=NO_TILT, chains=None, seed=0):
+    """Makes a plan with one key, or plans with `chains` keys."""
+    key = jax.random.key(seed)
+    if chains is None:
+        return jax.tree.map(np.asarray, compile_one(energy, config)(params, key, context))
+    plans = compile_many(energy, config)(params, jax.random.split(key, chains), context)
+    return jax.tree.map(np.asarray, plans)
+
+
+# How many positions a pass fills.
+
+
+def count_by_hand(probabilities, least, threshold, entropy):
+    """The number of positions of a ranked list that a pass fills, by the definitions."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        entropies = -np.nansum(probabilities * np.log(probabilities), axis=1)
+    count = least
+    while count < len(probabilities):
+        following = probabilities[: count + 1]
+        surely = threshold < 1 and (following.max(1) >= threshold).all()
+        spread = entropies[: count + 1].sum() - entropies[: count + 1].max()
+        if not (surely or (entropy > 0 and spread <= entropy)):
+            break
+        count += 1
+    return count
+
+
+@pytest.mark.parametrize(
+    ("least", "threshold", "entropy"),
+    [(1, 0.7, 0.0), (1, 1.0, 0.9), (2, 0.6, 0.3), (1, 0.0, 0.0), (2, 1.0, 0.0)],
+)
+def test_a_pass_fills_the_certain_positions(least, threshold, entropy):
+    rng, counts = np.random.default_rng(0), set()
+    for _ in range(30):
+        logits = rng.normal(scale=3, size=(8, 4)).astype(np.float32)
+        open_ = rng.random(8) < 0.7
+        open_[:2] = True
+        energies = -jax.nn.log_softmax(jnp.array(logits))
+        ranks = most_certain(energies, None)
+        commitment = Commitment(least, threshold, entropy)
+        where, chosen = map(np.asarray, choose_open(energies, jnp.array(open_), ranks, commitment))
+        probabilities = np.exp(-np.asarray(energies, np.float64))
+        ranked = sorted(np.flatnonzero(open_), key=lambda t: -probabilities[t].max())
+        count = count_by_hand(probabilities[ranked], least, threshold, entropy)
+        assert where[chosen].tolist() == ranked[:count]
+        counts.add(count)
+    assert len(counts) > 2 or not commitment.adapts
+
+
+@pytest.mark.parametrize("bound", [{"threshold": 0.8}, {"entropy_bound": 0.3}])
+@pytest.mark.parametrize("kind", [GibbsConfig, BeamConfig])
+def test_certain_positions_save_passes(kind, bound):
+    """Trace and `passes` tell how many; without a bound each pass fills one position."""
+    counts = set()
+    for seed in range(12):
+        table = 2 * random_table(seed, HORIZON, ACTIONS)
+        size = {"iterations": HORIZON} if kind is GibbsConfig else {"beams": 2}
+        plain = plan_for(kind(HORIZON, **size, fill="confident"), params=table)
+        quick = plan_for(kind(HORIZON, **size, fill="confident", **bound), params=table)
+        beams = size.get("beams", 1)
+        assert plain.passes == beams * HORIZON
+        assert quick.passes % beams == 0 and quick.passes <= plain.passes
+        assert (quick.actions < ACTIONS).all()
+        assert (quick.trace[quick.passes // beams - 1 :] == quick.actions).all()
+        if kind is GibbsConfig:
+            filled = (quick.trace < ACTIONS).sum(1)
+            assert (np.diff(filled[: quick.passes]) > 0).all()
+        counts.add(int(quick.passes))
+    assert len(counts) > 1
+
+
+def test_independent_positions_are_drawn_together_from_their_joint():
+    """The entropy bound allows for the dependence between actions; here there is none."""
+    rows = np.random.default_rng(0).normal(size=(HORIZON, ACTIONS))
+    table = (rows[0][:, None, None] + rows[1][:, None] + rows[2]).astype(np.float32)
+    config = GibbsConfig(HORIZON, HORIZON, fill="confident", temperature=1.0, entropy_bound=9.0)
+    plan = plan_for(config, params=table, chains=5000)
+    assert (plan.passes == 1).all()
+    counts = plan_counts(plan.actions, ACTIONS)
+    assert fit_p_value(counts, joint_probabilities(table).reshape(-1)) > 1e-3
+
+
+def test_a_strategy_that_ranks_nothing_still_fills_the_plan():
+    for rank in (np.nan, -np.inf, np.inf):
+        plan = plan_for(
+            GibbsConfig(HORIZON, HORIZON, fill=lambda energies, key, r=rank: energies[:, 0] * 0 + r),
+            params=random_table(0, HORIZON, ACTIONS),
+        )
+        assert (plan.actions < ACTIONS).all() and plan.passes == HORIZON
+
+
+# What is kept.
+
+
+def test_the_best_plan_of_all_traces_is_kept():
+    table = random_table(3, HORIZON, ACTIONS)
+    options = {"temperature": 1.5, "restarts": 2, "score": True, "score_trace": True}
+    last = plan_for(GibbsConfig(HORIZON, 8, **options), params=table, chains=200)
+    best = plan_for(GibbsConfig(HORIZON, 8, keep="best", **options), params=table, chains=200)
+    assert_close(best.energy, best.trace_energies.min(1), rtol=1e-5)
+    assert (best.energy <= last.energy + 1e-5).all() and (best.energy < last.energy - 0.1).any()
+    energies = -np.log(joint_probabilities(table))[tuple(best.actions.T)]
+    assert_close(best.energy, energies, rtol=1e-4)
+
+
+def test_cooling_to_the_same_temperature_changes_nothing_and_to_zero_takes_the_best():
+    table = random_table(0, HORIZON, ACTIONS)
+    plain = plan_for(GibbsConfig(HORIZON, 9, temperature=0.7), params=table, chains=50)
+    same = plan_for(GibbsConfig(HORIZON, 9, temperature=0.7, cool_to=0.7), params=table, chains=50)
+    assert_equal(plain.trace, same.trace)
+    cooled = GibbsConfig(HORIZON, 30, temperature=2.0, cool_to=0.0)
+    energy = -np.log(joint_probabilities(table))
+    found, warm = (
+        energy[tuple(plan_for(each, params=table, chains=500).actions.T)].mean()
+        for each in (cooled, GibbsConfig(HORIZON, 30, temperature=2.0))
+    )
+    assert found < warm - 0.5
+
+
+def test_passes_count_every_conditional_and_every_total():
+    table = random_table(0, HORIZON, ACTIONS)
+    for config, expected in (
+        (GibbsConfig(HORIZON, 7), 7),
+        (GibbsConfig(HORIZON, 7, score=True), 7 + HORIZON),
+        (GibbsConfig(HORIZON, 7, restarts=4), 4 * (7 + HORIZON)),
+        (GibbsConfig(HORIZON, 7, restarts=4, score=True), 4 * (7 + HORIZON)),
+        (GibbsConfig(HORIZON, 7, keep="best"), 7 + 7 * HORIZON),
+        (GibbsConfig(HORIZON, 7, score_trace=True), 7 + 7 * HORIZON),
+        (BeamConfig(HORIZON, 4), 4 * HORIZON),
+        (BeamConfig(HORIZON, 4, judge="energy"), 8 * HORIZON),
+        (BeamConfig(HORIZON, 4, score=True), 5 * HORIZON),
+    ):
+        assert plan_for(config, params=table).passes == expected, config
+
+
+# Beams in any order.
+
+
+@pytest.mark.parametrize("fill", [fill for fill in FILLS if fill != "together"])
+@pytest.mark.parametrize("judge", ["sum", "energy"])
+def test_wide_beams_find_the_mode_in_any_order(fill, judge):
+    for seed in range(6):
+        table = random_table(seed, HORIZON, ACTIONS)
+        config = BeamConfig(HORIZON, ACTIONS ** (HORIZON - 1), fill=fill, judge=judge, score=True)
+        plan = plan_for(config, params=table)
+        joint = joint_probabilities(table)
+        assert_equal(plan.actions, np.unravel_index(joint.argmax(), joint.shape))
+        assert_close(plan.energy, -np.log(joint.max()), rtol=1e-4)
+
+
+def test_the_total_energy_chooses_another_beam_than_the_sum():
+    """Of a pseudo-likelihood whose conditionals are not those of one joint."""
+
+    def conditional(params, memory, actions, positions):
+        first = jnp.array([0.0, 0.1, 5.0])  # the first choice is nearly free,
+        second = jnp.where(actions[0] == 0, 2.0, 2.1) + jnp.zeros(3)
+        return jnp.where(positions[:, None] == 0, first, second)
+
+    def total(params, memory, actions):  # and the total knows that it was wrong
+        return jnp.where(actions[0] == 0, 9.0, 1.0)
+
+    energy = Energy(lambda params, context: None, conditional, total, 3)
+    by_sum = plan_for(BeamConfig(2, 4), energy)
+    by_energy = plan_for(BeamConfig(2, 4, judge="energy"), energy)
+    assert by_sum.actions[0] == 0 and by_energy.actions[0] == 1
+
+
+# Dead ends.
+
+
+def test_a_dead_end_crowds_out_no_plan_that_satisfies():
+    """Only (1, 1) is allowed; from action 0 no way leads there, and it costs less."""
+    energy = Energy(
+        lambda params, context: None,
+        lambda params, memory, actions, positions: -jnp.log(
+            jnp.where(positions[:, None] == 0, jnp.array([0.5, 0.4]), 0.05)
+        ),
+        lambda params, memory, actions: jnp.zeros(()),
+        2,
+    )
+    only = constrain(energy, lambda context, plan: jnp.where((plan == 1).all(), 0.0, jnp.inf))
+    plan = plan_for(BeamConfig(2, 2), only)
+    assert plan.actions.tolist() == [1, 1] and plan.satisfied
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    allowed=st.lists(st.integers(0, 26), min_size=1, max_size=4),
+    partial=st.booleans(),
+    fill=st.sampled_from(["sequential", "confident", "random"]),
+)
+def test_wide_beams_satisfy_where_a_plan_can(seed, allowed, partial, fill):
+    """They return the best of the allowed plans, whatever the others cost."""
+    plans = PLANS[sorted(set(allowed))]
+    context = np.zeros(len(PLANS), np.float32)
+    context[sorted(set(allowed))] = 1
+    plan = DEAD_ENDS[partial, fill](2 * random_table(seed, HORIZON, ACTIONS), context)
+    joint = joint_probabilities(2 * random_table(seed, HORIZON, ACTIONS))[tuple(plans.T)]
+    assert plan.satisfied
+    assert_equal(plan.actions, plans[joint.argmax()])
+
+
+def _forbid(context, plan):
+    """Infinite unless a plan can still become an allowed one."""
+    agrees = ((jnp.array(PLANS) == plan) | (plan == ACTIONS)).all(1)
+    return jnp.where((agrees & (context > 0)).any(), 0.0, jnp.inf)
+
+
+def _plan_among(partial, fill):
+    energy = constrain(
+        ENUMERABLE._replace(encode=lambda p, c: ENUMERABLE.encode(p, jnp.zeros((HORIZON, ACTIONS)))),
+        _forbid,
+        partial=partial,
+    )
+    planner = quick_jit(bind(energy, BeamConfig(HORIZON, ACTIONS ** (HORIZON - 1), fill=fill)))
+    return lambda table, context: jax.tree.map(
+        np.asarray, planner(table, jax.random.key(0), context)
+    )
+
+
+DEAD_ENDS = {
+    (partial, fill): _plan_among(partial, fill)
+    for partial in (False, True)
+    for fill in ("sequential", "confident", "random")
+}
+
+
+# Energies of local terms.
+
+EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (4, 4)], np.int32)
+WEIGHTS = np.array([1.0, 2.0, 0.5, 3.0, 1.5, 0.25], np.float32)
+
+
+def _clash(params, weight, actions):
+    return params * weight * (actions[0] == actions[1]) + 0.1 * actions[1]
+
+
+COLOURS = from_factors(lambda params, context: Factors(context, WEIGHTS), _clash, 3, degree=3)
+
+
+def _clash_of_all(params, memory, actions):
+    pairs = actions[memory]
+    return (params * WEIGHTS * (pairs[:, 0] == pairs[:, 1]) + 0.1 * pairs[:, 1]).sum()
+
+
+def test_local_terms_have_the_energies_of_their_sum():
+    whole = from_total(lambda params, context: context, _clash_of_all, 3)
+    for plan in list(itertools.product(range(3), repeat=5))[::17]:
+        plan = jnp.array(plan)
+        memories = [energy.encode(2.0, EDGES) for energy in (COLOURS, whole)]
+        totals = [e.total(2.0, m, plan) for e, m in zip((COLOURS, whole), memories, strict=True)]
+        assert_close(*totals, rtol=1e-6)
+        local, exact = (
+            energy.conditional(2.0, memory, plan, jnp.arange(5))
+            for energy, memory in zip((COLOURS, whole), memories, strict=True)
+        )
+        assert_close(local - local[:, :1], exact - exact[:, :1], atol=1e-5)
+
+
+def test_local_terms_may_judge_incomplete_plans():
+    """A pair with an open end costs nothing: so the conditional counts the chosen neighbours."""
+
+    def clash(params, weight, actions):
+        both = (actions < 3).all()
+        return jnp.where(both, weight * (actions[0] == actions[1]), 0.0)
+
+    energy = from_factors(
+        lambda params, context: Factors(EDGES, WEIGHTS), clash, 3, degree=3, accepts_mask=True
+    )
+    memory, mask = energy.encode(None, None), mask_token(3)
+    plan = jnp.array([mask, 1, 2, mask, mask])
+    assert_close(energy.conditional(None, memory, plan, jnp.array([0]))[0], [0, 1.0, 1.5])
+    assert_close(energy.conditional(None, memory, plan, jnp.array([0, 1]))[0], [0, 0, 1.5])
+    assert np.isposinf(energy.total(None, memory, plan))
+    found = plan_for(GibbsConfig(5, 5, fill="confident"), energy)
+    pairs = found.actions[EDGES[:5]]
+    assert (pairs[:, 0] != pairs[:, 1]).all()
+
+
+def test_more_terms_at_a_position_than_the_degree_are_an_error():
+    few = from_factors(lambda params, context: Factors(EDGES, WEIGHTS), _clash, 3, degree=2)
+    plan = plan_for(GibbsConfig(5, 10), few, params=1.0)
+    assert not plan.valid
+    with pytest.raises(ValueError, match="NaN"):
+        few.conditional(1.0, few.encode(1.0, None), jnp.zeros(5, int), jnp.array([0]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GibbsConfig(5, 5, fill="uncertain"), "unknown fill 'uncertain'"),
+        (lambda: GibbsConfig(5, 5, threshold=0.9), "fill 'together' fills all"),
+        (lambda: GibbsConfig(5, 5, fill="margin", threshold=1.5), "threshold"),
+        (lambda: GibbsConfig(5, 5, fill="margin", entropy_bound=-1.0), "entropy_bound"),
+        (lambda: GibbsConfig(5, 5, keep="first"), "unknown keep 'first'"),
+        (lambda: GibbsConfig(5, 5, cool_to=-1.0), "temperature"),
+        (lambda: BeamConfig(5, fill="together"), "unknown fill 'together'"),
+        (lambda: BeamConfig(5, judge="length"), "unknown judge 'length'"),
+        (lambda: BeamConfig(5, temperature=1.0, entropy_bound=0.1), "use one of the two"),
+        (lambda: from_factors(None, None, 3, degree=0), "degree"),
+    ],
+)
+def test_mistakes_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
