@@ -328,7 +328,7 @@ def find_published(name: str) -> Path:
 def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
     """Writes a trained planner as two small files, its parameters in half precision.
 
-    The files are `specification.json` and `weights.npz`. `load` reads their folder anywhere.
+    The files are `specification.json` and `weights.npz`. `load` reads their folder from any place.
 
     Args:
         folder: folder of a run, or of `Pretrained.save`.

@@ -1,4 +1,4 @@
-"""Plays many episodes in lockstep: plans for all of them in one call, acts, and replans."""
+"""Plays many episodes in lockstep: plans for many in one call, acts, and replans."""
 
 import contextlib
 import itertools
@@ -44,7 +44,7 @@ class Episodes(NamedTuple):
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:
-    """Joins results of episodes that were played in parallel: adds plans, takes longest times."""
+    """Joins results of parallel episodes: adds their plans, and takes the longest times."""
     return Episodes(
         np.concatenate([part.seeds for part in parts]),
         np.concatenate([part.successes for part in parts]),

@@ -188,7 +188,7 @@ def _draw_from_episodes(solved: np.ndarray, rng: np.random.Generator) -> tuple[n
         )
     seeds, count = solved.shape
     # Count the levels that 0, 1, .. S seeds solve. The prior adds half a level that no seed solves,
-    # and half a level that all seeds solve. With one seed, this gives the Beta posterior of Jeffreys'
+    # and half a level that all seeds solve. With one seed this is the Beta posterior of Jeffreys'
     # prior.
     alike = np.bincount(solved.sum(axis=0), minlength=seeds + 1).astype(float)
     alike[[0, -1]] += 0.5
