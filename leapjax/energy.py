@@ -221,7 +221,7 @@ def from_factors(
         params: Params, memory: Factors, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, num_actions)
-        # As in every energy, the queried positions are masked together; else all keep their actions.
+        # Terms that take MASK see all queried positions masked; others see the whole plan.
         tokens = actions.at[positions].set(mask) if accepts_mask else actions
 
         def at(position: jax.Array) -> jax.Array:

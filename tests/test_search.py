@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from leapjax import BeamConfig, Energy, Factors, GibbsConfig, constrain, from_factors, from_total
+from leapjax import (
+    BeamConfig,
+    Energy,
+    Factors,
+    GibbsConfig,
+    constrain,
+    from_factors,
+    from_total,
+)
 from leapjax.planners import FILLS, bind
 from leapjax.planners.positions import Commitment, choose_open, most_certain
 from leapjax.types import mask_token
@@ -127,7 +135,9 @@ def test_independent_positions_are_drawn_together_from_their_joint():
 def test_a_strategy_that_ranks_nothing_still_fills_the_plan():
     for rank in (np.nan, -np.inf, np.inf):
         plan = plan_for(
-            GibbsConfig(HORIZON, HORIZON, fill=lambda energies, key, r=rank: energies[:, 0] * 0 + r),
+            GibbsConfig(
+                HORIZON, HORIZON, fill=lambda energies, key, r=rank: energies[:, 0] * 0 + r
+            ),
             params=random_table(0, HORIZON, ACTIONS),
         )
         assert (plan.actions < ACTIONS).all() and plan.passes == HORIZON
@@ -216,8 +226,8 @@ def test_a_dead_end_crowds_out_no_plan_that_satisfies():
     """Only (1, 1) is allowed; from action 0 no way leads there, and it costs less."""
     energy = Energy(
         lambda params, context: None,
-        lambda params, memory, actions, positions: -jnp.log(
-            jnp.where(positions[:, None] == 0, jnp.array([0.5, 0.4]), 0.05)
+        lambda params, memory, actions, positions: (
+            -jnp.log(jnp.where(positions[:, None] == 0, jnp.array([0.5, 0.4]), 0.05))
         ),
         lambda params, memory, actions: jnp.zeros(()),
         2,
@@ -253,7 +263,9 @@ def _forbid(context, plan):
 
 def _plan_among(partial, fill):
     energy = constrain(
-        ENUMERABLE._replace(encode=lambda p, c: ENUMERABLE.encode(p, jnp.zeros((HORIZON, ACTIONS)))),
+        ENUMERABLE._replace(
+            encode=lambda p, c: ENUMERABLE.encode(p, jnp.zeros((HORIZON, ACTIONS)))
+        ),
         _forbid,
         partial=partial,
     )

@@ -118,7 +118,9 @@ def beam_search(
     draw_keys, select_key = jax.random.split(key, horizon), jax.random.fold_in(key, 1)
     start = _Beams(blank, sums, -sums, -sums, missing)
     beams, passes, trace, valid = jax.lax.while_loop(
-        is_incomplete, extend, (start, jnp.zeros((), jnp.int32), blank[:1].repeat(horizon, 0), True)
+        is_incomplete,
+        extend,
+        (start, jnp.zeros((), jnp.int32), blank[:1].repeat(horizon, 0), jnp.array(True)),
     )
     passes = passes * width
     judged = beams.sums
@@ -167,5 +169,3 @@ def _draw_ranks(
         return jnp.where(hopeless, -jnp.inf, each + beams.likelihoods[:, None])
 
     return after(likelihoods), after(ranks)
-
-

@@ -95,5 +95,3 @@ def cross_entropy_method(
         jnp.asarray(config.iterations * count * horizon, jnp.int32),
     )
     return plan._replace(energy=energies[best]) if config.score else plan
-
-

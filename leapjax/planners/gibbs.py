@@ -184,7 +184,7 @@ def _run_chain(
 
     positions = _order_positions(order_key, config, later)  # [N - F, P]
     last = config.temperature if config.cool_to is None else config.cool_to
-    temperatures = jnp.linspace(config.temperature, last, later)[:, None, None]
+    temperatures = jnp.linspace(config.temperature, last, later + 1)[1:, None, None]
     noise = temperatures * draw_noise(noise_key, later, config.resampled)  # [N - F, P, A]
     plan, (trace, valid) = jax.lax.scan(resample, plan, (positions, noise))
     trace = jnp.concatenate([begun, trace])

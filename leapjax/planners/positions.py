@@ -109,5 +109,5 @@ def choose_open(
 
 
 def compute_probabilities(energies: jax.Array) -> jax.Array:
-    """Returns probabilities `[P, A]` of actions with energies `[P, A]`; 0 where all are forbidden."""
+    """Returns the probabilities `[P, A]` of actions; 0 where all of a row are forbidden."""
     return jnp.nan_to_num(jax.nn.softmax(-energies, axis=-1))
