@@ -174,12 +174,12 @@ def _check_single(actions: jax.Array) -> None:
 
 
 class Factors(NamedTuple):
-    """The terms of a sum, each of which reads a few positions of a plan.
+    """The terms of an energy; each term reads a few positions of a plan.
 
     Attributes:
-        positions: `[M, S]` int32, the positions that each of M terms reads; a term that reads fewer
-            repeats one of its own.
-        data: leaves `[M, ...]`, further numbers of each term; `()` if there are none.
+        positions: `[M, S]` int32, the positions that each of M terms reads; a term with fewer
+            positions repeats some.
+        data: leaves `[M, ...]`, further numbers of each term, or `()`.
     """
 
     positions: Array
@@ -193,10 +193,10 @@ def from_factors(
     degree: int,
     accepts_mask: bool = False,
 ) -> Energy:
-    """Makes an energy from a sum of local terms, such as the edges of a graph that is coloured.
+    """Makes an energy from a sum of local terms, such as the edges of a graph to colour.
 
-    The conditional evaluates only the terms that read a position: `P * A * degree` evaluations of a
-    term. It is exact, as that of `from_total`.
+    The conditional evaluates only terms that read the queried positions: `P * A * degree`
+    evaluations of a term. It equals the conditional of `from_total`, up to a constant per position.
 
     Args:
         encode: (params, context) -> the terms.

@@ -1,7 +1,7 @@
 """Planners: `(energy, params, key, memory, config) -> Plan`, pure, for one context.
 
 They know only `Energy`; `memory` is the result of its `encode` for the context. `leapjax.batching`
-plans for any number of contexts with one of them.
+compiles a planner for any number of contexts.
 """
 
 from collections.abc import Callable

@@ -36,8 +36,9 @@ def beam_search(
 
     In every pass each beam chooses its next position (`BeamConfig.fill`) while the others stay
     open, and branches there: one continuation for each action. The best W continuations of all
-    beams survive. If the conditionals are those of a joint distribution, a sum of energies along a
-    path is the negative log-probability of the actions chosen so far, in any order of positions.
+    beams survive. A beam's sum adds the conditional energies of its actions. With exact
+    conditionals of a joint distribution it is the negative log-probability of these actions,
+    whatever their order.
 
     At temperature 0 the W least sums survive; with W = A^(T - 1) it finds the plan of least sum.
     Above it, W continuations are drawn without replacement, each action with probability
@@ -62,9 +63,8 @@ def beam_search(
         """Chooses the next position of a beam.
 
         Returns:
-            The plan with the positions that are filled and do not branch, the sum of their
-            energies, the position to branch at, its energies `[A]`, and whether all energies are
-            defined.
+            The plan after the fill, the sum of the energies that this added, the position to branch
+            at, the energies `[A]` there, and whether all energies are defined.
         """
         open_ = plan == mask
         energies = energy.conditional(
@@ -143,25 +143,26 @@ def beam_search(
 def _draw_ranks(
     key: jax.Array, beams: _Beams, energies: jax.Array, temperature: float
 ) -> tuple[jax.Array, jax.Array]:
-    """`likelihoods` and `ranks` `[W, A]` of plans that are one action longer.
+    """Draws the log-likelihoods and ranks `[W, A]` of the continuations of all beams.
 
-    The highest rank of what a plan becomes is the plan's own (Kool et al., 2019, algorithm 1):
-    so complete plans have ranks as if noise had been added to each of all that are possible.
+    The highest rank among the continuations of a beam equals the rank of the beam (Kool et al.,
+    2019, algorithm 1). So the ranks of complete plans are log-probabilities plus independent Gumbel
+    noise, and the highest W are a sample without replacement.
 
     Args:
-        key: of the noise.
-        beams: that are made longer.
-        energies: `[W, A]` of every action.
-        temperature: of the draw, positive.
+        key: key of the noise.
+        beams: beams that branch.
+        energies: energy `[W, A]` of every action.
+        temperature: temperature of the draw, positive.
     """
-    # Measured from the least first, so that the lowest temperature is a greedy choice.
+    # The least energy is subtracted first, so that the lowest temperature is a greedy choice.
     least = energies.min(axis=1, keepdims=True)
-    hopeless = jnp.isinf(least) | jnp.isinf(beams.likelihoods)[:, None]  # nothing, or no plan
+    hopeless = jnp.isinf(least) | jnp.isinf(beams.likelihoods)[:, None]
     likelihoods = jnp.where(hopeless, 0, jax.nn.log_softmax((least - energies) / temperature))
     noisy = likelihoods + jax.random.gumbel(key, energies.shape)
     highest = noisy.max(axis=1, keepdims=True)
     wanted = jnp.where(hopeless, 0, (beams.ranks - beams.likelihoods)[:, None])
-    # -log(exp(-wanted) - exp(-highest) + exp(-noisy)), in a form that overflows nowhere.
+    # -log(exp(-wanted) - exp(-highest) + exp(-noisy)), in a form that does not overflow.
     excess = wanted - noisy + jnp.log1p(-jnp.exp(noisy - highest))
     ranks = wanted - jnp.maximum(excess, 0) - jnp.log1p(jnp.exp(-jnp.abs(excess)))
 

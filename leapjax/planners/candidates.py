@@ -31,7 +31,7 @@ def _draw_plans(key: jax.Array, choices: jax.Array, count: int) -> jax.Array:
 def random_shooting(
     energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: ShootingConfig
 ) -> Plan:
-    """Draws possible plans at random and keeps the one of least energy (paper, ablation)."""
+    """Draws possible plans at random, and returns the plan of least energy (paper, ablation)."""
     energy = guard_shapes(energy)
     choices = _find_choices(energy, params, memory, config.horizon)
     plans = _draw_plans(key, choices, config.candidates)
@@ -71,7 +71,7 @@ def cross_entropy_method(
         children = parents[jnp.arange(count) % config.elites]
         where = jax.random.randint(place_key, (count,), 0, horizon)
         rows = jnp.arange(count)
-        # Draw another action; if no other is possible, the lowest logit leaves the same one.
+        # Draw another action. Without a possible one, the lowest finite logit keeps the same.
         lowest = jnp.finfo(choices.dtype).min
         others = choices[where].at[rows, children[rows, where]].set(lowest)
         changed = jax.random.categorical(action_key, others).astype(jnp.int32)

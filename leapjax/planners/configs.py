@@ -46,30 +46,30 @@ class GibbsConfig:
 
     Attributes:
         horizon: T, planned actions.
-        iterations: N, passes of the model at most, those that fill the plan included.
+        iterations: N, passes of the model at most, including the fill.
         resampled: P, positions that a pass chooses together, unless it fills all.
-        fill: How passes fill the first plan. "together": all positions in one pass, as in the
-            paper. Otherwise P positions in each pass, while the others stay MASK: those with the
-            likeliest actions ("confident"), those whose likeliest action leads the second by
-            most ("margin"), those from left to right ("sequential"), or those in "random" order.
-            A program may pass its own function (energies `[T, A]`, key) -> ranks `[T]`; the highest
-            rank comes first.
-        order: Which P positions every later iteration resamples: "random" ones, the next from left
-            to right ("sequential"), or the least certain ones when they were chosen, each once
-            before any is again ("uncertain").
+        fill: How passes fill the first plan. "together" fills all positions in one pass, as in the
+            paper. The other names fill P positions in each pass, while the rest stay MASK.
+            "confident" takes positions with the likeliest actions first, "margin" positions whose
+            likeliest action leads the second by most. "sequential" goes from left to right, and
+            "random" in random order. A program may pass a function (energies `[T, A]`, key) ->
+            ranks `[T]`; the highest rank comes first.
+        order: Which P positions every later iteration resamples. "random" draws them, "sequential"
+            goes from left to right, and "uncertain" takes positions that were least certain when
+            they were chosen. It resamples each once before it resamples any again.
         temperature: Temperature at which actions are drawn; 0 takes the most likely action.
-        restarts: R, independent plans; the planner keeps the one of least energy.
+        restarts: R, independent plans; the planner returns the plan of least energy.
         score: Also return the energy of the plan, for T more passes.
         score_trace: Also return the energy after every iteration, for N * T more passes.
         threshold: A filling pass also fills each next position whose likeliest action has at least
             this probability. Then the plan takes fewer passes. 1 fills P positions.
-        entropy_bound: A filling pass also fills each next position while the sum of their
-            entropies, less the largest, is at most this, in nats (EB-Sampler, arXiv 2505.24857).
-            0 fills P positions.
-        cool_to: Temperature of the last iteration; it changes linearly after the first plan. None
-            keeps the temperature.
-        keep: The plan to return: the "last" one, or the "best" one of the whole trace, whose
-            energies cost N * T more passes.
+        entropy_bound: A filling pass also fills each next position, as long as their entropies
+            without the largest add up to at most this, in nats (EB-Sampler, arXiv 2505.24857). 0
+            fills P positions.
+        cool_to: Temperature of the last iteration; it changes linearly after the first plan. By
+            default the temperature is constant.
+        keep: Which plan of the trace to return: the "last", or the "best". The energies of the
+            whole trace cost N * T more passes.
     """
 
     horizon: int = 5
@@ -145,7 +145,7 @@ class ShootingConfig:
 
     Attributes:
         horizon: T, planned actions.
-        candidates: Uniformly drawn plans; the planner keeps the one of least energy.
+        candidates: Uniformly drawn plans; the planner returns the plan of least energy.
         score: Also return the energy of the plan, which is known anyway.
     """
 
@@ -186,7 +186,7 @@ class CrossEntropyConfig:
 
 @dataclasses.dataclass(frozen=True)
 class BeamConfig:
-    """Beam search: the best of W partial plans, each of which branches at its next position.
+    """Beam search: W partial plans branch, each at its next position, and the best W go on.
 
     Attributes:
         horizon: T, planned actions.
@@ -195,8 +195,8 @@ class BeamConfig:
         score: Also return the energy of the plan, for T more passes.
         fill: Which open position a beam chooses next, as in `GibbsConfig`; from left to right
             ("sequential") by default. Other orders let each beam take its own.
-        judge: Which complete beam is returned: the one of the least "sum" of the conditional
-            energies of its choices, or of the least total "energy", for W * T more passes.
+        judge: Which complete beam to return. "sum" takes the least sum of the conditional energies
+            of its choices, "energy" the least total energy, for W * T more passes.
         threshold: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
             beam branches at the last of them.
         entropy_bound: As in `GibbsConfig`; the beam branches at the last position.

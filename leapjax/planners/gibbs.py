@@ -75,8 +75,8 @@ class _Plan(NamedTuple):
 
     Attributes:
         actions: actions `[T]`, MASK at open positions.
-        age: for each position `[T]`, the number of times it was chosen, plus half of the
-            probability of its action then; None unless the order is "uncertain".
+        age: number `[T]` of times that each position was chosen, plus half of the probability of
+            its last action; `None` unless the order is "uncertain".
     """
 
     actions: jax.Array

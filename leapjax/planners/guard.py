@@ -1,4 +1,4 @@
-"""Checks what an energy returns, while a planner is traced and while it runs."""
+"""Checks the results of an energy, while a planner is traced and while it runs."""
 
 import jax
 import jax.numpy as jnp

@@ -24,9 +24,10 @@ def most_certain(energies: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def by_margin(energies: jax.Array, key: jax.Array) -> jax.Array:
-    """Ranks positions by the lead of their likeliest action over the second (Kim et al., 2025).
+    """Ranks positions by the lead of their likeliest action over the second.
 
-    The source is arXiv 2502.06768. Arguments and result are those of `most_certain`.
+    The source is Kim et al., 2025 (arXiv 2502.06768). It takes and returns the same as
+    `most_certain`.
     """
     del key
     likeliest = jax.lax.top_k(compute_probabilities(energies), min(2, energies.shape[-1]))[0]
@@ -34,7 +35,7 @@ def by_margin(energies: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def left_to_right(energies: jax.Array, key: jax.Array) -> jax.Array:
-    """Ranks positions from left to right; arguments and result are those of `most_certain`."""
+    """Ranks positions from left to right; takes and returns the same as `most_certain`."""
     del key
     return -jnp.arange(energies.shape[0], dtype=jnp.float32)
 
@@ -42,7 +43,7 @@ def left_to_right(energies: jax.Array, key: jax.Array) -> jax.Array:
 def in_random_order(energies: jax.Array, key: jax.Array) -> jax.Array:
     """Ranks positions at random; a key always gives one order.
 
-    Arguments and result are those of `most_certain`.
+    It takes and returns the same as `most_certain`.
     """
     return jax.random.uniform(key, energies.shape[:1])
 
@@ -62,9 +63,9 @@ class Commitment(NamedTuple):
         least: number of positions that every pass fills, while so many are open.
         threshold: a pass also fills each next position whose likeliest action has at least this
             probability; above 1: no further position.
-        entropy: a pass also fills each next position while the sum of all their entropies, less the
-            largest, is at most this, in nats (EB-Sampler, Ben-Hamu et al., arXiv 2505.24857). It
-            bounds the dependence between actions that a pass chooses independently.
+        entropy: a pass also fills each next position, as long as their entropies without the
+            largest add up to at most this, in nats (EB-Sampler, Ben-Hamu et al., arXiv 2505.24857).
+            It bounds the dependence between actions that a pass chooses independently.
     """
 
     least: int = 1
