@@ -193,8 +193,8 @@ class BeamConfig:
         beams: W, partial plans that are kept.
         temperature: 0 keeps the best beams; above it beams are drawn, all different.
         score: Also return the energy of the plan, for T more passes.
-        fill: Which open position a beam chooses next, as in `GibbsConfig`; from left to right
-            ("sequential") by default. Other orders let each beam take its own.
+        fill: Which open position a beam chooses next, as in `GibbsConfig`. By default beams go from
+            left to right; in other orders each beam takes a position of its own.
         judge: Which complete beam to return. "sum" takes the least sum of the conditional energies
             of its choices, "energy" the least total energy, for W * T more passes.
         certainty: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
