@@ -11,8 +11,8 @@ from leapjax.running import shell, startup
 
 # In the order in which someone new meets them; what they do is the first line of each.
 PROGRAMS = (
-    "babyai", "atari", "gymnasium", "stars", "sudoku", "properties", "stochastic", "suboptimal",
-    "ablation", "atari_energy", "landscape", "qualitative", "accuracy", "failures",
+    "babyai", "atari", "gymnasium", "stars", "sudoku", "satisfiability", "properties", "stochastic",
+    "suboptimal", "ablation", "atari_energy", "landscape", "qualitative", "accuracy", "failures",
 )  # fmt: skip
 
 

@@ -45,6 +45,10 @@ DOMAINS: dict[str, DomainType | Place] = {
     "sudoku": Place(
         "leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train", "boards with one solution"
     ),
+    "satisfiability": Place(
+        "leapjax.domains.puzzles.satisfiability.domain", "SATISFIABILITY", "train",
+        "formulas: find values that satisfy all clauses",
+    ),
 }  # fmt: skip
 
 

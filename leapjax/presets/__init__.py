@@ -17,7 +17,10 @@ from leapjax.presets import environments
 Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
 # A module of presets is imported when it is first used: it imports its domain.
-MODULES = {name: f"leapjax.presets.{name}" for name in ("babyai", "atari", "stars", "sudoku")}
+MODULES = {
+    name: f"leapjax.presets.{name}"
+    for name in ("babyai", "atari", "stars", "sudoku", "satisfiability")
+}
 PRESETS: dict[str, Mapping[str, Preset]] = {}  # by domain, those of a user's own
 
 
