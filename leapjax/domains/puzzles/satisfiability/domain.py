@@ -55,31 +55,38 @@ class FormulaTokens(Encoder):
     def setup(self) -> None:  # noqa: D102
         # Large names stay nearly orthogonal while attention learns to compare them.
         self.names = nn.Embed(self.count, self.width, embedding_init=nn.initializers.normal(1.0))
-        scale = self.width**-0.5
-        self.member = dense(self.width, use_bias=False, scale=scale, dtype=self.dtype)
-        self.sign = dense(self.width, use_bias=False, scale=scale, dtype=self.dtype)
+        make = functools.partial(
+            dense, self.width, use_bias=False, scale=self.width**-0.5, dtype=self.dtype
+        )
+        self.member, self.sign, self.about, self.toward = make(), make(), make(), make()
         self.value = embed(OPEN + 1, self.width)
         self.kind = embed(2, self.width)
 
     def __call__(self, context: Context) -> jax.Array:
-        """Returns the tokens `[clauses + variables, D]`."""
-        return jnp.concatenate([self._clauses(context), self._variables(context)])
+        """Returns the tokens `[clauses, D]`."""
+        return self._encode(context)[0]
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
         """Encodes the variables that a plan assigns: `[T, D]`."""
         ahead = context.observation.variable + jnp.arange(horizon)
-        return self._variables(context)[jnp.minimum(ahead, self.count - 1)]
+        return self._encode(context)[1][jnp.minimum(ahead, self.count - 1)]
 
-    def _clauses(self, context: Context) -> jax.Array:
-        variables, values = jnp.divmod(context.observation.literals, 2)
-        names = self.names(variables)  # [clauses, 3, D]
-        signed = names * (2 * values - 1)[..., None]
-        kind = self.kind(jnp.zeros(1, jnp.int32))
-        return self.member(names.sum(1)) + self.sign(signed.sum(1)) + kind
-
-    def _variables(self, context: Context) -> jax.Array:
-        names = self.member(self.names(jnp.arange(self.count)))
-        return names + self.value(context.observation.values) + self.kind(jnp.ones(1, jnp.int32))
+    def _encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
+        """Encodes clauses `[clauses, D]`, and variables `[count, D]` with their clauses."""
+        formula = context.observation
+        variables, values = jnp.divmod(formula.literals, 2)
+        holds = jax.nn.one_hot(variables, self.count)  # [clauses, 3, count]
+        signed = (holds * (2 * values - 1)[..., None]).sum(1)
+        holds = holds.sum(1)
+        names = self.names(jnp.arange(self.count))
+        known = self.value(formula.values)
+        clauses = holds @ (self.member(names) + known) + signed @ self.sign(names)
+        clauses = clauses + self.kind(jnp.zeros(1, jnp.int32))
+        seen = nn.gelu(clauses)
+        degree = (1 + holds.sum(0))[:, None]
+        told = holds.T @ self.about(seen) + signed.T @ self.toward(seen)
+        own = self.member(names) + known + told / jnp.sqrt(degree)
+        return clauses, own + self.kind(jnp.ones(1, jnp.int32))
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -128,7 +135,7 @@ def check_formulas(states: Formula, where: str, size: formulas.Size) -> None:
     in_order = np.array_equal(states.variable, np.arange(size.variables + 1))
     if not in_order or states.values[-1].max() == OPEN:
         raise UserError(f"{where} does not assign the {size.variables} variables in order")
-    if formulas.count_violations(states.literals[-1], states.values[-1], size.differ):
+    if formulas.find_violated(states.literals[-1], states.values[-1], size.differ).any():
         raise UserError(f"{where} does not satisfy its formula")
 
 

@@ -109,8 +109,8 @@ def draw(size: Size, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.permuted(literals, axis=1).astype(np.int32), solution
 
 
-def count_violations(literals: Array, values: Array, differ: bool) -> Array:
-    """Counts the clauses that values violate, whatever the open variables become.
+def find_violated(literals: Array, values: Array, differ: bool) -> Array:
+    """Finds the clauses `[clauses]` that values violate, whatever the open variables become.
 
     Args:
         literals: `[clauses, 3]`.
@@ -119,9 +119,7 @@ def count_violations(literals: Array, values: Array, differ: bool) -> Array:
     """
     found, wanted = values[literals // 2], literals % 2
     violated = (found == 1 - wanted).all(axis=-1)
-    if differ:
-        violated = violated | (found == wanted).all(axis=-1)
-    return violated.sum()
+    return violated | (found == wanted).all(axis=-1) if differ else violated
 
 
 class FormulaAdapter:
@@ -149,9 +147,9 @@ class FormulaAdapter:
         values = values.copy()
         values[variable] = action
         self._formula = Formula(literals, values, np.int32(variable + 1))
-        violated = bool(count_violations(literals, values, self.size.differ))
+        violated = bool(find_violated(literals, values, self.size.differ).any())
         success = not violated and variable + 1 == self.size.variables
-        return Transition(self._formula, float(success), success or violated, False, bool(success))
+        return Transition(self._formula, float(success), success or violated, False, success)
 
 
 def repeat_solution(demonstration: Demonstration) -> np.ndarray:
@@ -186,11 +184,13 @@ def rename(key: jax.Array, window: Window) -> Window:
 
     earlier = old.variable + jnp.arange(-window.context.actions.shape[0], 0)
     ahead = old.variable + jnp.arange(window.actions.shape[0])
-    past = jax.vmap(formula)(earlier)
-    past = jax.tree.map(lambda x: jnp.where((earlier >= 0).reshape(-1, *[1] * (x.ndim - 1)), x, 0), past)
+
+    def blank_before(leaf: jax.Array) -> jax.Array:
+        return jnp.where(jnp.expand_dims(earlier >= 0, range(1, leaf.ndim)), leaf, 0)
+
     context = window.context._replace(
         observation=formula(old.variable),
-        past=past,
+        past=jax.tree.map(blank_before, jax.vmap(formula)(earlier)),
         actions=write_plan(earlier, pad_token(end + 1)),
     )
     return window._replace(context=context, actions=write_plan(ahead, end))

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from leapjax.domains.puzzles.satisfiability.formulas import Formula, count_violations
+from leapjax.domains.puzzles.satisfiability.formulas import Formula, find_violated
 from leapjax.types import Context, Energy, Params
 
 
@@ -23,11 +23,11 @@ def rules(differ: bool, weight: float = 4.0) -> Energy:
         del params
         return jax.tree.map(jnp.asarray, context.observation)
 
-    def count(formula: Formula, actions: jax.Array) -> jax.Array:
-        """Counts the clauses that a plan violates; positions after the last variable are free."""
+    def weigh(formula: Formula, actions: jax.Array) -> jax.Array:
+        """Weighs the clauses that a plan violates; positions after the last variable are free."""
         places = formula.variable + jnp.arange(actions.shape[0])
         values = formula.values.at[places].set(actions, mode="drop")
-        return weight * count_violations(formula.literals, values, differ)
+        return weight * find_violated(formula.literals, values, differ).sum()
 
     def conditional(
         params: Params, formula: Formula, actions: jax.Array, positions: jax.Array
@@ -36,13 +36,13 @@ def rules(differ: bool, weight: float = 4.0) -> Energy:
         masked = actions.at[positions].set(mask)
 
         def score(position: jax.Array) -> jax.Array:
-            values = [count(formula, masked.at[position].set(value)) for value in (0, 1)]
+            values = [weigh(formula, masked.at[position].set(value)) for value in (0, 1)]
             return jnp.stack([*values, jnp.inf])
 
         return jax.vmap(score)(positions)
 
     def total(params: Params, formula: Formula, actions: jax.Array) -> jax.Array:
         del params
-        return jnp.where(jnp.any(actions == end), jnp.inf, count(formula, actions))
+        return jnp.where(jnp.any(actions == end), jnp.inf, weigh(formula, actions))
 
     return Energy(encode, conditional, total, end + 1)
