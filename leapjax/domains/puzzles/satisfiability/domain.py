@@ -17,7 +17,7 @@ from leapjax.domains.puzzles.satisfiability.formulas import OPEN, Formula, Formu
 from leapjax.domains.puzzles.satisfiability.rules import rules
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
-from leapjax.models.transformer import dense, embed
+from leapjax.models.transformer import WEIGHT_SCALE, dense, embed
 from leapjax.types import Context
 
 
@@ -37,56 +37,69 @@ class Settings:
 
 
 class FormulaTokens(Encoder):
-    """A token for each clause and for each variable.
+    """A token for each clause, and for each action of a plan the token of its variable.
 
-    A clause's token is a sum over its literals, so their order means nothing. `encode_positions`
-    gives each action of a plan the token of its variable.
+    Each variable has a name, a vector that is part of the tokens of its clauses. Attention then
+    finds the clauses of a variable by comparing names. Name t is that of variable `variable + t`,
+    which action t of a plan assigns; names after the last variable are those of the first.
 
     Attributes:
         count: number of variables.
         width: D, of a token.
+        mixed: whether the token of an action also holds all values of the plan.
         dtype: type of matrix products.
     """
 
     count: int
     width: int
+    mixed: bool = True
     dtype: Dtype = jnp.float32
 
     def setup(self) -> None:  # noqa: D102
-        # Large names stay nearly orthogonal while attention learns to compare them.
-        self.names = nn.Embed(self.count, self.width, embedding_init=nn.initializers.normal(1.0))
-        make = functools.partial(
-            dense, self.width, use_bias=False, scale=self.width**-0.5, dtype=self.dtype
-        )
-        self.member, self.sign, self.about, self.toward = make(), make(), make(), make()
+        # Attention learns to compare names sooner if they are orthogonal.
+        init = nn.initializers.orthogonal(WEIGHT_SCALE * self.width**0.5)
+        self.names = self.param("names", init, (2 * self.count, self.width))
         self.value = embed(OPEN + 1, self.width)
-        self.kind = embed(2, self.width)
+        self.norm = nn.LayerNorm()
+        self.expand = dense(self.width, scale=self.width**-0.5, dtype=self.dtype)
+        self.about = dense(self.width, use_bias=False, dtype=self.dtype)
+        self.toward = dense(self.width, use_bias=False, dtype=self.dtype)
+        self.amount = dense(2, scale=self.width**-0.5 / WEIGHT_SCALE, dtype=self.dtype)
 
     def __call__(self, context: Context) -> jax.Array:
         """Returns the tokens `[clauses, D]`."""
         return self._encode(context)[0]
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """Encodes the variables that a plan assigns: `[T, D]`."""
-        ahead = context.observation.variable + jnp.arange(horizon)
-        return self._encode(context)[1][jnp.minimum(ahead, self.count - 1)]
+        """Encodes the variables that a plan assigns, with their clauses: `[T, D]`."""
+        return self._encode(context)[1][jnp.minimum(jnp.arange(horizon), self.count - 1)]
+
+    def mix_actions(self, tokens: jax.Array) -> jax.Array:
+        """Adds to the token of each action the values of all variables, `[T, D]`.
+
+        A clause holds the same names, so one layer finds the clauses that the plan leaves
+        unsatisfied. Otherwise layers must first learn to collect the values.
+        """
+        if not self.mixed:
+            return tokens
+        amounts = self.amount(tokens)[: self.count]  # [T, 2]
+        member, sign = (names[: len(amounts)] for names in jnp.split(self.names, 2))
+        values = amounts[:, 0] @ member + amounts[:, 1] @ sign
+        return tokens + values / jnp.sqrt(self.count)
 
     def _encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
-        """Encodes clauses `[clauses, D]`, and variables `[count, D]` with their clauses."""
+        """Encodes clauses `[clauses, D]`, and variables `[count, D]` from the next one on."""
         formula = context.observation
         variables, values = jnp.divmod(formula.literals, 2)
-        holds = jax.nn.one_hot(variables, self.count)  # [clauses, 3, count]
-        signed = (holds * (2 * values - 1)[..., None]).sum(1)
-        holds = holds.sum(1)
-        names = self.names(jnp.arange(self.count))
-        known = self.value(formula.values)
-        clauses = holds @ (self.member(names) + known) + signed @ self.sign(names)
-        clauses = clauses + self.kind(jnp.zeros(1, jnp.int32))
-        seen = nn.gelu(clauses)
-        degree = (1 + holds.sum(0))[:, None]
+        places = (variables - formula.variable) % self.count
+        each = jax.nn.one_hot(places, self.count)  # [clauses, 3, count]
+        holds, signed = each.sum(1), (each * (2 * values - 1)[..., None]).sum(1)
+        member, sign = jnp.split(self.names, 2)
+        known = self.value(jnp.roll(formula.values, -formula.variable))
+        clauses = holds @ (member + known) + signed @ sign
+        seen = nn.gelu(self.expand(self.norm(clauses)))
         told = holds.T @ self.about(seen) + signed.T @ self.toward(seen)
-        own = self.member(names) + known + told / jnp.sqrt(degree)
-        return clauses, own + self.kind(jnp.ones(1, jnp.int32))
+        return clauses, member + known + told / jnp.sqrt(1 + holds.sum(0))[:, None]
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -109,7 +122,7 @@ def make(name: str, settings: Settings) -> Domain:
         ),
         encoders={
             "leapjax": lambda model, context: FormulaTokens(
-                size.variables, model.width, model.dtype
+                size.variables, model.width, model.attention == "full", model.dtype
             )
         },
         demonstrations=Demonstrations(
