@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -17,7 +18,7 @@ from leapjax.domains.puzzles.satisfiability.formulas import OPEN, Formula, Formu
 from leapjax.domains.puzzles.satisfiability.rules import rules
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
-from leapjax.models.transformer import WEIGHT_SCALE, dense, embed
+from leapjax.models.transformer import dense, embed
 from leapjax.types import Context
 
 
@@ -36,70 +37,111 @@ class Settings:
         check_types(self)
 
 
-class FormulaTokens(Encoder):
-    """A token for each clause, and for each action of a plan the token of its variable.
+class Messages(nn.Module):
+    """One round of messages from variables to their clauses and back (Selsam et al., 2019).
 
-    Each variable has a name, a vector that is part of the tokens of its clauses. Attention then
-    finds the clauses of a variable by comparing names. Name t is that of variable `variable + t`,
-    which action t of a plan assigns; names after the last variable are those of the first.
+    All variables and all clauses share the weights, so their order means nothing.
+
+    Attributes:
+        width: D.
+        dtype: type of matrix products.
+    """
+
+    width: int
+    dtype: Dtype = jnp.float32
+
+    def setup(self) -> None:  # noqa: D102
+        self.norm = nn.LayerNorm(dtype=self.dtype)
+        scale = self.width**-0.5
+        self.speak = dense(2 * self.width, scale=scale, dtype=self.dtype)
+        self.listen = dense(self.width, scale=scale, dtype=self.dtype)
+
+    def __call__(self, tokens: jax.Array, holds: jax.Array) -> jax.Array:
+        """Returns the tokens of variables `[n, D]` after a round.
+
+        Args:
+            tokens: of variables, `[n, D]`.
+            holds: `[clauses, 2 n]`, 1 where a clause holds a literal.
+        """
+        count = len(tokens)
+        spoken = self.speak(self.norm(tokens)).reshape(2 * count, -1)  # by each literal
+        heard = holds.T @ nn.gelu(holds @ spoken)  # [2 n, D]
+        degree = holds.sum() / (2 * count)
+        return tokens + self.listen((heard / degree).reshape(count, -1))
+
+
+class Relations(NamedTuple):
+    """What the messages in a plan need to know of a formula.
+
+    Attributes:
+        holds: `[clauses, 2 n]`, see `Messages`.
+        tokens: of variables, `[n, D]`, without a plan.
+    """
+
+    holds: jax.Array
+    tokens: jax.Array
+
+
+class FormulaTokens(Encoder):
+    """A token for each variable, from the next one on, which knows its clauses by messages.
+
+    A plan's actions exchange messages too.
 
     Attributes:
         count: number of variables.
         width: D, of a token.
-        mixed: whether the token of an action also holds all values of the plan.
+        rounds: of messages, before a plan is known and in each pass.
+        mixed: whether the actions of a plan exchange messages.
         dtype: type of matrix products.
     """
 
     count: int
     width: int
+    rounds: int
     mixed: bool = True
     dtype: Dtype = jnp.float32
 
     def setup(self) -> None:  # noqa: D102
-        # Attention learns to compare names sooner if they are orthogonal.
-        init = nn.initializers.orthogonal(WEIGHT_SCALE * self.width**0.5)
-        self.names = self.param("names", init, (2 * self.count, self.width))
         self.value = embed(OPEN + 1, self.width)
-        self.norm = nn.LayerNorm()
-        self.expand = dense(self.width, scale=self.width**-0.5, dtype=self.dtype)
-        self.about = dense(self.width, use_bias=False, dtype=self.dtype)
-        self.toward = dense(self.width, use_bias=False, dtype=self.dtype)
-        self.amount = dense(2, scale=self.width**-0.5 / WEIGHT_SCALE, dtype=self.dtype)
+        self.next = embed(2, self.width)
+        self.before = [Messages(self.width, self.dtype) for _ in range(self.rounds)]
+        self.within = [Messages(self.width, self.dtype) for _ in range(self.rounds)]
 
     def __call__(self, context: Context) -> jax.Array:
-        """Returns the tokens `[clauses, D]`."""
-        return self._encode(context)[0]
+        """Returns the tokens `[n, D]`."""
+        return self._relate(context).tokens
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """Encodes the variables that a plan assigns, with their clauses: `[T, D]`."""
-        return self._encode(context)[1][jnp.minimum(jnp.arange(horizon), self.count - 1)]
+        """Encodes the variables that a plan assigns: `[T, D]`."""
+        return self._relate(context).tokens[jnp.minimum(jnp.arange(horizon), self.count - 1)]
 
-    def mix_actions(self, tokens: jax.Array) -> jax.Array:
-        """Adds to the token of each action the values of all variables, `[T, D]`.
+    def relate_positions(self, context: Context, horizon: int) -> Relations:
+        """Returns which variables share a clause."""
+        del horizon
+        return self._relate(context)
 
-        A clause holds the same names, so one layer finds the clauses that the plan leaves
-        unsatisfied. Otherwise layers must first learn to collect the values.
-        """
+    def exchange_messages(self, tokens: jax.Array, relations: Relations) -> jax.Array:
+        """Returns the tokens `[T, D]` after messages between variables that share a clause."""
         if not self.mixed:
             return tokens
-        amounts = self.amount(tokens)[: self.count]  # [T, 2]
-        member, sign = (names[: len(amounts)] for names in jnp.split(self.names, 2))
-        values = amounts[:, 0] @ member + amounts[:, 1] @ sign
-        return tokens + values / jnp.sqrt(self.count)
+        # Variables that the plan does not reach send what is known without it.
+        inside = min(len(tokens), self.count)
+        whole = jnp.concatenate([tokens[:inside], relations.tokens[inside:]])
+        for messages in self.within:
+            whole = messages(whole, relations.holds)
+        return jnp.concatenate([whole[:inside], tokens[inside:]])
 
-    def _encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
-        """Encodes clauses `[clauses, D]`, and variables `[count, D]` from the next one on."""
+    def _relate(self, context: Context) -> Relations:
         formula = context.observation
-        variables, values = jnp.divmod(formula.literals, 2)
-        places = (variables - formula.variable) % self.count
-        each = jax.nn.one_hot(places, self.count)  # [clauses, 3, count]
-        holds, signed = each.sum(1), (each * (2 * values - 1)[..., None]).sum(1)
-        member, sign = jnp.split(self.names, 2)
-        known = self.value(jnp.roll(formula.values, -formula.variable))
-        clauses = holds @ (member + known) + signed @ sign
-        seen = nn.gelu(self.expand(self.norm(clauses)))
-        told = holds.T @ self.about(seen) + signed.T @ self.toward(seen)
-        return clauses, member + known + told / jnp.sqrt(1 + holds.sum(0))[:, None]
+        # Variables are counted from the next one on, as positions of a plan are.
+        literals = (formula.literals - 2 * formula.variable) % (2 * self.count)
+        holds = jax.nn.one_hot(literals, 2 * self.count).sum(1)
+        first = jnp.arange(self.count) == 0
+        values = jnp.roll(formula.values, -formula.variable)
+        tokens = self.value(values) + self.next(first.astype(jnp.int32))
+        for messages in self.before:
+            tokens = messages(tokens, holds)
+        return Relations(holds, tokens)
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -122,7 +164,7 @@ def make(name: str, settings: Settings) -> Domain:
         ),
         encoders={
             "leapjax": lambda model, context: FormulaTokens(
-                size.variables, model.width, model.attention == "full", model.dtype
+                size.variables, model.width, 2, model.attention == "full", model.dtype
             )
         },
         demonstrations=Demonstrations(
