@@ -216,32 +216,66 @@ def test_the_energy_of_the_rules_weighs_violated_clauses(size, known, horizon):
         assert row[0] == row[1] < row[2] == np.inf  # after the last variable any value will do
 
 
-@pytest.mark.parametrize("size", [SAT], ids=["Sat6x20"])
-def test_the_order_of_clauses_and_literals_means_nothing_to_the_network_but_signs_do(size):
-    config = find_preset("satisfiability", NAMES[size], "leap", "leapjax")
-    model = ModelConfig(layers=2, heads=2, width=16, dropout=0.0)
-    domain = make(NAMES[size], Settings())
-    setup = Setup(domain, 0, size.variables, model, config.training, config.method_settings)
-    agent = find_method("leap").make_agent(setup, None)
-    params, (formula, _) = random_parameters(agent), start(size, 0, known=2)
-    plan = np.array([0, MASK, 1, MASK, END, END])
+def make_agent(**model):
+    config = find_preset("satisfiability", "Sat6x20", "leap", "leapjax")
+    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0, **model)
+    domain = make("Sat6x20", Settings(rounds=1))
+    setup = Setup(domain, 0, SAT.variables, model, config.training, config.method_settings)
+    return find_method("leap").make_agent(setup, None)
+
+
+def test_the_network_sees_a_formula_and_no_order_of_clauses_literals_or_variables():
+    agent, (formula, _) = make_agent(), start(SAT, 0)
+    params, plan = random_parameters(agent), np.array([0, MASK, 1, MASK, 1, 0])
 
     @jax.jit
-    def energies(formula):
-        memory = agent.energy.encode(params, at(size, formula))
-        return agent.energy.conditional(params, memory, plan, np.arange(4))
+    def energies(literals, plan):
+        memory = agent.energy.encode(params, at(SAT, formula._replace(literals=literals)))
+        # One position at a time: those asked for together are masked together.
+        ask = functools.partial(agent.energy.conditional, params, memory, plan)
+        return jax.vmap(lambda position: ask(position[None])[0, :2])(np.arange(6))
 
-    found = energies(formula)
-    for same in (formula.literals[::-1], formula.literals[:, [1, 2, 0]]):
-        again = energies(formula._replace(literals=same))
-        np.testing.assert_allclose(again, found, rtol=1e-4, atol=1e-4)
-    for other in (
-        formula._replace(literals=formula.literals ^ (np.arange(3) == 0)),
-        formula._replace(literals=(formula.literals + 2) % (2 * size.variables)),
-        formula._replace(values=np.where(formula.values < OPEN, 1 - formula.values, OPEN)),
-        start(size, 0, known=1)[0]._replace(values=formula.values),  # positions are variables
+    def ask(literals, plan=plan):
+        return np.asarray(energies(literals, plan))
+
+    literals = formula.literals
+    found = ask(literals)
+    same = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
+    same(ask(literals[::-1]), found)
+    same(ask(literals[:, [1, 2, 0]]), found)
+    places = np.array([0, 3, 1, 5, 2, 4])  # the first is marked: methods of one action assign it
+    moved = np.empty_like(plan)
+    moved[places] = plan
+    same(ask(2 * places[literals // 2] + literals % 2, moved)[places], found)
+    flipped = literals ^ (np.arange(3) == 0)
+    for other in (ask(flipped), ask(literals, np.where(plan < 2, 1 - plan, plan))):
+        assert np.abs(other - found).max() > 1e-3
+
+
+def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
+    """What a plan of all variables says of the rest, if its first values are those known."""
+    agent = make_agent()
+    params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0, known=2)
+    encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)))
+    rolled = formula._replace(
+        literals=(formula.literals - 4) % 12, values=np.roll(formula.values, -2), variable=0
+    )
+    for later, first in zip(
+        jax.tree.leaves(encode(formula)), jax.tree.leaves(encode(rolled)), strict=True
     ):
-        assert np.abs(energies(other) - found)[:, :2].max() > 1e-3
+        np.testing.assert_allclose(later, first, rtol=1e-5, atol=1e-6)
+    other = formula._replace(values=np.where(formula.values < 2, 1 - formula.values, OPEN))
+    assert np.abs(encode(other).places - encode(formula).places).max() > 0.01
+
+
+def test_no_action_sees_a_later_one_where_attention_is_causal():
+    agent = make_agent(attention="causal")
+    params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0)
+    memory = agent.energy.encode(params, at(SAT, formula))
+    conditional = jax.jit(agent.energy.conditional)
+    plans = [np.array([0, MASK, 1, value, 1, 0]) for value in (0, 1)]
+    found = [conditional(params, memory, plan, np.array([1])) for plan in plans]
+    np.testing.assert_array_equal(*found)
 
 
 @SIZES

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.typing import Dtype
 
-from leapjax.checks import check_range, check_types
+from leapjax.checks import check_at_least, check_range, check_types
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
 from leapjax.domains.puzzles.satisfiability import formulas
@@ -24,17 +24,21 @@ from leapjax.types import Context
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Satisfiability: augmentation.
+    """Satisfiability: augmentation, and the encoder.
 
     Attributes:
         augment: Permute and negate the variables of every training window, which makes it a window
             of another formula.
+        rounds: Rounds of messages between variables and clauses, before a plan is known and again
+            in each pass.
     """
 
     augment: bool = True
+    rounds: int = 2
 
     def __post_init__(self) -> None:
         check_types(self)
+        check_at_least(self, 0, "rounds", most=100)
 
 
 class Messages(nn.Module):
@@ -103,13 +107,13 @@ class FormulaTokens(Encoder):
 
     def setup(self) -> None:  # noqa: D102
         self.value = embed(OPEN + 1, self.width)
-        self.next = embed(2, self.width)
+        self.next = embed(1, self.width)
         self.before = [Messages(self.width, self.dtype) for _ in range(self.rounds)]
         self.within = [Messages(self.width, self.dtype) for _ in range(self.rounds)]
 
     def __call__(self, context: Context) -> jax.Array:
-        """Returns the tokens `[n, D]`."""
-        return self._relate(context).tokens
+        """Returns the tokens `[n, D]`; the first is marked."""
+        return self._relate(context).tokens.at[:1].add(self.next(jnp.zeros(1, jnp.int32)))
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
         """Encodes the variables that a plan assigns: `[T, D]`."""
@@ -136,9 +140,7 @@ class FormulaTokens(Encoder):
         # Variables are counted from the next one on, as positions of a plan are.
         literals = (formula.literals - 2 * formula.variable) % (2 * self.count)
         holds = jax.nn.one_hot(literals, 2 * self.count).sum(1)
-        first = jnp.arange(self.count) == 0
-        values = jnp.roll(formula.values, -formula.variable)
-        tokens = self.value(values) + self.next(first.astype(jnp.int32))
+        tokens = self.value(jnp.roll(formula.values, -formula.variable))
         for messages in self.before:
             tokens = messages(tokens, holds)
         return Relations(holds, tokens)
@@ -164,7 +166,7 @@ def make(name: str, settings: Settings) -> Domain:
         ),
         encoders={
             "leapjax": lambda model, context: FormulaTokens(
-                size.variables, model.width, 2, model.attention == "full", model.dtype
+                size.variables, model.width, settings.rounds, model.attention == "full", model.dtype
             )
         },
         demonstrations=Demonstrations(
