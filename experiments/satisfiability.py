@@ -1,8 +1,7 @@
 """Satisfiability: `python -m experiments.satisfiability --help`.
 
-Trains a method to satisfy formulas that it has never seen, then plans with what was trained in
-every way that there is, and reports success against the passes of the model that each takes.
-Prints beside it what two classical solvers do with the same formulas.
+Trains a method to satisfy unseen formulas, then plans with the trained energy in every way. Reports
+success against passes of the model, beside two classical solvers on the same formulas.
 """
 
 import sys

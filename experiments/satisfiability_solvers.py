@@ -18,7 +18,7 @@ class Solved(NamedTuple):
     """The result of a solver.
 
     Attributes:
-        values: `[variables]`, or None if the solver found no solution.
+        values: `[variables]`; `None` if the solver found no solution.
         steps: flips of WalkSAT, or assumptions of DPLL.
     """
 

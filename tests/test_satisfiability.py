@@ -1,4 +1,4 @@
-"""Satisfiability: what enumeration finds is what is drawn, played, turned, weighed and solved."""
+"""Satisfiability: formulas, episodes, rules and solvers agree with enumeration."""
 
 import functools
 import itertools
@@ -253,7 +253,7 @@ def test_the_network_sees_a_formula_and_no_order_of_clauses_literals_or_variable
 
 
 def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
-    """What a plan of all variables says of the rest, if its first values are those known."""
+    """Its memory equals that of a formula whose variables are counted from there on."""
     agent = make_agent()
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0, known=2)
     encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)))
@@ -306,7 +306,7 @@ def test_a_walk_does_not_start_at_the_solution_that_a_formula_was_drawn_for():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("Sat20", "unknown level 'Sat20': expected Sat or Nae<variables>x<clauses>"),
+        ("Sat20", "unknown level 'Sat20': expected Sat<variables>x<clauses> or"),
         ("sat20x91", "did you mean Sat20x91"),
         ("Sat2x3", r"level Sat2x3: variables must be in 3 .. 100, got 2"),
         ("Nae4x25", "level Nae4x25: at most 24 clauses exist, got 25"),

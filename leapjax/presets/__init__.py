@@ -1,7 +1,7 @@
 """Presets: for each domain one module, with the configuration of every level and method.
 
-`paper` is the paper's network and training, `leapjax` is ours. A number of a preset stands in one
-place, with its reason; what a preset does not set is the default of the dataclass that has it.
+`paper` is the paper's network and training, `leapjax` is ours. Each number of a preset stands in
+one place, with its reason. Fields that a preset does not set keep the defaults of their dataclass.
 """
 
 import functools
@@ -21,11 +21,11 @@ MODULES = {
     name: f"leapjax.presets.{name}"
     for name in ("babyai", "atari", "stars", "sudoku", "satisfiability")
 }
-PRESETS: dict[str, Mapping[str, Preset]] = {}  # by domain, those of a user's own
+PRESETS: dict[str, Mapping[str, Preset]] = {}  # presets of a user's own domains, by domain
 
 
 def find_presets(domain: str) -> Mapping[str, Preset]:
-    """Returns the presets of a domain by name; one without its own has those of any environment.
+    """Returns the presets of a domain by name; `environments` serves domains without their own.
 
     Raises:
         UserError: there is no such domain, or it needs an extra that is not installed.

@@ -44,7 +44,7 @@ class Settings:
 class Messages(nn.Module):
     """One round of messages from variables to their clauses and back (Selsam et al., 2019).
 
-    All variables and all clauses share the weights, so their order means nothing.
+    All variables share the weights, and so do all clauses: the network sees no order of them.
 
     Attributes:
         width: D.
@@ -128,7 +128,7 @@ class FormulaTokens(Encoder):
         """Returns the tokens `[T, D]` after messages between variables that share a clause."""
         if not self.mixed:
             return tokens
-        # Variables that the plan does not reach send what is known without it.
+        # Variables after the plan's end take part as they are before the plan.
         inside = min(len(tokens), self.count)
         whole = jnp.concatenate([tokens[:inside], relations.tokens[inside:]])
         for messages in self.within:

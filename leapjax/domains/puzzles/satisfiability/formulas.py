@@ -6,9 +6,9 @@ an episode is the value of variable t. Two kinds of level exist:
     Sat20x91   each of the 91 clauses holds a true literal
     Nae20x42   each of the 42 clauses holds a true and a false literal (not all equal)
 
-The clause counts lie where random formulas turn from satisfiable to unsatisfiable, because
-formulas there are the hardest to solve: 4.26 clauses a variable, more among few variables
-(SATLIB's uf20-91), and about 2.1 with not-all-equal clauses (Achlioptas et al., 2001).
+Formulas are hardest to solve where half of all random formulas have a solution. Of 20 variables
+that takes about 91 clauses, as in SATLIB's uf20-91. Not-all-equal clauses forbid two patterns
+instead of one, so about 42 are enough: 2.1 a variable (Achlioptas et al., 2001).
 """
 
 import functools
@@ -72,8 +72,10 @@ def find_level(name: str) -> Size:
     Raises:
         UserError: the level does not exist.
     """
-    pattern, expected = r"(?:Sat|Nae)([1-9]\d{0,2})x([1-9]\d{0,5})", "Sat or Nae<variables>x<clauses>"
-    size = Size(*read_numbers(name, pattern, expected, LEVELS), differ=name.startswith("Nae"))
+    pattern = r"(?:Sat|Nae)([1-9]\d{0,2})x([1-9]\d{0,5})"
+    expected = "Sat<variables>x<clauses> or Nae<variables>x<clauses>"
+    variables, clauses = read_numbers(name, pattern, expected, LEVELS)
+    size = Size(variables, clauses, differ=name.startswith("Nae"))
     if not LITERALS <= size.variables <= MOST_VARIABLES:
         raise UserError(
             f"level {name}: variables must be in {LITERALS} .. {MOST_VARIABLES}, "
@@ -131,14 +133,12 @@ class FormulaAdapter:
     def __init__(self, size: Size) -> None:
         self.size = size
         self.num_actions = 3
-        self.solution = np.zeros(size.variables, np.int32)  # one of the current formula's
+        self.solution = np.zeros(size.variables, np.int32)  # of the current formula
 
     def reset(self, seed: int) -> Formula:
         """Draws the formula of a seed."""
         literals, self.solution = draw(self.size, seed)
-        self._formula = Formula(
-            literals, np.full(self.size.variables, OPEN, np.int32), np.int32(0)
-        )
+        self._formula = Formula(literals, np.full(self.size.variables, OPEN, np.int32), np.int32(0))
         return self._formula
 
     def step(self, action: int) -> Transition:
