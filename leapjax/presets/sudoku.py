@@ -26,9 +26,9 @@ def leapjax(name: str, method: str) -> AnyConfig:
 
 def _puzzle(name: str) -> Puzzle:
     """Boards of 9 by 9 cells train for twelve minutes on one core."""
-    size = boards.find_level(name)
-    small = size.side == 4
+    level = boards.find_level(name)
+    small = level.side == 4
     training = {
         "steps": 2000 if small else 1500, "batch": 64 if small else 32, "learning_rate": 1e-3,
     }  # fmt: skip
-    return Puzzle("sudoku", name, size.cells, 500 if small else 2000, Settings(), training)
+    return Puzzle("sudoku", name, level.cells, 500 if small else 2000, Settings(), training)

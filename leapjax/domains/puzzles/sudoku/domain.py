@@ -78,28 +78,28 @@ class BoardTokens(Encoder):
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """Makes a level by name, such as Sudoku9x36.
+    """Makes a level by name, such as Sudoku9x36 or Sudoku9x31-42.
 
     Raises:
         UserError: there is no such level.
     """
-    size = boards.find_level(name)
-    make_adapter = functools.partial(SudokuAdapter, size)
-    turn = functools.partial(boards.transform, side=size.side)
+    level = boards.find_level(name)
+    make_adapter = functools.partial(SudokuAdapter, level)
+    turn = functools.partial(boards.transform, side=level.side)
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
-        max_steps=size.cells,
-        blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
-        encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
+        actions=(*(str(1 + digit) for digit in range(level.side)), "end"),
+        max_steps=level.cells,
+        blank=Board(np.zeros(level.cells, np.int32), np.zeros((), np.int32)),
+        encoders={"leapjax": lambda model, context: BoardTokens(level.side, model.width)},
         demonstrations=Demonstrations(
             functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
-            check=functools.partial(check_boards, side=size.side),
+            check=functools.partial(check_boards, side=level.side),
         ),
         augmentations=Augmentations([turn] if settings.augment else [], boards.make_puzzles),
-        rules=rules(size.side),
-        signature={"side": size.side, "clues": size.clues},
+        rules=rules(level.side),
+        signature={"side": level.side},  # any number of clues
     )
 
 
