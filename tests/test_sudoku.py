@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import itertools
+import os
 import time
 
 import jax
@@ -12,8 +13,10 @@ import pytest
 
 from experiments import babyai, sudoku
 from experiments.common import searches
+from leapjax import files
 from leapjax.batching import compile_planner
-from leapjax.data import windows
+from leapjax.configuration import hash_config, list_settings, make_domain, specify
+from leapjax.data import seeds, windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Level, SudokuAdapter
@@ -22,7 +25,9 @@ from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
+from leapjax.pretrained import describe_identity
 from leapjax.running import results
+from leapjax.running.command_line import parse
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long
@@ -108,7 +113,7 @@ def test_levels_that_cannot_be_drawn_are_refused(name, message):
         boards.find_level(name)
 
 
-def parse(line):
+def read_digits(line):
     return np.array([int(digit) for digit in line.replace(".", "0")])
 
 
@@ -121,7 +126,7 @@ BRUTE_FORCE = "..............3.85..1.2.......5.7.....4...1...9.......5......73..
 @pytest.mark.parametrize(("line", "count"), [(SEVENTEEN, 1), (UNSOLVABLE, 0), (BRUTE_FORCE, 1)])
 def test_sparse_and_unsolvable_boards_take_no_time(line, count):
     begun = time.process_time()
-    found = boards.find_solutions(parse(line))
+    found = boards.find_solutions(read_digits(line))
     assert time.process_time() - begun < 5 and len(found) == count
     assert all(solved(solution, 9) for solution in found)
 
@@ -142,16 +147,16 @@ def test_arrays_that_are_no_boards_are_refused(board, message):
 
 
 def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
-    adapter = SudokuAdapter(SMALL)
+    adapter = SudokuAdapter(4, functools.partial(boards.draw, SMALL))
     first = adapter.reset(1)
     assert (first.digits > 0).sum() == SMALL.fewest and first.cell == 0
     solution = adapter.solution
-    steps = [adapter.step(int(digit) - 1) for digit in solution]
+    steps = [adapter.step(int(action)) for action in solution]
     assert [step.terminated for step in steps] == [False] * 15 + [True]
     assert [step.reward for step in steps] == [0.0] * 15 + [1.0] and steps[-1].success
-    np.testing.assert_array_equal(steps[-1].observation.digits, solution)
+    np.testing.assert_array_equal(steps[-1].observation.digits, solution + 1)
     adapter.reset(1)
-    step = adapter.step(int(solution[0]) % 4)
+    step = adapter.step(int(solution[0] + 1) % 4)
     assert step.terminated and not step.success
     np.testing.assert_array_equal(step.observation.digits, first.digits)
 
@@ -281,6 +286,91 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     assert share(both, ((), ()), certain) == share(energy, (), certain)
 
 
+def write_boards(folder, *lines):
+    path = folder / "hard.txt"
+    path.write_text("# from a magazine\n\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def make_lines(count):
+    """Boards of 4 by 4 cells, as lines of text."""
+    return ["".join(map(str, boards.draw(SMALL, seed)[0])) for seed in range(count)]
+
+
+def test_held_out_episodes_play_the_boards_of_a_file_in_order(tmp_path):
+    lines = make_lines(3)
+    path = write_boards(tmp_path, lines[0], "", lines[1].replace("0", "."), f" {lines[2]} # hard")
+    domain = make("Sudoku4x8-10", Settings(boards=path))
+    adapter, first = domain.make_adapter(), seeds.UNSEEN
+    domain.held_out.check(range(first, first + 3))
+    for seed in range(3):
+        clues, solution = boards.draw(SMALL, seed)
+        np.testing.assert_array_equal(adapter.reset(first + seed).digits, clues)
+        np.testing.assert_array_equal(adapter.solution, solution - 1)
+    drawn = domain.demonstrations.collect(5, 0, lambda done: None).demonstrations
+    counts = [(demonstration.observations.digits[0] > 0).sum() for demonstration in drawn]
+    assert min(counts) >= 8  # training draws the level's boards
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1" * 15, "line 4: 15 characters, expected 16: the cells of a 4 by 4 board"),
+        ("5" + "0" * 15, "line 4: '5' is no cell of a board: expected 1 to 4, or 0 or . if open"),
+        ("11" + "0" * 14, "line 4: the board has no solution, expected exactly one; correct"),
+        ("." * 16, "line 4: the board has several solutions, expected exactly one; correct the"),
+    ],
+)
+def test_a_wrong_line_of_a_file_is_named(line, message, tmp_path, capsys):
+    path = write_boards(tmp_path, *make_lines(1), line)
+    options = f"--level Sudoku4x6 --boards {path} --episodes".split()
+    assert sudoku.main([*options, "2"]) == 2
+    error = capsys.readouterr().err
+    assert f"hard.txt, {message}" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--episodes", "4"],
+            "boards for 3 of the 4 episodes: play at most 3",
+        ),
+        (["--test-seed", "10000002", "--episodes", "2"], "has boards for 1 of the 2 episodes"),
+        (["--test-seed", "0", "--episodes", "2"], "has no level of seed 0 (--test-seed"),
+        (
+            ["--validation", "--episodes", "2"],
+            "test levels of the seeds from 10000000 on",
+        ),
+        (["--boards", "missing.txt"], "cannot read missing.txt"),
+        (["--boards", os.devnull], "cannot read /dev/null: not a file"),
+    ],
+)
+def test_episodes_that_a_file_does_not_have_are_refused(options, message, tmp_path, capsys):
+    path = write_boards(tmp_path, *make_lines(3))
+    assert sudoku.main(["--level", "Sudoku4x6", "--boards", str(path), *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_row_is_named_by_the_contents_of_a_file_and_a_network_is_not(tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    for folder, count in zip(folders, (3, 3, 2), strict=True):
+        folder.mkdir()
+        write_boards(folder, *make_lines(count))
+    options = "--level Sudoku4x6 --episodes 2".split()
+    plain, *configs = (
+        parse("sudoku", [*options, *each])[0]
+        for each in ([], *(["--boards", str(folder / "hard.txt")] for folder in folders))
+    )
+    names = [hash_config(config, 0) for config in (plain, *configs)]
+    assert names[1] == names[2] and len(set(names)) == 3
+    said = list_settings(configs[0], 0)["domain_settings"]["boards"]
+    assert said == make_domain(configs[0]).held_out.name and said.startswith("hard.txt ")
+    specified = [specify(config, 0, make_domain(config)) for config in (plain, *configs)]
+    assert len(set(map(describe_identity, specified))) == 1
+
+
 def test_data_that_solve_no_board_are_refused():
     source = make("Sudoku4x6", Settings()).demonstrations
     states = source.collect(1, 0, lambda done: None).demonstrations[0].observations
@@ -306,11 +396,15 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     (folder,) = (tmp_path / "runs").glob("sudoku-*")
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     assert sudoku.main([*toy, "--method", "rules"]) == 0
+    path = write_boards(tmp_path, *make_lines(2))
+    again = [*toy, "--checkpoint", str(folder), "--boards", str(path), "--episodes"]
+    assert sudoku.main([*again, "2", "--level", "Sudoku4x8"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
     found = [(row["method"], results.name_planner(row)) for row in rows]
     assert found == [
         ("leap", "N = 16, confident"), ("leap", "N = 1"), ("leap", "N = 16, confident, rules 1.0"),
         ("rules", "N = 16, confident"), ("rules", "N = 1"),
+        ("leap", f"N = 16, confident, on {files.describe(path)}"),
     ]  # fmt: skip
     # Eight clues leave little open. What two steps have learned is next to nothing.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from leapjax.checks import check_range, check_seed
 from leapjax.domains.puzzles.names import read_numbers
-from leapjax.environments import Transition
+from leapjax.domains.puzzles.playing import PuzzleAdapter
 from leapjax.errors import UserError
 from leapjax.types import Array, Demonstration, Window, pad_token
 
@@ -250,10 +250,7 @@ def draw(level: Level, seed: int) -> tuple[np.ndarray, np.ndarray]:
     if level.fewest < level.most:
         counts = np.random.default_rng([seed, 1])  # another stream than the board's
         clues = int(counts.integers(level.fewest, level.most, endpoint=True))
-    boards = _draw_board(level.side, clues, np.random.default_rng(seed))
-    for board in boards:
-        board.setflags(write=False)
-    return boards
+    return _freeze(*_draw_board(level.side, clues, np.random.default_rng(seed)))
 
 
 def _draw_board(side: int, clues: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -282,32 +279,67 @@ def _draw_board(side: int, clues: int, rng: np.random.Generator) -> tuple[np.nda
             return board, solution
 
 
-class SudokuAdapter:
+@functools.lru_cache(maxsize=10_000)
+def read_board(text: str, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the clues and the only solution of a board; 0 or a dot stands for an open cell.
+
+    Raises:
+        UserError: the text has other characters or another length, or the board has no solution or
+            several.
+    """
+    digits = "".join(map(str, range(1, side + 1)))
+    wrong = next((character for character in text if character not in f".0{digits}"), None)
+    if wrong is not None:
+        raise UserError(f"{wrong!r} is no cell of a board: expected 1 to {side}, or 0 or . if open")
+    if len(text) != side**2:
+        raise UserError(
+            f"{len(text)} characters, expected {side**2}: the cells of a {side} by {side} board, "
+            "row by row"
+        )
+    clues = np.array(list(text.replace(".", "0")), np.int32)
+    solutions = find_solutions(clues)
+    if len(solutions) != 1:
+        count = "no solution" if not solutions else "several solutions"
+        raise UserError(f"the board has {count}, expected exactly one")
+    return _freeze(clues, solutions[0])
+
+
+def _freeze(clues: np.ndarray, solution: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Makes two arrays read-only, as a cache shares them."""
+    for board in (clues, solution):
+        board.setflags(write=False)
+    return clues, solution
+
+
+class SudokuAdapter(PuzzleAdapter[Board]):
     """A board as the rollout sees it: actions are digits, less one, for one cell after the other.
 
     A digit that is not the solution's ends the episode; the last one ends it with success.
+
+    Args:
+        side: of the board.
+        draw_board: (level seed) -> clues and solution.
     """
 
-    def __init__(self, level: Level) -> None:
-        self.level = level
-        self.num_actions = level.side + 1
-        self.solution = np.zeros(level.cells, np.int32)  # of the current board
+    def __init__(
+        self, side: int, draw_board: Callable[[int], tuple[np.ndarray, np.ndarray]]
+    ) -> None:
+        self.num_actions = side + 1
+        self._draw_board = draw_board
 
-    def reset(self, seed: int) -> Board:
+    def draw(self, seed: int) -> tuple[Board, np.ndarray]:
         """Draws the board of a seed."""
-        clues, self.solution = draw(self.level, seed)
-        self._board = Board(clues, np.int32(0))
-        return self._board
+        clues, solution = self._draw_board(seed)
+        return Board(clues, np.int32(0)), solution - 1
 
-    def step(self, action: int) -> Transition:
-        """Writes a digit."""
-        cell, right = int(self._board.cell), bool(self.solution[self._board.cell] == action + 1)
-        if right:
-            digits = self._board.digits.copy()
-            digits[cell] = action + 1
-            self._board = Board(digits, np.int32(cell + 1))
-        success = right and cell + 1 == self.level.cells
-        return Transition(self._board, float(success), success or not right, False, success)
+    def move(self, board: Board, action: int) -> tuple[Board, bool | None]:
+        """Writes a digit if it is right."""
+        if action != self.solution[board.cell]:
+            return board, False
+        digits = board.digits.copy()
+        digits[board.cell] = action + 1
+        after = Board(digits, np.int32(board.cell + 1))
+        return after, True if after.cell == len(digits) else None
 
 
 class Puzzle(NamedTuple):
