@@ -45,6 +45,10 @@ DOMAINS: dict[str, DomainType | Place] = {
     "sudoku": Place(
         "leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train", "boards with one solution"
     ),
+    "countdown": Place(
+        "leapjax.domains.puzzles.countdown.domain", "COUNTDOWN", "train",
+        "reach a number with four operations on given numbers",
+    ),
 }  # fmt: skip
 
 

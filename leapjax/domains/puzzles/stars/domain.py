@@ -11,7 +11,7 @@ from flax.typing import Dtype
 
 from leapjax.checks import check_range, check_types
 from leapjax.domain import Augmentation, Augmentations, Domain, DomainType
-from leapjax.domains.puzzles.playing import demonstrate
+from leapjax.domains.puzzles.common import demonstrate
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
 from leapjax.errors import UserError

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
+from leapjax.domains.puzzles.common import PuzzleAdapter
 from leapjax.domains.puzzles.names import read_numbers
-from leapjax.domains.puzzles.playing import PuzzleAdapter
 from leapjax.errors import UserError
 from leapjax.types import Array, Window
 

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_range, check_seed
+from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
 from leapjax.domains.puzzles.names import read_numbers
-from leapjax.domains.puzzles.playing import PuzzleAdapter
 from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, Window, pad_token
+from leapjax.types import Array, Demonstration, Window
 
 LEVELS = ("Sudoku4x6", "Sudoku9x36")
 FEWEST_CLUES = {4: 4, 9: 22}  # it takes ten seconds to draw a board with 21
@@ -356,9 +356,8 @@ class Puzzle(NamedTuple):
 
 def make_puzzles(demonstration: Demonstration) -> Puzzle:
     """Makes the puzzle of every step: arrays `[n, cells]`."""
-    digits = demonstration.observations.digits
-    repeated = [np.broadcast_to(board, digits[1:].shape) for board in (digits[0], digits[-1])]
-    return Puzzle(*(board.astype(np.int8) for board in repeated))
+    digits = demonstration.observations.digits.astype(np.int8)
+    return repeat(Puzzle(digits[0], digits[-1]), demonstration)
 
 
 def transform(key: jax.Array, window: Window, side: int) -> Window:
@@ -375,26 +374,11 @@ def transform(key: jax.Array, window: Window, side: int) -> Window:
     clues, solution = (
         names[board[places].astype(jnp.int32)].astype(jnp.int32) for board in window.extras
     )
-    cells, end = side**2, side
-    cell = window.context.observation.cell
 
-    def board(cell: jax.Array) -> Board:
-        digits = jnp.where(jnp.arange(cells) < cell, solution, clues)
-        return Board(jnp.where(cell < 0, 0, digits), jnp.maximum(cell, 0))
+    def observe(cell: jax.Array) -> Board:
+        return Board(jnp.where(jnp.arange(side**2) < cell, solution, clues), cell)
 
-    earlier = cell + jnp.arange(-window.context.actions.shape[0], 0)
-    ahead = cell + jnp.arange(window.actions.shape[0])
-
-    def write_plan(at: jax.Array, otherwise: int) -> jax.Array:
-        inside = (at >= 0) & (at < cells)
-        return jnp.where(inside, solution[jnp.clip(at, 0, cells - 1)] - 1, otherwise)
-
-    context = window.context._replace(
-        observation=board(cell),
-        past=jax.vmap(board)(earlier),
-        actions=write_plan(earlier, pad_token(side + 1)),
-    )
-    return window._replace(context=context, actions=write_plan(ahead, end))
+    return rewrite(window, window.context.observation.cell, solution - 1, observe, end=side)
 
 
 def _keep_boxes(key: jax.Array, side: int) -> jax.Array:

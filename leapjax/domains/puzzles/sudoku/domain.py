@@ -10,7 +10,7 @@ import numpy as np
 
 from leapjax.checks import check_range, check_types
 from leapjax.domain import Augmentations, Domain, DomainType
-from leapjax.domains.puzzles.playing import PuzzleFile, demonstrate
+from leapjax.domains.puzzles.common import PuzzleFile, demonstrate
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.rules import rules

@@ -1,4 +1,4 @@
-"""What puzzles share: an adapter, its demonstrations, and files of puzzles to play."""
+"""What puzzles share: an adapter, demonstrations, augmented windows, and files of puzzles."""
 
 import abc
 import dataclasses
@@ -7,13 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from leapjax import files
 from leapjax.data.seeds import UNSEEN
 from leapjax.data.solved import collect_solved
 from leapjax.domain import Demonstrations, HeldOut
 from leapjax.environments import Transition
 from leapjax.errors import UserError
-from leapjax.types import Array, PyTree
+from leapjax.types import Array, Demonstration, PyTree, Window, pad_token
 
 O = TypeVar("O")  # noqa: E741
 P = TypeVar("P")
@@ -64,6 +68,47 @@ def demonstrate(
     """
     collect = functools.partial(collect_solved, make_adapter, lambda adapter: adapter.solution)
     return Demonstrations(collect, check=check)
+
+
+def repeat(puzzle: PyTree, demonstration: Demonstration) -> PyTree:
+    """Repeats arrays for every step of a demonstration, as augmentations need them: `[n, ...]`."""
+    steps = len(demonstration.actions)
+    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (steps, *np.shape(leaf))), puzzle)
+
+
+def rewrite(
+    window: Window,
+    place: jax.Array,
+    solution: jax.Array,
+    observe: Callable[[jax.Array], PyTree],
+    end: int,
+) -> Window:
+    """Makes the window of another puzzle at the same place of its solution.
+
+    Args:
+        window: window to change.
+        place: `[]` number of actions that the solution has before the window.
+        solution: `[n]` all actions of the new puzzle's solution.
+        observe: (place) -> observation of the new puzzle after so many actions.
+        end: the end action.
+    """
+    length = solution.shape[0]
+    earlier = place + jnp.arange(-window.context.actions.shape[0], 0)
+    ahead = place + jnp.arange(window.actions.shape[0])
+
+    def read(places: jax.Array, otherwise: int) -> jax.Array:
+        inside = (places >= 0) & (places < length)
+        return jnp.where(inside, solution[jnp.clip(places, 0, length - 1)], otherwise)
+
+    def observe_past(place: jax.Array) -> PyTree:
+        return jax.tree.map(lambda leaf: jnp.where(place < 0, 0, leaf), observe(place))
+
+    context = window.context._replace(
+        observation=observe(place),
+        past=jax.vmap(observe_past)(earlier),
+        actions=read(earlier, pad_token(end + 1)),
+    )
+    return window._replace(context=context, actions=read(ahead, end))
 
 
 @dataclasses.dataclass(frozen=True)
