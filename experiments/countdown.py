@@ -1,7 +1,7 @@
 """Countdown, reaching a number by arithmetic: `python -m experiments.countdown --help`.
 
-Trains a method to reach targets that it has never seen, then plans with what was trained in every
-way that there is, and reports success against the passes of the model that each takes.
+Trains a method on some targets, and plays other targets. It plans in every way that there is, and
+reports success against the passes of the model.
 """
 
 import sys

@@ -41,7 +41,7 @@ same = np.testing.assert_array_equal
 
 
 def apply(a, operation, b):
-    """The result of an operation in exact arithmetic; None if the rules forbid it."""
+    """The result of an operation in exact arithmetic; `None` if the rules forbid it."""
     if operation == PLUS:
         return a + b
     if operation == MINUS:
@@ -206,7 +206,7 @@ def test_a_reordered_window_solves_the_same_problem(numbers, place):
             same(past.written[-back][place - back :], OPEN)
             assert past.place[-back] == place - back
         seen.add((episode, *solution))
-    assert len(seen) > 4 + (numbers > 3)  # episodes, some of which have no other order
+    assert len(seen) > 4 + (numbers > 3)  # episodes: one order for some, several for others
 
 
 def test_independent_equations_change_places_and_others_do_not():

@@ -46,8 +46,8 @@ class Settings:
 class ProblemTokens(Encoder):
     """A token for each given number, for the target, and for each token that is written.
 
-    The given numbers are in no order. A number has an embedding of its value, and one of each of
-    its digits, so that numbers which are rare in training share what is learned.
+    The given numbers have no order. The token of a number is the sum of embeddings of its value and
+    its digits. The digits help with numbers that are rare in training.
 
     Attributes:
         numbers: how many are given.

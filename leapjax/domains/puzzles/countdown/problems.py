@@ -1,8 +1,8 @@
 """Countdown: reach a target with the four operations, using each given number exactly once.
 
-Numbers and targets are those of 'Stream of Search' (Gandhi et al., 2024), which 'Beyond
-Autoregression' (Ye et al., 2025) also uses: numbers in 1 .. 99, targets in 10 .. 100, results that
-are integers and not negative. A solution of n numbers is n - 1 equations `a op b = c`.
+The ranges follow 'Stream of Search' (Gandhi et al., 2024), as 'Beyond Autoregression' (Ye et al.,
+2025) does. Numbers are in 1 .. 99, targets in 10 .. 100. Results are integers and never negative.
+A solution of n numbers has n - 1 equations `a op b = c`.
 """
 
 import functools
@@ -79,7 +79,7 @@ def find_level(name: str) -> Level:
 
 
 def list_targets(seed: int) -> list[int]:
-    """Lists the targets of a level seed: training, validation and test share none."""
+    """Lists the targets of a level seed: training, validation and test have different targets."""
     held_out = (TEST, VALIDATION)
     if seed >= TRAINING_START:
         return [target for target in TARGETS if target % MODULUS not in held_out]
@@ -125,7 +125,7 @@ def can_continue(numbers: Sequence[int], tokens: Sequence[int]) -> bool:
 
 
 def is_solution(numbers: Sequence[int], target: int, tokens: Sequence[int]) -> bool:
-    """Tells whether tokens are a complete solution, any of those that exist."""
+    """Tells whether tokens are a complete solution; a problem may have several."""
     complete = len(tokens) == PARTS * (len(numbers) - 1)
     return complete and can_continue(numbers, tokens) and tokens[-1] == target
 
@@ -174,7 +174,7 @@ def solve(numbers: Sequence[int], target: int) -> list[Equation] | None:
 
 
 def _combine(made: Mapping[int, Mapping[int, Last | None]], subset: int) -> dict[int, Last | None]:
-    """Finds the numbers that a subset makes, from those of smaller subsets."""
+    """Finds the numbers that a subset makes, from the numbers that smaller subsets make."""
     found: dict[int, Last | None] = {}
     first = subset & (subset - 1)
     while first:
