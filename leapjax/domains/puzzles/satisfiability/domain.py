@@ -11,8 +11,8 @@ import numpy as np
 from flax.typing import Dtype
 
 from leapjax.checks import check_at_least, check_range, check_types
-from leapjax.data.solved import collect_solved
-from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
+from leapjax.domain import Augmentations, Domain, DomainType
+from leapjax.domains.puzzles.common import demonstrate
 from leapjax.domains.puzzles.satisfiability import formulas
 from leapjax.domains.puzzles.satisfiability.formulas import OPEN, Formula, FormulaAdapter
 from leapjax.domains.puzzles.satisfiability.rules import rules
@@ -34,7 +34,7 @@ class Settings:
     """
 
     augment: bool = True
-    rounds: int = 2
+    rounds: int = 4
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -169,10 +169,7 @@ def make(name: str, settings: Settings) -> Domain:
                 size.variables, model.width, settings.rounds, model.attention == "full", model.dtype
             )
         },
-        demonstrations=Demonstrations(
-            functools.partial(collect_solved, make_adapter, lambda adapter: adapter.solution),
-            check=functools.partial(check_formulas, size=size),
-        ),
+        demonstrations=demonstrate(make_adapter, functools.partial(check_formulas, size=size)),
         augmentations=Augmentations(
             [formulas.rename] if settings.augment else [], formulas.repeat_solution
         ),

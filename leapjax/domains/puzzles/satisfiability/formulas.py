@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
+from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
 from leapjax.domains.puzzles.names import read_numbers
-from leapjax.environments import Transition
 from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, Window, pad_token
+from leapjax.types import Array, Demonstration, Window
 
 LEVELS = ("Sat20x91", "Nae20x42")
 LITERALS = 3  # in a clause
@@ -124,7 +124,7 @@ def find_violated(literals: Array, values: Array, differ: bool) -> Array:
     return violated | (found == wanted).all(axis=-1) if differ else violated
 
 
-class FormulaAdapter:
+class FormulaAdapter(PuzzleAdapter[Formula]):
     """A formula as the rollout sees it: actions are values of one variable after the other.
 
     A value that violates a clause ends the episode; the last value ends it with success.
@@ -133,29 +133,28 @@ class FormulaAdapter:
     def __init__(self, size: Size) -> None:
         self.size = size
         self.num_actions = 3
-        self.solution = np.zeros(size.variables, np.int32)  # of the current formula
 
-    def reset(self, seed: int) -> Formula:
+    def draw(self, seed: int) -> tuple[Formula, np.ndarray]:
         """Draws the formula of a seed."""
-        literals, self.solution = draw(self.size, seed)
-        self._formula = Formula(literals, np.full(self.size.variables, OPEN, np.int32), np.int32(0))
-        return self._formula
+        literals, solution = draw(self.size, seed)
+        return Formula(literals, np.full_like(solution, OPEN), np.int32(0)), solution
 
-    def step(self, action: int) -> Transition:
+    def move(self, formula: Formula, action: int) -> tuple[Formula, bool | None]:
         """Assigns a variable."""
-        literals, values, variable = self._formula
-        values = values.copy()
-        values[variable] = action
-        self._formula = Formula(literals, values, np.int32(variable + 1))
-        violated = bool(find_violated(literals, values, self.size.differ).any())
-        success = not violated and variable + 1 == self.size.variables
-        return Transition(self._formula, float(success), success or violated, False, success)
+        values = formula.values.copy()
+        values[formula.variable] = action
+        after = Formula(formula.literals, values, np.int32(formula.variable + 1))
+        if find_violated(after.literals, values, self.size.differ).any():
+            return after, False
+        return after, True if after.variable == self.size.variables else None
 
 
 def repeat_solution(demonstration: Demonstration) -> np.ndarray:
     """Returns the solution for every step, for augmentation: `[n, variables]` int8."""
-    values = demonstration.observations.values
-    return np.broadcast_to(values[-1], values[1:].shape).astype(np.int8)
+    repeated: np.ndarray = repeat(
+        demonstration.observations.values[-1].astype(np.int8), demonstration
+    )
+    return repeated
 
 
 def rename(key: jax.Array, window: Window) -> Window:
@@ -166,31 +165,16 @@ def rename(key: jax.Array, window: Window) -> Window:
     """
     order_key, sign_key = jax.random.split(key)
     solution = window.extras.astype(jnp.int32)
-    count, end = solution.shape[0], 2
+    count = solution.shape[0]
     places = jax.random.permutation(order_key, count)
     negated = jax.random.randint(sign_key, (count,), 0, 2)
     solution = jnp.zeros_like(solution).at[places].set(solution ^ negated)
-    old = window.context.observation
-    variables, values = jnp.divmod(old.literals, 2)
+    formula = window.context.observation
+    variables, values = jnp.divmod(formula.literals, 2)
     literals = 2 * places[variables] + (values ^ negated[variables])
 
-    def formula(variable: jax.Array) -> Formula:
+    def observe(variable: jax.Array) -> Formula:
         known = jnp.arange(count) < variable
         return Formula(literals, jnp.where(known, solution, OPEN), variable)
 
-    def write_plan(at: jax.Array, otherwise: int) -> jax.Array:
-        inside = (at >= 0) & (at < count)
-        return jnp.where(inside, solution[jnp.clip(at, 0, count - 1)], otherwise)
-
-    earlier = old.variable + jnp.arange(-window.context.actions.shape[0], 0)
-    ahead = old.variable + jnp.arange(window.actions.shape[0])
-
-    def blank_before(leaf: jax.Array) -> jax.Array:
-        return jnp.where(jnp.expand_dims(earlier >= 0, range(1, leaf.ndim)), leaf, 0)
-
-    context = window.context._replace(
-        observation=formula(old.variable),
-        past=jax.tree.map(blank_before, jax.vmap(formula)(earlier)),
-        actions=write_plan(earlier, pad_token(end + 1)),
-    )
-    return window._replace(context=context, actions=write_plan(ahead, end))
+    return rewrite(window, formula.variable, solution, observe, end=2)
