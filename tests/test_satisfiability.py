@@ -253,7 +253,7 @@ def test_the_network_sees_a_formula_and_no_order_of_clauses_literals_or_variable
 
 
 def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
-    """Its memory equals that of a formula whose variables are counted from there on."""
+    """Its memory equals the one for variables counted from the next one on."""
     agent = make_agent()
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0, known=2)
     encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)))
