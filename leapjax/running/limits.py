@@ -58,6 +58,8 @@ def check(config: AnyConfig) -> None:
             f"{config.level}: use {config.flag('level')} {recorded}"
         )
     domain = make_domain(config)
+    if domain.held_out is not None:
+        domain.held_out.check(choose_episode_seeds(config))
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.demonstrations.collect is None and domain.demonstrations.source is None:
         raise UserError(
