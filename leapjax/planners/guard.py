@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from leapjax.checks import check_floats, check_kind
 from leapjax.types import Energy, Params, PyTree
 
-
 SCORED_TOGETHER = 8  # totals of one context at a time: each may hold T copies of a plan
 
 
