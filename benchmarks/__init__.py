@@ -1,3 +1,3 @@
-"""Programs that measure speed. `experiments` prepares the process before JAX is imported."""
+"""Programs that measure speed. Importing `experiments` first prepares the process for JAX."""
 
 import experiments  # noqa: F401

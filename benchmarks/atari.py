@@ -1,7 +1,7 @@
 """Measures playing and training on Atari: `python -m benchmarks.atari`.
 
-Playing: the milliseconds of a decision in each of several games, divided into emulator, encoder and
-planner, and the encoder's share of the matrix-multiply peak, measured in the same run. Training:
+Playing: the milliseconds of a decision in several games together, divided into emulator, encoder
+and planner. The encoder's speed stands against the matrix-multiply peak of the same run. Training:
 steps, as `benchmarks.training` measures them.
 """
 
@@ -34,8 +34,8 @@ from leapjax.presets import find_preset
 from leapjax.running import jax_setup, shell
 from leapjax.types import Context, Params, PyTree
 
-GAMES_PLAYED = (1, 16, 64)  # together
-DECISIONS = 50  # of each game, to measure
+GAMES_PLAYED = (1, 16, 64)  # games played together
+DECISIONS = 50  # measured decisions of each game
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints tables, and writes the rows."""
+    """Measures, prints tables, and writes the rows; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.atari", given)
     return shell.run_program("benchmarks.atari", given, lambda: run(options))
@@ -131,7 +131,7 @@ def measure(config: AnyConfig, batches: Sequence[int], seconds: float) -> list[R
         _, cache = plan(params, keys, contexts, None)
         first = time.perf_counter() - begun
         anew = planning = fastest(partial(plan, params, keys, contexts, None), seconds)
-        if cache is not None:  # as in play
+        if cache is not None:  # play reuses cached states
             plan(params, keys, contexts, cache)
             planning = fastest(partial(plan, params, keys, contexts, cache), seconds)
         # On as many devices as the planner.

@@ -15,8 +15,8 @@ def matmul_flops(function: Callable[..., Any], *arguments: Any) -> float:
     A product of `[n, k]` and `[k, m]` counts 2 n k m, a convolution as the equivalent product.
 
     Args:
-        function: to count, jitted or not; it is traced, not run.
-        arguments: arrays, or their shapes.
+        function: function to count, jitted or not; it is traced, not run.
+        arguments: its arguments: arrays, or their shapes.
     """
     jitted = function if hasattr(function, "trace") else jax.jit(function)
     return _count(jitted.trace(*arguments).jaxpr.jaxpr)
@@ -44,12 +44,12 @@ def _count(jaxpr: Jaxpr) -> float:
 
 
 def inner_programs(values: list[Any]) -> list[Jaxpr]:
-    """Finds the programs among the parameters of an operation, closed over constants or not."""
+    """Finds the programs among the parameters of an operation, with or without constants."""
     found = []
     for value in values:
         if isinstance(value, tuple | list):
             found += inner_programs(list(value))
-        elif hasattr(value, "jaxpr"):  # with its constants
+        elif hasattr(value, "jaxpr"):  # a program with its constants
             found.append(value.jaxpr)
         elif hasattr(value, "eqns"):
             found.append(value)

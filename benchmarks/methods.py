@@ -44,7 +44,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes the rows to `--json`."""
+    """Measures, prints a table, and writes the rows to `--json`; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.methods", given)
     return shell.run_program("benchmarks.methods", given, lambda: run(options))

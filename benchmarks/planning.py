@@ -1,8 +1,8 @@
 """Plans per second against this machine's limit: `python -m benchmarks.planning --quick`.
 
-Parameters are random, because speed does not depend on them. Compilation is timed apart; every
-figure is the best of several runs. FLOPs count all matrix products of a plan and its encoder. The
-peak is measured in the same run, on the shapes of a transformer layer.
+Parameters are random, because speed does not depend on them. Compilation is timed apart. Every time
+is the best of several calls. FLOPs count all matrix products of a plan and its encoder. The peak is
+measured in the same run, on the shapes of a transformer layer.
 """
 
 import dataclasses
@@ -64,7 +64,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes the rows to `--json`."""
+    """Measures, prints a table, and writes the rows to `--json`; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.planning", given)
     return shell.run_program("benchmarks.planning", given, lambda: run(options))
@@ -139,7 +139,7 @@ def measure(
                 "side": domain.blank.grid.shape[0],
                 "batch": batch,
                 "chunk": chunk,
-                # 0 where a smaller batch has compiled what this one needs
+                # 0 if smaller batches have compiled all chunk sizes of this batch
                 "compile_seconds": first - best if new else 0.0,
                 "seconds": best,
                 "plans_per_second": batch / best,
@@ -153,7 +153,7 @@ def measure(
 
 
 def compare_with_peak(rows: Sequence[Row]) -> None:
-    """Adds `fraction_of_peak`, of the best peak measured for the row's shapes."""
+    """Adds `fraction_of_peak`, relative to the best peak measured for the row's shapes."""
     peaks: dict[int, float] = {}
     for row in rows:
         peaks[row["tokens"]] = max(row["peak_gflops"], peaks.get(row["tokens"], 0.0))
@@ -163,20 +163,20 @@ def compare_with_peak(rows: Sequence[Row]) -> None:
 
 
 def make_energy(name: str, level: Level) -> tuple[Energy, Params, Domain]:
-    """A preset's energy with random parameters, with the horizon of the appendix."""
+    """Makes a preset's energy with random parameters and the appendix's horizon."""
     default = find_preset("babyai", level.name, "leap", name)
     return untrained(change(default, planner={"horizon": level.horizon}))
 
 
 def untrained(config: AnyConfig) -> tuple[Energy, Params, Domain]:
-    """The energy of a configuration with random parameters, and its domain."""
+    """Makes the energy of a configuration, random parameters, and the domain."""
     domain = make_domain(config)
     agent = pretrained.make_agent(specify(config, 0, domain), domain)
     return agent.energy, jax.jit(agent.init)(jax.random.key(0)).params, domain
 
 
 def plan_many(name: str, level: Level, count: int) -> str:
-    """Plans for very many contexts in one call; prints time and memory."""
+    """Plans for very many contexts in one call; returns a line with its time and memory."""
     energy, params, domain = make_energy(name, level)
     planner = compile_planner(energy, GibbsConfig(level.horizon, level.iterations))
     contexts = random_contexts(domain, level.context, count)
@@ -192,9 +192,9 @@ def plan_many(name: str, level: Level, count: int) -> str:
 
 
 def random_contexts(domain: Domain, length: int, batch: int) -> Any:
-    """`[B]` contexts of the right shapes with random grids and poses, and one instruction.
+    """Makes `[B]` random contexts of the right shapes, as NumPy arrays.
 
-    Or with random frames. As NumPy arrays.
+    BabyAI: random grids and poses, and one instruction. Atari: random frames.
     """
     blank, rng = blank_context(domain, length), np.random.default_rng(2)
     contexts = jax.tree.map(lambda x: np.repeat(x[None], batch, axis=0), blank)
@@ -231,7 +231,7 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Plans per second, and fraction of peak, against batch size."""
+    """Draws plans per second, and the fraction of the peak, against batch size."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
     for name in COMPARED:
         for horizon, iterations in dict.fromkeys((r["horizon"], r["iterations"]) for r in rows):

@@ -1,8 +1,8 @@
 """Measures success and speed of search settings: `python -m benchmarks.quality runs/RUN`.
 
-Success on validation levels (never on test levels) against plans per second, for
-trained planners and many search settings. Speed is measured at one batch of contexts, the
-first states of those levels.
+Measures success on validation levels (never on test levels) and plans per second, for trained
+planners and many search settings. The speed is for one batch of contexts, the first states of the
+validation levels.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from leapjax.scores import wilson_interval
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-# Plans per second of the authors' code, by (T, N), one by one on two cores.
+# Plans per second of the authors' code by (T, N), one plan at a time on two cores.
 AUTHORS = {(5, 10): 11.8, (10, 30): 2.9, (15, 50): 1.2}
 
 
@@ -55,7 +55,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures every setting, prints a table, and writes the rows to `--json`."""
+    """Measures, prints a table, and writes the rows to `--json`; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.quality", given)
     return shell.run_program("benchmarks.quality", given, lambda: run(options))
@@ -179,7 +179,7 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Success with its interval against plans per second."""
+    """Draws success with its interval against plans per second."""
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     for index, row in enumerate(rows):
         share = row["successes"] / row["episodes"]

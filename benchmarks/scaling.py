@@ -1,6 +1,6 @@
 """Weak scaling of training over devices and processes: `python -m benchmarks.scaling`.
 
-Each device takes the same number of windows per step. A setting runs in processes of its own,
+Each device takes the same number of windows per step. Each setting runs in its own processes,
 because JAX fixes its devices when it starts. More virtual devices than cores show only the cost of
 splitting.
 """
@@ -52,7 +52,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures every setting, prints a table, and writes the rows to `--json`."""
+    """Measures, prints a table, and writes the rows to `--json`; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.scaling", given)
     return shell.run_program("benchmarks.scaling", given, lambda: run(options, given))
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Options, arguments: list[str]) -> None:
     """Measures every setting, or with `worker` this process's setting."""
-    find_preset("babyai", options.level, "leap", "leapjax")  # an unknown level is refused here
+    find_preset("babyai", options.level, "leap", "leapjax")  # raises if the level is unknown
     check_writable(options.json)
     if options.worker:
         jax_setup.start(options.cluster, cache=False)
@@ -74,7 +74,7 @@ def run(options: Options, arguments: list[str]) -> None:
 
 
 def launch(arguments: list[str], count: int, devices: int, fsdp: int) -> Row:
-    """Measures one setting in processes of its own; returns its row.
+    """Measures one setting in new processes; returns its row.
 
     Raises:
         UserError: a process failed.

@@ -19,7 +19,7 @@ Row = dict[str, Any]  # one measurement, as JSON values
 
 
 def fastest(run: Callable[[], Any], seconds: float) -> float:
-    """Returns the seconds of the fastest of several runs."""
+    """Returns the seconds of the fastest call; repeats calls for at least `seconds`."""
     best, spent = float("inf"), 0.0
     while spent < seconds or best == float("inf"):
         begun = time.perf_counter()
@@ -36,13 +36,13 @@ def matmul_peak(tokens: int, width: int, seconds: float) -> float:
     Returns the better of two ways: all cores on one product, or the tokens split over devices.
     """
     devices = len(jax.local_devices())
-    tokens = -(-tokens // devices) * devices  # so that they can be split
+    tokens = -(-tokens // devices) * devices  # splits evenly over devices
     key = jax.random.key(0)
     x = jax.random.normal(key, (tokens, width))
     shapes = [(width, width)] * 4 + [(width, 4 * width), (4 * width, width)]
     weights = [jax.random.normal(key, shape) / width for shape in shapes]
     flops = 2 * tokens * sum(rows * columns for rows, columns in shapes)
-    repeats = max(1, int(2e9 / flops))  # hides the dispatch
+    repeats = max(1, int(2e9 / flops))  # makes the cost of dispatch negligible
 
     def multiply(_: None, weights: list[jax.Array], x: jax.Array) -> jax.Array:
         # Each product needs the last one, so XLA cannot leave it out.

@@ -1,9 +1,9 @@
 """Training steps per second against this machine's limit: `python -m benchmarks.training`.
 
-A step draws and augments a batch, takes the gradient and updates the parameters, as the main job
-does. Grids are random, because speed does not depend on them. Compilation is timed apart. FLOPs
-count the matrix products of a step; the peak is measured in the same run. The parts of a step are
-compiled alone, so their sum leaves out the exchange between devices.
+A step draws and augments a batch, takes the gradient and updates the parameters, as in a run. Grids
+are random, because speed does not depend on them. Compilation is timed apart. FLOPs count the
+matrix products of a step; the peak is measured in the same run. The parts of a step are compiled
+one by one, so their sum leaves out the exchange between devices.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from leapjax.running import jax_setup, shell
 from leapjax.types import Agent, Demonstration, PyTree
 
 LEVELS = ("GoToLocalS7N5", "GoToObjMazeS4", "GoToObjMazeS7")
-EPISODES, LENGTH = 100, 20  # of the made-up demonstrations
+EPISODES, LENGTH = 100, 20  # of the random demonstrations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints a table, and writes the rows to `--json`."""
+    """Measures, prints a table, and writes the rows to `--json`; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "benchmarks.training", given)
     return shell.run_program("benchmarks.training", given, lambda: run(options))
@@ -64,7 +64,7 @@ def run(options: Options) -> None:
     """Measures every level and preset.
 
     Raises:
-        UserError: an unknown level or preset, or a microbatch that cannot be.
+        UserError: a level or preset is unknown, or the microbatch is invalid.
     """
     check_writable(options.json)
     jax_setup.start(cache=False)  # compile times are real
@@ -85,7 +85,7 @@ def run(options: Options) -> None:
 
 
 class Stepper:
-    """Training steps of a configuration on made-up demonstrations, compiled; a call makes one."""
+    """Compiled training steps of a configuration on random demonstrations; a call makes a step."""
 
     def __init__(self, config: AnyConfig, mesh: Mesh) -> None:
         self._config, self._domain = config, make_domain(config)
@@ -94,20 +94,20 @@ class Stepper:
         self._data = sharding.replicate(random_steps(self._domain), mesh)
         begin, self._step = training.compile_ahead(agent, mesh, self._data)
         self.state, self._key = begin(0)
-        jax.block_until_ready(self())  # the draw of a batch is compiled on first use
+        jax.block_until_ready(self())  # the first step compiles the drawing of a batch
 
     def __call__(self) -> jax.Array:
-        """Makes one step; its loss."""
+        """Makes one step; returns its loss."""
         self.state, metrics = self._step(self.state, self._data, self._key)
         return metrics["loss"]
 
     def flops(self) -> float:
-        """Of the matrix products of one update of the whole batch."""
+        """Counts the FLOPs of the matrix products of one update with the whole batch."""
         update = training.make_train_step(self._agent(None)).update
         return matmul_flops(update, self.state, self._draw(), self._key)
 
     def parts(self, mesh: Mesh, seconds: float) -> list[Row]:
-        """Where a step's time goes: its parts, each compiled alone, on as many devices."""
+        """Measures the parts of a step, each compiled by itself, on the devices of `mesh`."""
         config, params = self._config, self.state.params
         tokens = jnp.zeros((config.training.batch, config.planner.horizon), jnp.int32)
         contexts = random_contexts(self._domain, config.context, config.training.batch)
@@ -133,7 +133,7 @@ class Stepper:
         return jax.vmap(self.energy.encode, in_axes=(None, 0))(params, contexts)
 
     def _loss(self, params: PyTree, memory: PyTree, tokens: jax.Array) -> jax.Array:
-        """One pass over each window, or one for each of its actions."""
+        """Computes losses with one pass per window, or with one pass per action of a window."""
 
         def one(memory: PyTree, actions: jax.Array) -> jax.Array:
             if self._config.method_settings.masking == "each":
@@ -161,7 +161,7 @@ def _gradient(
     mesh: Mesh,
     seconds: float,
 ) -> Row:
-    """`function(params, *batches)` and its gradient, each device for its own rows."""
+    """Measures `function(params, *batches)` and its gradient; each device takes its own rows."""
 
     def gradient(_: None, params: PyTree, *batches: PyTree) -> PyTree:
         def total(params: PyTree, inputs: PyTree) -> jax.Array:
@@ -181,7 +181,7 @@ def _is_float(leaf: jax.Array) -> bool:
 
 
 def measure(config: AnyConfig, seconds: float) -> Row:
-    """One preset on one level."""
+    """Measures one preset on one level."""
     batch, windows = config.training.batch, config.training.consecutive
     mesh = sharding.make_mesh(batch // windows)
     step = Stepper(config, mesh)
@@ -198,7 +198,7 @@ def measure(config: AnyConfig, seconds: float) -> Row:
         "consecutive": windows,
         "devices": mesh.size,
         "steps_per_second": 1 / taken,
-        "parts": step.parts(mesh, seconds) if windows == 1 else [],  # of windows drawn alone
+        "parts": step.parts(mesh, seconds) if windows == 1 else [],  # for windows drawn alone
         "flops_per_step": flops,
         "gflops": flops / taken / 1e9,
         "peak_gflops": peak,

@@ -1,4 +1,4 @@
-"""A planner that comes with the library is forbidden to turn left: nothing is trained."""
+"""Forbids a planner that comes with the library to turn left, without training."""
 
 import sys
 
@@ -12,13 +12,13 @@ LEVEL, EPISODES = "GoToLocalS7N5", int(sys.argv[1]) if len(sys.argv) > 1 else 10
 LEFT = ACTIONS.index("left")
 
 
-def left_turns(context, actions):  # a penalty: 0 where a plan is allowed
-    executed = jnp.cumsum(actions == END) == 0  # what follows the end is not
+def left_turns(context, actions):  # a penalty: 0 if a plan is allowed
+    executed = jnp.cumsum(actions == END) == 0  # the actions before the end
     return 20.0 * jnp.sum((actions == LEFT) & executed)
 
 
 class Counting(BabyAIAdapter):
-    """Counts what the planner was asked not to do."""
+    """Counts the planner's left turns."""
 
     lefts = 0
 

@@ -1,4 +1,4 @@
-"""A hand-written energy, a constraint, and hundreds of plans in one call. No network."""
+"""A hand-written energy without a network, a constraint, and hundreds of plans in one call."""
 
 import jax
 import jax.numpy as jnp

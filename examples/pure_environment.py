@@ -38,7 +38,7 @@ def step(state, action):
 
 
 def encode(params, context):
-    """The distance of every cell from the target: once per plan."""
+    """Computes the distance of every cell from the target, once per plan."""
     walls, target = context.observation["walls"], context.observation["target"]
 
     def spread(_, far):
@@ -52,7 +52,7 @@ def encode(params, context):
 
 
 def total(params, memory, actions):
-    """How far from the target a plan leads."""
+    """Returns the distance from the target at the end of a plan."""
     far, walls, agent = memory
 
     def move(place, action):
@@ -61,7 +61,7 @@ def total(params, memory, actions):
         return jnp.where(inside & ~walls[tuple(there)], there, place), None
 
     place, _ = jax.lax.scan(move, agent, actions)
-    return jnp.where(actions[0] == 4, jnp.inf, far[tuple(place)])  # never give up
+    return jnp.where(actions[0] == 4, jnp.inf, far[tuple(place)])  # forbids to give up
 
 
 energy = leap.from_total(encode, total, num_actions=5)

@@ -1,4 +1,4 @@
-"""A Gymnasium environment, a Minari data set of it, and a planner that learns from that.
+"""Trains a planner on a Minari data set of a Gymnasium environment.
 
 python examples/train_on_my_data.py [steps] [episodes]
 """
@@ -14,7 +14,7 @@ from leapjax.data import storage
 
 steps, episodes = (int(given) for given in (sys.argv[1:] + ["600", "20"][len(sys.argv) - 1 :]))
 
-# Data: somebody's, or of a rule that balances the pole.
+# Data: an existing data set, or episodes of a rule that balances the pole.
 NAME = "mine/cartpole-v0"
 if not storage.has_dataset(NAME):
     env = DataCollector(gymnasium.make("CartPole-v1"))
@@ -26,10 +26,10 @@ if not storage.has_dataset(NAME):
             (x, speed, angle, turning), _, fallen, out_of_time, _ = env.step(push)
             over = fallen or out_of_time
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it would like to know who we are
+        warnings.simplefilter("ignore")  # Minari warns that author and code are not named
         env.create_dataset(NAME)
 
-# A planner of five actions, trained, asked for a plan, and played.
+# Train a planner of five actions, make a plan, and play episodes.
 domain = leap.make_domain("gymnasium", "CartPole-v1")
 planner = leap.fit(NAME, domain, steps=steps, progress=lambda step, means: print(step, means))
 print(planner)

@@ -1,4 +1,4 @@
-"""A planner that comes with the library plays a level of your own: more objects in the room."""
+"""A planner that comes with the library plays a variant of its level, with more objects."""
 
 import dataclasses
 import sys

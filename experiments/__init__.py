@@ -1,4 +1,4 @@
-"""Programs that reproduce the paper, and its tables; to import them changes nothing."""
+"""Programs that reproduce the paper and its tables. Importing them leaves the process as it is."""
 
 from leapjax.running import startup
 

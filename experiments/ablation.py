@@ -1,8 +1,8 @@
 """Energies and planners (paper, appendix, table 8): `python -m experiments.ablation --help`.
 
-The masked model and the LSTM classifier, minimised by random shooting, by the cross-entropy
-method and by Gibbs sampling; beside them, of the masked model, two planners that the paper does
-not have.
+Compares random shooting, the cross-entropy method and Gibbs sampling, on the energies of the masked
+model and of the LSTM classifier. The masked model also has two planners that the paper does not
+test.
 """
 
 import dataclasses
@@ -14,31 +14,31 @@ from experiments.common.cases import Analysis, Case, Model, Way
 from leapjax.planners import BeamConfig, CrossEntropyConfig, GibbsConfig, ShootingConfig
 
 LEVEL = "GoToObjMazeS4"
-ITERATIONS = 30  # the paper's N of this level
+ITERATIONS = 30  # the paper's N for this level
 
 
 def configure_shooting(trained: GibbsConfig) -> ShootingConfig:
-    """The best of 30 random plans."""
+    """Configures random shooting, which keeps the best of 30 random plans."""
     return ShootingConfig(trained.horizon)
 
 
 def configure_cross_entropy(trained: GibbsConfig) -> CrossEntropyConfig:
-    """30 plans in each of as many rounds as the paper's Gibbs sampling has iterations."""
+    """Configures the cross-entropy method with 30 plans a round and the paper's N as rounds."""
     return CrossEntropyConfig(trained.horizon, ITERATIONS)
 
 
 def configure_gibbs(trained: GibbsConfig) -> GibbsConfig:
-    """Algorithm 1, with the paper's N."""
+    """Configures algorithm 1 with the paper's N."""
     return dataclasses.replace(trained, iterations=ITERATIONS)
 
 
 def configure_confident(trained: GibbsConfig) -> GibbsConfig:
-    """One action in each pass, the most certain first."""
+    """Configures one pass for each action, the most certain action first."""
     return dataclasses.replace(trained, fill="confident", iterations=trained.horizon)
 
 
 def configure_beams(trained: GibbsConfig) -> BeamConfig:
-    """Ten beams, from left to right."""
+    """Configures beam search with ten beams, from left to right."""
     return BeamConfig(trained.horizon)
 
 
@@ -67,7 +67,7 @@ ANALYSIS = Analysis(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Every case asked for; the exit code."""
+    """Runs the chosen cases; returns the exit code."""
     return cases.main(ANALYSIS, arguments)
 
 

@@ -1,10 +1,11 @@
-"""What a trained model knows of demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
+"""How well a model predicts demonstrations: `python -m experiments.accuracy runs/NAME [...]`.
 
-How often the action that the model finds most likely is the demonstrator's, at each position of
-the plan, given all actions before it: on demonstrations that it has learned from, and on others
-of the same demonstrator. A gap between the two says that the network recognises demonstrations
-where it should understand the level; a fall along the plan says that its end is not to be trusted.
-(Not of a model that was trained with `--masking all`: it has seen no actions before others.)
+Prints how often the model's likeliest action is the demonstrator's, at each position of the plan,
+given all actions before it. One column is for demonstrations that the model learned from. The other
+is for new ones of the same demonstrator. A gap between the columns says that the network recognises
+demonstrations where it should understand the level. A fall along the plan says that the end of a
+plan is unreliable. (A model trained with `--masking all` never saw the actions before a position,
+so its numbers say little.)
 """
 
 import dataclasses
@@ -30,17 +31,17 @@ from leapjax.running import jax_setup, shell
 from leapjax.running.limits import check_counts
 from leapjax.types import Demonstration, Energy, Params, Window, mask_token
 
-TOGETHER = 64  # windows scored in one go
+TOGETHER = 64  # windows scored at once
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say what models know of demonstrations that they have, and have not, learned from.
+    """Measure how well models predict demonstrations, those they learned from and new ones.
 
     Attributes:
         runs: Folders of runs.
-        demos: Demonstrations of each kind, learned from or not.
-        samples: Steps of the demonstrations to predict the actions of, at most.
+        demos: Demonstrations of each kind, learned from or new.
+        samples: Largest number of steps to predict from, for each kind.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -49,7 +50,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Prints one table per run; the exit code."""
+    """Prints one table per run; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.accuracy", given)
     return shell.run_program("experiments.accuracy", given, lambda: report(options))
@@ -75,7 +76,7 @@ def report(options: Options) -> None:
 
 
 def load_learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
-    """Some demonstrations that a run has learned from."""
+    """Loads at most `count` of the demonstrations that a run learned from."""
     count = min(count, origin.demos)
     source = domain.demonstrations.source
     if source is not None:
@@ -87,19 +88,19 @@ def load_learned(domain: Domain, origin: Origin, count: int) -> Sequence[Demonst
 
 
 def collect_others(domain: Domain, origin: Origin, count: int) -> Sequence[Demonstration]:
-    """As many of the domain's demonstrator, of another training seed."""
+    """Collects at most `count` demonstrations with another training seed than the run's."""
     last = seeds.MAX_TRAINING_SEED - 1
     return _collect(domain, min(count, origin.demos), last - (origin.seed == last))
 
 
 def _collect(domain: Domain, count: int, seed: int) -> Sequence[Demonstration]:
     collect = domain.demonstrations.collect
-    assert collect is not None  # see `report`; all levels of BabyAI have a demonstrator
+    assert collect is not None  # `report` has checked it; all BabyAI levels have a demonstrator
     return collect(count, seed, lambda done: None).demonstrations
 
 
 def make_table(planner: Pretrained, options: Options, title: str) -> Table:
-    """Accuracy by position, of both kinds of demonstrations."""
+    """Tabulates the accuracy at each position, for both kinds of demonstrations."""
     specification = planner.specification
     domain, origin = pretrained.make_domain(specification), specification.origin
     kinds = (
@@ -123,12 +124,12 @@ def _format_share(right: int, asked: int) -> str:
 def count_hits(
     planner: Pretrained, data: Sequence[Demonstration], samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many actions the model finds most likely, of how many: `[T]` each, by position.
+    """Counts the correct predictions, and all predictions, at each position: `[T]` each.
 
     Args:
         planner: the model.
         data: demonstrations.
-        samples: how many of their steps to predict from, evenly spaced.
+        samples: largest number of steps to predict from, evenly spaced.
     """
     specification, end = planner.specification, planner.energy.num_actions - 1
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data))
@@ -152,18 +153,19 @@ def count_hits(
 def find_hits(
     energy: Energy, params: Params, window: Window, end: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Whether each action is the likeliest, given those before it and MASK after it.
+    """Tells at which positions the model's likeliest action is the demonstrator's.
 
-    After the end action there is nothing to predict but more of it: those do not count.
+    Each action is predicted from the actions before it; MASK stands at and after its position.
+    Positions after the first end action repeat it, so they do not count.
 
     Args:
-        energy: of a model that was trained to fill in what is masked.
-        params: of it.
-        window: of a demonstration.
-        end: the end action is predicted, too.
+        energy: energy of a masked model.
+        params: its parameters.
+        window: window of a demonstration.
+        end: whether the first end action counts.
 
     Returns:
-        `[T]` bool: it is, and it counts; `[T]` bool: it counts.
+        `[T]` bool, where a prediction counts and is correct; `[T]` bool, where it counts.
     """
     memory = energy.encode(params, window.context)
     places = jnp.arange(window.actions.shape[0])

@@ -1,8 +1,8 @@
 """Atari (paper, table 2): `python -m experiments.atari --game Breakout --help`.
 
-Plays games with built-in demonstrators where there are no data yet, trains a method on them, and
-reports its score beside the paper's. `python -m experiments.atari collect --help` makes data
-alone.
+Trains a method on played games, and reports its score beside the paper's. Built-in demonstrators
+play the games if there are no data yet. `python -m experiments.atari collect --help` tells how to
+make data without training.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from leapjax.running.run import Experiment
 from leapjax.running.spelling import AtariConfig
 
 RECORDED = Path("results/atari-data.json")
-SMALLEST_WORKER = 100 << 20  # bytes of a process that plays
+SMALLEST_WORKER = 100 << 20  # bytes of memory that a playing process needs at least
 
 
 EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, config=AtariConfig)
@@ -35,17 +35,17 @@ EXPERIMENT = Experiment("atari", "atari", animate=animate, iterations=False, con
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Play games with built-in demonstrators; writes what DQN-Replay's files hold.
+    """Play games with built-in demonstrators, and write them in the format of DQN-Replay.
 
     Attributes:
         game: Game: Breakout, Qbert, Pong or Seaquest.
-        transitions: Transitions to make at least, in whole games; None for as many as preset
+        transitions: Least number of transitions, in whole games. By default as many as preset
             leapjax learns from.
-        folder: Folder for the data; if games were begun there, they are continued.
-        dqn_seed: Number of the data, from 1, as DQN-Replay has the games of DQNs of five seeds;
-            each has games of its own.
+        folder: Folder for the data; games begun there are continued.
+        dqn_seed: Number of the data, from 1, like the five DQN seeds of DQN-Replay. Each number
+            has its own games.
         longest: Decisions after which a game is cut off, because a ball can fly on for ever.
-        workers: Processes; None for one on each core.
+        workers: Number of processes, by default one for each core.
         record: Write the scores of the demonstrators to results/, which is committed.
     """
 
@@ -59,7 +59,7 @@ class Collect:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs every game and seed asked for, or collects data; the exit code."""
+    """Runs every chosen game and seed, or collects data; returns the exit code."""
     given = shell.read_arguments(arguments)
     if given[:1] == ["collect"]:
         options = shell.parse(Collect, "experiments.atari collect", given[1:])
@@ -70,21 +70,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def collect_games(options: Collect) -> None:
-    """Makes data.
+    """Plays games, stores them and prints a table of their scores.
 
     Raises:
-        UserError: an unknown game, numbers that cannot be, or data that are not to be recorded.
+        UserError: the game is unknown, a number is out of range, or `record` is set although runs
+            do not learn from such data.
     """
     for name in ("transitions", "dqn_seed", "longest", "workers"):
         if getattr(options, name) is not None:
             check_counts(options, name)
-    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises above their ranges
+    Settings(dqn_seed=options.dqn_seed, max_steps=options.longest)  # raises if it is out of range
     memory.check({"--workers": (options.workers or 1) * SMALLEST_WORKER})
     if options.record and (options.dqn_seed, options.longest) != (1, LONGEST):
         raise UserError(
             f"--record is for data that are learned from: --dqn-seed 1, --longest {LONGEST}"
         )
-    make(options.game, Settings())  # refuses an unknown game, and to go on without ale-py
+    make(options.game, Settings())  # raises if the game is unknown or ale-py is missing
     from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
     console = Console(markup=False)
@@ -101,18 +102,18 @@ def collect_games(options: Collect) -> None:
 
 
 def name_data(game: str, transitions: int) -> str:
-    """Returns what data of a game are recorded as: its name, where there are as many as usual."""
+    """Names the data of a game: the game, and the number of transitions if it is unusual."""
     usual = transitions == presets.transitions(game)
     return game if usual else f"{game}, {transitions:,} transitions"
 
 
 def parse_game(name: str) -> str:
-    """Returns the game of data that `name_data` calls so."""
+    """Returns the game in a name that `name_data` made."""
     return name.partition(",")[0]
 
 
 def make_scores_table(games: Sequence[Mapping[str, Any]]) -> Table:
-    """What demonstrators have reached, by how often they act at random."""
+    """Tabulates the demonstrators' scores by their share of random actions."""
     table = Table("random actions", "games", "transitions", "mean score", "least", "most")
     for noise in sorted({game["noise"] for game in games}):
         some = [game for game in games if game["noise"] == noise]

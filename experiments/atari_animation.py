@@ -1,4 +1,4 @@
-"""A game played by a planner, its planned actions beside it, as an animated GIF."""
+"""An animated GIF of a planner's game, with the planned actions beside it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ from leapjax.pretrained import Pretrained
 from leapjax.running.run import Run
 from leapjax.types import Plan
 
-SIDE, MARGIN, LINE = 252, 150, 18  # pixels: of the game, of the plan beside it, of one action
-MOST_DECISIONS = 300  # of one game
-SHOWN, STEP_MS = 2, 60  # every second of them, for so many milliseconds
+SIDE, MARGIN, LINE = 252, 150, 18  # pixels: the game, the plan beside it, a line of the plan
+MOST_DECISIONS = 300  # plans of the game, at most
+SHOWN, STEP_MS = 2, 60  # draws every second decision, each for so many milliseconds
 WHITE, BLACK, GREY, BLUE = (255, 255, 255), (0, 0, 0), (150, 150, 150), (40, 110, 220)
 
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
-    """Draws the beginning of one game, every second decision of it."""
+    """Draws every second decision at the beginning of one game."""
     from leapjax.domains.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
 
     actions, title = run.domain.actions, run.domain.level
@@ -44,7 +44,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
 def draw_picture(
     frame: np.ndarray, plan: np.ndarray, actions: Sequence[str], score: float, title: str
 ) -> Image.Image:
-    """A frame `[84, 84]`, and the plan `[T]` beside it: the first of its actions is executed."""
+    """Draws a frame `[84, 84]` and a plan `[T]` beside it, with the first action in blue."""
     image = Image.new("RGB", (SIDE + MARGIN, SIDE), WHITE)
     image.paste(Image.fromarray(frame).resize((SIDE, SIDE), Image.Resampling.NEAREST))
     pen = ImageDraw.Draw(image)

@@ -1,7 +1,7 @@
 """Energies of good and bad games (paper, 'Energy vs. Reward'): `experiments.atari_energy --help`.
 
-The energy that a trained LEAP (`--checkpoint runs/NAME`) gives to what was done in the trajectories
-that it learned from, beside what each of them was rewarded with.
+A trained LEAP (`--checkpoint runs/NAME`) scores the trajectories that it learned from. The program
+compares the energy of each trajectory with its reward.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ class Options:
 
     Attributes:
         checkpoint: Folders of runs of LEAP on Atari, one for each game.
-        windows: Random windows of each trajectory to compute the energy of.
+        windows: Random windows to score in each trajectory.
         record: Write the result to results/, which is committed.
         runs: Folder for a result that is not recorded.
     """
@@ -48,14 +48,14 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Says how energy and reward are correlated; the exit code."""
+    """Reports how energy and reward are correlated; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.atari_energy", given)
     return shell.run_program("experiments.atari_energy", given, lambda: report(options))
 
 
 def report(options: Options) -> None:
-    """The correlation of each game, the file and the figure."""
+    """Prints the correlation of each game, and writes the file and the figure."""
     check_counts(options, "windows")
     if not options.checkpoint:
         raise UserError("--checkpoint: name the folder of at least one run")
@@ -65,7 +65,7 @@ def report(options: Options) -> None:
             raise UserError(
                 f"{path} is {specification.method} on {specification.level}, not LEAP on Atari"
             )
-        # Each window is scored with T passes, all of a trajectory at once.
+        # All windows of a trajectory are scored at once, each with T passes.
         horizon, model = specification.planner.horizon, specification.model
         layer = count_layer_bytes(model, specification.context + horizon)
         memory.check({"--windows": options.windows * horizon * layer})
@@ -88,11 +88,15 @@ def report(options: Options) -> None:
 
 
 def correlate(planner: Pretrained, games: Sequence[Demonstration], count: int) -> dict[str, Any]:
-    """The mean energy per action of each trajectory, its return, and their rank correlation."""
+    """Computes each trajectory's mean energy per action, its return, and their rank correlation.
+
+    Raises:
+        UserError: all trajectories have the same return.
+    """
     specification = planner.specification
     horizon, end = specification.planner.horizon, planner.energy.num_actions - 1
     random = np.random.default_rng(specification.origin.seed)
-    # Windows lie within their trajectory: the end action is no action of a game.
+    # Windows stay within their trajectory, because a game has no end action.
     games = [game for game in games if len(game.actions) >= horizon]
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -16,7 +16,7 @@ EXPERIMENT = Experiment("babyai", "babyai", animate=animate, paper=find_success)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs every level and seed asked for; the exit code."""
+    """Runs every chosen level and seed; returns the exit code."""
     return running.main(EXPERIMENT, arguments)
 
 

@@ -1,4 +1,4 @@
-"""Plans being refined, then executed on the real level, as an animated GIF."""
+"""An animated GIF of plans: first refined, then executed on the level."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from leapjax.running.run import Run
 from leapjax.types import Plan
 
 REFINE_MS, STEP_MS, PAUSE_MS = 250, 220, 900
-MAX_PLANS = 8  # an episode that needs more is cut off, of plans that are executed whole
+MAX_PLANS = 8  # of an episode, if each plan is executed whole; then it is cut off
 
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
@@ -32,7 +32,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
 def draw_episode(
     planner: Pretrained, level: Level, level_seed: int, seed: int, executed: int | None = None
 ) -> list[Frame]:
-    """The frames of one episode with their durations in milliseconds."""
+    """Returns the frames of one episode, each with its duration in milliseconds."""
     with closing(BabyAIAdapter(level)) as adapter:
         return _draw_frames(adapter, planner, level_seed, seed, executed)
 
@@ -44,7 +44,8 @@ def _draw_frames(
     replan = step = 0
     context = planner.specification.context
     horizon = planner.specification.planner.horizon
-    most = MAX_PLANS * min(3, -(-horizon // (executed or horizon)))  # shorter ones, a few more
+    # Allows up to three times as many plans if only a part of each is executed.
+    most = MAX_PLANS * min(3, -(-horizon // (executed or horizon)))
     for event in watch_episode(adapter, planner, context, level_seed, seed, executed, most):
         if isinstance(event, Plan):
             replan += 1
@@ -66,6 +67,6 @@ def _draw_frames(
 
 
 def _distinct(trace: np.ndarray) -> list[int]:
-    """The iterations that changed the plan, and the last."""
+    """Returns the iterations that changed the plan, and the last iteration."""
     changed = [0] + [i for i in range(1, len(trace)) if (trace[i] != trace[i - 1]).any()]
     return changed if changed[-1] == len(trace) - 1 else [*changed, len(trace) - 1]

@@ -1,4 +1,4 @@
-"""Levels of BabyAI as MiniGrid renders them, with the ways of plans drawn in."""
+"""Draws BabyAI levels with MiniGrid's renderer, and the paths of plans in them."""
 
 import copy
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from PIL import Image, ImageDraw
 from leapjax.domains.babyai.adapter import END, BabyAIAdapter
 from leapjax.domains.babyai.observations import Cell, agent_cell
 
-SIDE = 336  # pixels of a level, about
+SIDE = 336  # pixels of a level, approximately
 CAPTION = 34  # pixels of text below the level
 WHITE = (255, 255, 255)
-# Of one way after another: blue, orange, green, pink, yellow.
+# Colours of the paths in order: blue, orange, green, pink, yellow.
 COLOURS = ((80, 160, 255), (255, 150, 50), (90, 220, 120), (255, 110, 200), (240, 230, 80))
-GLYPHS = ("L", "R", "F", "pick", "drop", "open", "end", "?")  # of actions, and of MASK
+GLYPHS = ("L", "R", "F", "pick", "drop", "open", "end", "?")  # the last stands for MASK
 Colour = tuple[int, int, int]
 
 
@@ -24,13 +24,13 @@ def draw_picture(
     ways: Sequence[Sequence[Cell]] = (),
     marked: Sequence[tuple[Sequence[Cell], Colour]] = (),
 ) -> Image.Image:
-    """A level as it is now, with its goal in a white frame, its mission and a caption.
+    """Draws the current level, a white frame around its goal, its mission and a caption.
 
     Args:
-        adapter: of the level.
-        text: the caption.
-        ways: through cells, each drawn in another colour.
-        marked: cells in frames, and their colours.
+        adapter: adapter of the level.
+        text: caption.
+        ways: paths of cells, each drawn in another colour.
+        marked: groups of cells to frame, each with the colour of its frames.
     """
     env, tile = adapter.env, SIDE // adapter.side
     level = Image.fromarray(env.grid.render(tile, tuple(env.agent_pos), env.agent_dir))
@@ -55,16 +55,16 @@ def draw_picture(
 
 
 def spell_actions(actions: np.ndarray) -> str:
-    """A plan `[T]` in short."""
+    """Abbreviates a plan `[T]`."""
     return " ".join(GLYPHS[int(action)] for action in actions)
 
 
 def find_way(adapter: BabyAIAdapter, actions: np.ndarray) -> list[Cell]:
-    """The cells that a plan leads through, found by playing it on a copy of the level."""
+    """Plays a plan on a copy of the level; returns the cells that it leads through."""
     copied = copy.deepcopy(adapter.env)
     cells = [agent_cell(copied)]
     for action in actions:
-        if action >= END:  # or MASK, of a plan that is not complete yet
+        if action >= END:  # end, or MASK in an incomplete plan
             break
         _, _, terminated, truncated, _ = copied.step(int(action))
         cells.append(agent_cell(copied))

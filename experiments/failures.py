@@ -1,8 +1,8 @@
 """Which episodes fail, and why: `python -m experiments.failures runs/NAME [runs/NAME ...]`.
 
-Plays validation levels (never test levels) with trained planners, counts the failures by what
-happened, by how much of the instruction was done and by how long a detour the level asks for, and
-draws some of them.
+Plays validation levels (never test levels) with trained planners. Counts the failures by cause, by
+the completed tasks of the instruction, and by the length of the detour that the level requires.
+Draws some of them.
 """
 
 import dataclasses
@@ -33,12 +33,12 @@ from leapjax.errors import UserError
 from leapjax.running import jax_setup, shell
 from leapjax.running.limits import check_counts, check_executed
 
-FEW_CELLS = 6  # that an agent which goes in circles stays within
+FEW_CELLS = 6  # an agent that stays within so many cells goes in circles
 COLUMNS = 4  # of the gallery
 
 
 class Cause(enum.Enum):
-    """What happened in an episode that failed; the first that applies."""
+    """The cause of a failed episode: the first that applies."""
 
     GAVE_UP = "planned to stop before it was there"
     REFUSED = "did what ends the episode as a failure"
@@ -49,14 +49,14 @@ class Cause(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Say why episodes fail.
+    """Find out why episodes fail.
 
     Attributes:
         runs: Folders of runs of one level, for instance of several seeds.
         episodes: Validation episodes for each run.
-        executed: Actions to execute before replanning; None for the whole plan.
-        gallery: Path of the picture of failures; None for failures.png in the first run's folder.
-        drawn: Failures in the picture, at most.
+        executed: Actions to execute before replanning, by default the whole plan.
+        gallery: Path of the picture of failures, by default failures.png in the first run's folder.
+        drawn: Largest number of failures in the picture.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -67,7 +67,7 @@ class Options:
 
 
 class Recorder(BabyAIAdapter):
-    """An episode that remembers what it began with, where the agent went, and how it ended."""
+    """Records the detour of a level, the agent's cells and the last transition of an episode."""
 
     def __init__(self, level: Level) -> None:
         super().__init__(level)
@@ -77,7 +77,7 @@ class Recorder(BabyAIAdapter):
 
     @property
     def tasks(self) -> list[bool]:
-        """Which single tasks of the instruction are done by now."""
+        """Lists whether each single task of the instruction is done by now."""
         return list_tasks_done(self.env.instrs)  # type: ignore[attr-defined]
 
     def reset(self, seed: int) -> Observation:
@@ -88,14 +88,14 @@ class Recorder(BabyAIAdapter):
         return observation
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions."""
+        """Takes an action of MiniGrid's first six."""
         self.last = super().step(action)
         self.cells.append(observations.agent_cell(self.env))
         return self.last
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Plays, counts, draws; the exit code."""
+    """Reports the failures of some runs; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.failures", given)
     return shell.run_program("experiments.failures", given, lambda: report(options))
@@ -130,11 +130,11 @@ def report(options: Options) -> None:
 
 
 def find_common_level(runs: Sequence[Path], executed: int | None) -> Level:
-    """The level of all of these runs.
+    """Returns the level that all runs share.
 
     Raises:
-        UserError: no run, one that cannot be read or cannot execute so many actions, or several
-            levels.
+        UserError: there is no run, a run cannot be read, its plans have fewer actions than
+            `executed`, or the runs have different levels.
     """
     names = set()
     for run in runs:
@@ -149,7 +149,7 @@ def find_common_level(runs: Sequence[Path], executed: int | None) -> Level:
 def play(
     run: Path, level: Level, played: range, executed: int | None
 ) -> tuple[list[Recorder], list[bool]]:
-    """The episodes of one planner, and whether each succeeded."""
+    """Plays the levels with one planner; returns the episodes, and whether each succeeded."""
     planner = pretrained.load(run)
     recorders: list[Recorder] = []
 
@@ -165,7 +165,10 @@ def play(
 
 
 def measure_detour(adapter: BabyAIAdapter) -> int | None:
-    """Cells that the shortest free way is longer than the straight one; None: no way, no goal."""
+    """Counts the cells by which the shortest free path to the goal exceeds a straight path.
+
+    Returns `None` if there is no goal, or no free path to it.
+    """
     start, goal = observations.agent_cell(adapter.env), adapter.goal
     if goal == observations.NO_GOAL:
         return None
@@ -176,7 +179,7 @@ def measure_detour(adapter: BabyAIAdapter) -> int | None:
 
 
 def find_cause(recorder: Recorder) -> Cause:
-    """Why an episode failed."""
+    """Finds the cause of a failed episode."""
     last, cells = recorder.last, recorder.cells
     if last is not None and last.terminated:
         return Cause.REFUSED
@@ -188,7 +191,7 @@ def find_cause(recorder: Recorder) -> Cause:
 
 
 def list_tasks_done(instruction: Instr) -> list[bool]:
-    """Which single tasks of an instruction are done, in its order.
+    """Lists whether each single task of an instruction is done, in the instruction's order.
 
     A task that is the whole instruction never counts as done: its success ends the episode.
     """
@@ -203,7 +206,7 @@ def list_tasks_done(instruction: Instr) -> list[bool]:
 
 
 def make_cause_table(failed: Sequence[Recorder]) -> Table:
-    """Failures by what happened."""
+    """Tabulates the failures by cause."""
     counts = Counter(find_cause(recorder) for recorder in failed)
     result = Table("what happened", "episodes")
     for each in Cause:
@@ -213,7 +216,7 @@ def make_cause_table(failed: Sequence[Recorder]) -> Table:
 
 
 def make_task_table(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
-    """Failures by how many tasks the instruction has, and how many of them were done."""
+    """Tabulates the failures by the instruction's number of tasks, and by how many were done."""
     totals = Counter(len(r.tasks) for r in played)
     failures = Counter((len(done), sum(done)) for done in (r.tasks for r in failed))
     result = Table("tasks of the instruction", "episodes", "failed, by how many were done")
@@ -226,7 +229,7 @@ def make_task_table(played: Sequence[Recorder], failed: Sequence[Recorder]) -> T
 
 
 def make_detour_table(played: Sequence[Recorder], failed: Sequence[Recorder]) -> Table:
-    """Failures by how much longer than straight the shortest free way is."""
+    """Tabulates the failures by detour, see `measure_detour`."""
     totals, failures = (Counter(r.detour for r in some) for some in (played, failed))
     result = Table("detour (cells)", "episodes", "failed")
     for length in sorted(totals, key=lambda n: (n is None, n)):
@@ -237,7 +240,7 @@ def make_detour_table(played: Sequence[Recorder], failed: Sequence[Recorder]) ->
 
 
 def draw_gallery(failed: Sequence[Recorder], path: Path) -> None:
-    """How each episode ended, with all of its way.
+    """Draws the end of each episode, with the agent's whole path.
 
     Raises:
         UserError: the picture cannot be written.

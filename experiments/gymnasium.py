@@ -1,6 +1,6 @@
 """Any Gymnasium environment: `python -m experiments.gymnasium --env ID --dataset ID --help`.
 
-Trains a method on a Minari data set of an environment with discrete actions, and plays it.
+Trains a method on a Minari data set of an environment with discrete actions, and plays episodes.
 """
 
 import sys
@@ -14,7 +14,7 @@ EXPERIMENT = Experiment("gymnasium", "gymnasium", config=GymnasiumConfig)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs every environment and seed asked for; the exit code."""
+    """Runs every chosen environment and seed; returns the exit code."""
     return running.main(EXPERIMENT, arguments)
 
 

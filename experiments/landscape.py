@@ -1,8 +1,9 @@
-"""What energies training gives to good and bad plans: `python -m experiments.landscape --help`.
+"""Energies of good and bad plans over training: `python -m experiments.landscape --help`.
 
-The paper's 'Energy Landscape Verification' (section 4, figure 6, right): the energy of
-demonstrations that were never learned from, as they are and with a share of their actions replaced
-at random, over training. Beside it, the energy of plans over the iterations that refine them.
+The paper's 'Energy Landscape Verification' (section 4, figure 6, right). Measures the energy of
+demonstrations that the model never learned from, over training: as they are, and with a share of
+their actions replaced at random. Also measures the energy of plans over the iterations that refine
+them.
 """
 
 import dataclasses
@@ -38,21 +39,21 @@ from leapjax.running.run import Experiment, Run, open_run
 from leapjax.running.train import train
 from leapjax.types import Context, Energy, Params, Window
 
-CORRUPTED = (0, 25, 50, 75, 100)  # percent of a plan's actions that are random
+CORRUPTED = (0, 25, 50, 75, 100)  # percent of a demonstration's actions replaced at random
 EXPERIMENT = Experiment("landscape", "babyai")
 RESULTS = Path("landscape.json")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train, and watch the energies of good and bad plans.
+    """Train, and track the energies of good and bad plans.
 
     Attributes:
-        level: Level of BabyAI; the paper's is the default.
-        presets: Presets to train with, "paper" or "leapjax" or both.
+        level: Level of BabyAI, by default the paper's.
+        presets: Presets to train with: "paper", "leapjax" or both.
         seed: Training seed.
-        trajectories: Demonstrations to compute the energy of, and contexts to plan for.
-        steps: Training steps; None for as many as the preset has.
+        trajectories: Number of demonstrations to score, and of contexts to plan for.
+        steps: Training steps, by default the preset's.
         record: Write the result to results/, which is committed.
         runs: Folder for trained models, and for a result that is not recorded.
     """
@@ -67,7 +68,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Trains with each preset and says what was found; the exit code."""
+    """Trains with each preset and reports the energies; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.landscape", given)
     return shell.run_interruptible_program(
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(options: Options, interruption: Interruption) -> None:
-    """Trains with each preset; the table, the file and the figure of what was found."""
+    """Trains with each preset, prints a table, and writes the file and the figure."""
     check_counts(options, "trajectories")
     if options.steps is not None:
         check_counts(options, "steps")
@@ -92,7 +93,7 @@ def report(options: Options, interruption: Interruption) -> None:
         config = find_preset("babyai", options.level, "leap", preset)
         if options.steps is not None:
             config = change(config, training={"steps": options.steps})
-        # What is watched is part of a run: one of another count is another run.
+        # A run records energies of so many trajectories: another number makes another run.
         runs = options.runs / f"landscape-{options.trajectories}"
         config = dataclasses.replace(config, seeds=(options.seed,), runs=runs)
         limits.check(config)
@@ -113,7 +114,7 @@ def report(options: Options, interruption: Interruption) -> None:
 
 
 def keep_measurements(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
-    """Adds what was found to a file, in the place of others of the same level, preset and seed."""
+    """Adds measurements to a file; they replace those with equal level, preset and seed."""
 
     def name(each: Mapping[str, Any]) -> tuple[Any, ...]:
         return each["level"], each["preset"], each["seed"]
@@ -125,7 +126,7 @@ def keep_measurements(path: Path, found: Sequence[Mapping[str, Any]]) -> None:
 
 
 def measure_landscape(this: Run, count: int) -> dict[str, Any]:
-    """One training, watched; and plans of what was learned."""
+    """Measures energies during one training, and energies of plans after it."""
     firsts = collect_beginnings(this, count)
     end = this.domain.num_actions - 1
 
@@ -137,7 +138,7 @@ def measure_landscape(this: Run, count: int) -> dict[str, Any]:
     last = measure(planner.energy, planner.params)
     curve = read_metrics(this.folder)
     watched = [{"step": m["step"], **{k: m[k] for k in last}} for m in curve]
-    if not watched:  # trained before, and its curve is gone
+    if not watched:  # the model was trained before, and its curve is gone
         watched = [{"step": this.config.training.steps, **last}]
     return {
         "level": this.config.level,
@@ -152,12 +153,12 @@ def measure_landscape(this: Run, count: int) -> dict[str, Any]:
 
 
 def collect_beginnings(this: Run, count: int) -> Window:
-    """The beginnings `[B]` of demonstrations of another training seed.
+    """Collects the first windows `[B]` of demonstrations with another training seed.
 
-    Of those that are as long as a plan: to some models the end of an episode is no action.
+    Leaves out demonstrations shorter than a plan, because some models have no end action.
 
     Raises:
-        UserError: none is.
+        UserError: all demonstrations are shorter than a plan.
     """
     domain, specification = this.domain, this.specification
     horizon = specification.planner.horizon
@@ -176,9 +177,9 @@ def collect_beginnings(this: Run, count: int) -> Window:
 
 
 def corrupt_actions(key: jax.Array, actions: jax.Array, share: float, end: int) -> jax.Array:
-    """Actions `[T]`, each random with a probability, but never the end action.
+    """Replaces each action of `[T]` with probability `share` by a random one.
 
-    Where a demonstration goes on, the end is not one of its actions.
+    Never draws the end action, because a demonstration has it only after its last step.
     """
     where_key, action_key = jax.random.split(key)
     wrong = jax.random.uniform(where_key, actions.shape) < share
@@ -189,7 +190,7 @@ def corrupt_actions(key: jax.Array, actions: jax.Array, share: float, end: int) 
 def compute_mean_energy(
     energy: Energy, params: Params, begins: Window, share: float, end: int
 ) -> jax.Array:
-    """The mean energy `[]` of what was done in windows `[B]`, a share of it replaced at random."""
+    """Computes the mean energy `[]` of windows `[B]` with a share of their actions replaced."""
 
     def one(place: jax.Array, window: Window) -> jax.Array:
         actions = corrupt_actions(jax.random.key(place), window.actions, share, end)
@@ -199,12 +200,13 @@ def compute_mean_energy(
 
 
 def measure_refinement(planner: Pretrained, contexts: Context) -> dict[str, list[Any]]:
-    """The energy of plans after every iteration, with the paper's N: their mean, and some.
+    """Plans, and returns the energies after each iteration: their mean, and eight single curves.
 
-    Plans of what demonstrations began with, so that their energies compare.
+    Plans with N = 10, the paper's for the default level, or more if the preset does. The contexts
+    are beginnings of demonstrations, so that the energies compare.
     """
     trained = planner.specification.planner
-    assert isinstance(trained, GibbsConfig)  # as of every energy over plans of several actions
+    assert isinstance(trained, GibbsConfig)  # as for every energy over plans of several actions
     config = dataclasses.replace(trained, iterations=max(10, trained.iterations), score_trace=True)
     plan = compile_planner(planner.energy, config, (PLANS_TOGETHER,))
     keys = jax.random.split(jax.random.key(0), len(jax.tree.leaves(contexts)[0]))
@@ -217,7 +219,7 @@ def measure_refinement(planner: Pretrained, contexts: Context) -> dict[str, list
 
 
 def make_table(found: Sequence[dict[str, Any]]) -> Table:
-    """Energies at the end of training, for a terminal."""
+    """Tabulates the energies at the end of training for a terminal."""
     names = [f"{share}% random" for share in CORRUPTED]
     shown = Table("level", "preset", *names, "plans, N = 1", "last")
     for each in found:

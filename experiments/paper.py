@@ -13,10 +13,10 @@ SUCCESS = {
 
 
 def list_success(level: str) -> dict[str, float]:
-    """The paper's success rates on a level, in percent, by method; of other levels none."""
+    """Returns the paper's success rates on a level in percent, by method; empty if unknown."""
     return dict(zip(METHODS, SUCCESS.get(level, ()), strict=False))
 
 
 def find_success(level: str, method: str) -> float | None:
-    """The paper's success rate of a method on a level, in percent; None where it has none."""
+    """Returns the paper's success rate of a method on a level in percent, `None` if unknown."""
     return list_success(level).get(method)

@@ -1,7 +1,7 @@
-"""What planning by energy gives (paper, section 5): `python -m experiments.properties --help`.
+"""Properties of planning by energy (paper, section 5): `python -m experiments.properties --help`.
 
-Constraints that training never saw, levels that are larger than those learned, models that each
-know a part of the task; and, beyond the paper, several constraints at once.
+Tests constraints that training never saw, levels larger than in training, and sums of models that
+each know a part of the task. Beyond the paper, it tests several constraints at once.
 """
 
 import dataclasses
@@ -43,32 +43,32 @@ from leapjax.types import Context, Energy
 
 Penalty = Callable[[Context, jax.Array], jax.Array]
 Minimise = Callable[[Sequence[Energy]], Energy]  # see `Way`
-# Turns enough to visit a cell of a room, and then to face an object: of the room when empty, and
-# where six more objects are in the way.
+# Turns that suffice to visit a cell of a room and then face an object: without other objects in the
+# room, and with six.
 FEW_TURNS, DETOUR_TURNS = 5, 9
-WEIGHT = 20.0  # of a violation, or of a step to go, in nats: more than any detour costs
-LIGHT = 5.0  # the same for beams, which would otherwise all stand where the cell is nearest
-AGAIN = 16.0  # nats for each time that the agent was before where it comes to
+WEIGHT = 20.0  # nats for a violation, or for a step to go: more than any detour costs
+LIGHT = 5.0  # the same for beam search: with more, all beams stop at the place nearest to the cell
+AGAIN = 16.0  # nats for each earlier visit to a pose of the plan
 PICKUP = ACTIONS.index("pickup")
 
 
 def train_longer(config: AnyConfig) -> AnyConfig:
-    """Trains every method longer, where one of them has more to learn."""
+    """Trains every method for 3,000 steps, because augmentation gives some more to learn."""
     return change(config, training={"steps": 3000})
 
 
 def add_false_starts(config: AnyConfig) -> AnyConfig:
-    """Shows LEAP where beginnings lead that no demonstration has: a constraint asks for such ones.
+    """Shows LEAP how to go on after beginnings that constraints force and no demonstration has.
 
-    A plan of one action has no beginning that others could follow.
+    The other methods plan one action, so their plans have no beginning to go on from.
     """
     return augment(config, false_starts=0.6) if config.method == "leap" else config
 
 
 def add_detours(config: AnyConfig) -> AnyConfig:
-    """Shows ways around things, which demonstrations of empty rooms never have.
+    """Shows LEAP and DT paths around obstacles, which demonstrations of empty rooms never have.
 
-    IQL learns from transitions: nobody goes around anything in one step.
+    IQL learns from single steps, and a detour takes several.
     """
     if config.method not in ("leap", "dt"):
         return config
@@ -76,17 +76,17 @@ def add_detours(config: AnyConfig) -> AnyConfig:
 
 
 def learn_in_room(config: AnyConfig) -> AnyConfig:
-    """Learns in an empty room for levels with obstacles and constraints."""
+    """Configures training in an empty room for levels with obstacles and constraints."""
     return train_longer(add_detours(add_false_starts(config)))
 
 
 def learn_in_maze(config: AnyConfig) -> AnyConfig:
-    """Learns in a maze for levels with constraints."""
+    """Configures training in a maze for levels with constraints."""
     return train_longer(add_false_starts(config))
 
 
 def learn_among_objects(config: AnyConfig) -> AnyConfig:
-    """Plans ten actions: a detour around objects is longer than plans in an empty room."""
+    """Configures training among objects; LEAP plans ten actions, as detours around them need."""
     found = learn_in_maze(config)
     if config.method != "leap":
         return found
@@ -94,13 +94,13 @@ def learn_among_objects(config: AnyConfig) -> AnyConfig:
 
 
 def learn_for_maze(config: AnyConfig, sweeps: int) -> AnyConfig:
-    """Learns in a room for a maze, whose ways are as long as so many sweeps reach."""
+    """Configures training in a room for a maze whose paths have up to `sweeps` steps."""
     changed = change(config, domain_settings={"sweeps": sweeps}, training={"steps": 2000})
     return add_detours(changed)
 
 
 def learn_long_distances(config: AnyConfig) -> AnyConfig:
-    """Learns distances as long as the ways in a maze."""
+    """Configures distances as long as the paths in a maze."""
     return change(config, domain_settings={"sweeps": 40})
 
 
@@ -112,7 +112,7 @@ class Watched(BabyAIAdapter):
         self.violations = 0
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions."""
+        """Takes an action of MiniGrid's first six."""
         transition = super().step(action)
         stands_on = self.env.grid.get(*self.env.agent_pos)
         self.violations += stands_on is not None and stands_on.type == "lava"
@@ -123,13 +123,13 @@ class WatchedTurns(Watched):
     """Counts steps onto lava, and turns to the left."""
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions."""
+        """Takes an action of MiniGrid's first six."""
         self.violations += action == LEFT
         return super().step(action)
 
 
 class WatchedErrand(Watched):
-    """Needs the coloured cell to be visited; counts goals before that, and turns over a budget."""
+    """Requires a visit to the coloured cell; counts goals before it, and turns beyond a budget."""
 
     def __init__(self, level: str, budget: int) -> None:
         super().__init__(level)
@@ -141,7 +141,7 @@ class WatchedErrand(Watched):
         return super().reset(seed)
 
     def step(self, action: int) -> Transition:
-        """Takes one of MiniGrid's first six actions; what was visited is a cell like others."""
+        """Takes an action of MiniGrid's first six; a visit makes the coloured cell an empty one."""
         self._turns += action in TURNS
         self.violations += action in TURNS and self._turns > self._budget
         transition = super().step(action)
@@ -158,14 +158,14 @@ def _is_marked(cell: WorldObj | None) -> bool:
 
 
 def penalise_unseen(*penalties: Penalty, weight: float = WEIGHT) -> Minimise:
-    """The energy of a model that sees neither lava nor coloured cells, and penalties that do."""
+    """Adds penalties to a model, and hides lava and coloured cells from the model."""
     return functools.partial(_penalised, penalties=penalties, weight=weight)
 
 
 def _penalised(energies: Sequence[Energy], penalties: Sequence[Penalty], weight: float) -> Energy:
     def penalty(context: Context, actions: jax.Array) -> jax.Array:
         count = sum((each(context, actions) for each in penalties), jnp.zeros(()))
-        return jnp.where(count > 0, weight * count, 0.0)  # the weight may be infinite
+        return jnp.where(count > 0, weight * count, 0.0)  # avoids inf * 0
 
     def hide_obstacles(context: Context) -> Context:
         return hide_marks(hide_lava(context))
@@ -173,12 +173,12 @@ def _penalised(energies: Sequence[Energy], penalties: Sequence[Penalty], weight:
     return constrain(view(energies[0], hide_obstacles), penalty, partial=True)
 
 
-# What judges the next action alone: those that violate anything at once are removed.
+# Forbids violations. A penalty of the next action alone removes the actions that violate it.
 masked = functools.partial(penalise_unseen, weight=math.inf)
 
 
 def penalise_revisits(minimise: Minimise, handling: bool = False) -> Minimise:
-    """The same energy, and more for each time that the agent comes where it was."""
+    """Adds a penalty for each earlier visit to a pose of the plan, see `count_revisits`."""
     return functools.partial(_explored, minimise=minimise, nats=AGAIN, handling=handling)
 
 
@@ -192,51 +192,51 @@ def _explored(
 
 
 def fill_left_to_right(trained: GibbsConfig) -> GibbsConfig:
-    """Gibbs sampling that fills a plan from its beginning, which a constraint then judges."""
+    """Fills a plan from left to right, so that a constraint can judge its beginning."""
     return dataclasses.replace(trained, fill="sequential", iterations=trained.horizon, resampled=1)
 
 
 def search_beams(trained: GibbsConfig) -> BeamConfig:
-    """Many beginnings of a plan at once: where what leads to the end first leads away from it."""
+    """Keeps 16 beginnings of a plan, because the way to the goal may first lead away from it."""
     return BeamConfig(horizon=trained.horizon, beams=16)
 
 
-# Where models disagree the likeliest plan leads nowhere: noise leads out of it.
+# If models disagree, the likeliest plan leads nowhere; noise leads out of such states.
 noisily = draw_at(2.0)
-# Of what is left where the likeliest action is removed, the likeliest leads to and fro.
+# If the likeliest action is forbidden, the next likeliest leads to and fro; noise breaks this up.
 wandering = draw_at(5.0)
 
 
 def refine_plan(trained: GibbsConfig, rounds: int = 3) -> GibbsConfig:
-    """Filled from its beginning, and gone over again: what comes later says what is first."""
+    """Fills a plan from left to right, then resamples it: later actions inform earlier ones."""
     filled = fill_left_to_right(trained)
     return dataclasses.replace(filled, iterations=rounds * filled.iterations)
 
 
 def refine_once(trained: GibbsConfig) -> GibbsConfig:
-    """Filled from its beginning, then gone over once more: where a detour is to be found."""
+    """Fills a plan from left to right, then makes T Gibbs steps at temperature 1, for detours."""
     return dataclasses.replace(refine_plan(trained, rounds=2), temperature=1.0)
 
 
 def halves(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
-    """Two models, each of which sees one half of the obstacles."""
+    """Adds two models; each sees one half of the obstacles."""
     views = (functools.partial(hide_half_of_obstacles, part=part) for part in (0, 1))
     return compose([view(e, see) for e, see in zip(energies, views, strict=True)], weights)
 
 
 def one_half(energies: Sequence[Energy]) -> Energy:
-    """The first of them, in the frame of the sum."""
+    """Weighs `halves` so that the first model decides alone."""
     return halves(energies, [1.0, 0.0])
 
 
 def fetch(energies: Sequence[Energy], weights: Sequence[float] | None = None) -> Energy:
-    """A model that goes to objects, which says nothing of picking up, and one that picks up."""
+    """Adds a model that goes to objects, neutral about picking up, and a model that picks up."""
     go, pick_up = energies
     return compose([neutral(view(go, replace_pick_up), [PICKUP]), pick_up], weights)
 
 
 def only_pick_up(energies: Sequence[Energy]) -> Energy:
-    """The second of them, in the frame of the sum."""
+    """Weighs `fetch` so that the second model decides alone."""
     return fetch(energies, [0.0, 1.0])
 
 
@@ -247,13 +247,13 @@ def _make_explorers(
     search: Callable[[GibbsConfig], GibbsConfig] = lambda trained: trained,
     handling: bool = False,
 ) -> list[Way]:
-    """Every method, where coming back costs: LEAP's plans, three actions or one of each executed.
+    """Makes a way of each method with a cost of revisits; LEAP executes three actions, or one.
 
     Args:
-        name: what LEAP's way is called without that.
-        minimise: without that.
-        at_once: what methods of one action minimise; None: the same.
-        search: how LEAP plans.
+        name: LEAP's way without this cost.
+        minimise: energy without this cost.
+        at_once: energy for DT and IQL without this cost, by default `minimise`.
+        search: LEAP's search when it executes three actions.
         handling: see `count_revisits`.
     """
     whole, single = (penalise_revisits(m, handling) for m in (minimise, at_once or minimise))
@@ -267,7 +267,7 @@ def _make_explorers(
 
 
 def _make_noisier(minimise: Minimise, temperature: float) -> list[Way]:
-    """Methods of one action, drawn as preset `paper` asks for."""
+    """Makes ways of DT and IQL with the higher temperature that preset `paper` needs."""
     search = draw_at(temperature)
     return [Way(f"{name}, with more noise", name, minimise, search) for name in ("dt", "iql")]
 
@@ -354,12 +354,15 @@ def _make_plain(paper: tuple[float, float, float], minimise: Minimise = alone) -
 
 
 def doors_as_empty(energies: Sequence[Energy]) -> Energy:
-    """What the one model of a case says where open doors are shown as empty cells."""
+    """Shows open doors as empty cells to the model of a case."""
     return view(energies[0], hide_open_doors)
 
 
 def _make_without_doors(paper: tuple[float, float, float]) -> list[Way]:
-    """As it is, and told what no demonstration has shown: that open doors are no obstacles."""
+    """Makes the plain ways, and the same ways with open doors shown as empty cells.
+
+    No demonstration shows that open doors are no obstacles.
+    """
     views = _make_plain(paper, doors_as_empty)
     named = [way._replace(name=f"{way.name}, open doors seen as empty") for way in views]
     return [*_make_plain(paper), *named]
@@ -386,7 +389,7 @@ CASES = (
     _make_adaptation("medium", ROOM, "GoToLavaMedium", (64.5, 20.0, 52.0)),
     _make_adaptation("hard", OPEN_MAZE, "GoToLavaHard", (54.5, 48.0, 44.0)),
     Case("generalization-easy", [ROOM], "GoToLocalS8N15", _make_plain((77.5, 36.0, 60.5))),
-    # Distances reach as far as ways in the maze are long, not as those in a room.
+    # Distances are as long as the paths in the maze, not only as those in a room.
     Case(
         "generalization-medium",
         [Model("GoToLocalS7N1", functools.partial(learn_for_maze, sweeps=28))],
@@ -428,7 +431,7 @@ ANALYSIS = Analysis("properties", CASES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Every case asked for; the exit code."""
+    """Runs the chosen cases; returns the exit code."""
     return cases.main(ANALYSIS, arguments)
 
 

@@ -1,6 +1,6 @@
 """Puts trained planners into the library: `python -m experiments.publish runs/NAME ...`.
 
-What is published is what `leapjax.load` finds by the name of its level. It is committed.
+`leapjax.load` finds a published planner by the name of its level. Its files are committed.
 """
 
 import dataclasses
@@ -24,14 +24,14 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Publishes every run that is named."""
+    """Publishes every run that the command line names; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.publish", given)
     return shell.run_program("experiments.publish", given, lambda: publish_runs(options.runs))
 
 
 def publish_runs(runs: Sequence[Path]) -> None:
-    """Publishes runs, the later one where two are of one level."""
+    """Publishes runs; of two runs on the same level, the later one stays."""
     targets = [pretrained.PUBLISHED / pretrained.read_specification(run).level for run in runs]
     jax_setup.start()
     for folder, target in zip(runs, targets, strict=True):

@@ -1,9 +1,8 @@
 """Drawings of plans: `python -m experiments.qualitative --help`.
 
-The paper's two figures 'Qualitative Visualization'.
-
-Plans after N = 1, 5 and 10 iterations and what they lead to, of published planners; and what
-models of `experiments.properties` do in worlds that they were not trained in.
+Draws the paper's two figures 'Qualitative Visualization'. The first shows plans of published
+planners after N = 1, 5 and 10 iterations, and their execution. The second shows how models of
+`experiments.properties` act in worlds that they were not trained in.
 """
 
 import dataclasses
@@ -39,12 +38,12 @@ from leapjax.types import Plan
 
 FIGURES = ("plans", "properties")
 ITERATIONS = (1, 5, 10)
-STEPS = 10  # of an episode that is drawn, at least
-HALVES = ((255, 80, 80), (80, 255, 255))  # frames of obstacles that one model sees: red, cyan
-MOST_LEVELS, MOST_PLANS = 200, 30  # to look at, for one; and to draw
-# Tasks of the first figure: planning a trajectory, and completing an instruction.
+STEPS = 10  # length of the shortest episode that is drawn
+HALVES = ((255, 80, 80), (80, 255, 255))  # frames of each model's obstacles: red, cyan
+MOST_LEVELS, MOST_PLANS = 200, 30  # levels to search for an episode; plans to draw
+# Levels of the first figure: planning a trajectory, and completing an instruction.
 PLANNED = ("GoToObjMazeS4", "GoToSeqS5R2")
-# Cases of the second one, and which of their ways.
+# Cases of the second figure, each with the way that is drawn.
 ASKED = (
     ("adaptation-medium", "whole plan, exploring"),
     ("generalization-hard", "leap, exploring"),
@@ -54,12 +53,12 @@ ASKED = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Draw plans, and what comes of them.
+    """Draw plans and their execution.
 
     Attributes:
-        seed: Training seed of models that are not trained yet.
-        test_seed: Level seed to search from for episodes to draw; the first that are long enough
-            are drawn.
+        seed: Training seed of the models of the second figure.
+        test_seed: Level seed where the search for episodes begins. The first suitable episodes are
+            drawn.
         record: Write the figures to docs/, which is committed.
         runs: Folder for trained models, and for figures that are not recorded.
     """
@@ -71,18 +70,27 @@ class Options:
 
 
 class Drawn(NamedTuple):
-    """An episode: how its first plan came about, and where all of them led."""
+    """An episode: the iterations of its first plan, and the paths of all plans.
+
+    Attributes:
+        level_seed: seed of the level.
+        trace: `[N, T]`, the first plan after each iteration.
+        ways: cells that the agent visited, by plan.
+        steps: length of the episode.
+        outcome: "success", "failed", "gave up" or "not finished".
+        adapter: level at the end of the episode.
+    """
 
     level_seed: int
-    trace: np.ndarray  # [N, T] of the first plan
-    ways: Sequence[Sequence[Cell]]  # through the level, one of each plan
+    trace: np.ndarray
+    ways: Sequence[Sequence[Cell]]
     steps: int
     outcome: str
-    adapter: BabyAIAdapter  # as it was left
+    adapter: BabyAIAdapter
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draws both figures; the exit code."""
+    """Draws both figures; returns the exit code."""
     given = shell.read_arguments(arguments)
     options = shell.parse(Options, "experiments.qualitative", given)
     return shell.run_interruptible_program(
@@ -91,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def draw_figures(options: Options, interruption: Interruption) -> None:
-    """Both figures."""
+    """Draws both figures."""
     seeds.test_seeds(options.test_seed, MOST_LEVELS)
     seeds.training_seeds(options.seed)
     jax_setup.start()
@@ -103,7 +111,7 @@ def draw_figures(options: Options, interruption: Interruption) -> None:
         interruption,
     )
     folder = Path("docs") if options.record else options.runs
-    for where in (folder, options.runs):  # not after hours of work
+    for where in (folder, options.runs):  # fails before hours of work
         files.check_writable(where)
     refined = [each for level in PLANNED for each in draw_refinement(level, options.test_seed)]
     asked = [draw_unlearned(work, *names, options) for names in ASKED]
@@ -115,14 +123,14 @@ def draw_figures(options: Options, interruption: Interruption) -> None:
 
 
 def draw_refinement(level: str, first: int) -> list[Image.Image]:
-    """A plan of a published planner after some iterations of algorithm 1, and what came of it."""
+    """Draws a published planner's plan after some iterations of algorithm 1, and its execution."""
     planner = pretrained.load(level)
     trained = planner.specification.planner
-    assert isinstance(trained, GibbsConfig)  # as all that are published
+    assert isinstance(trained, GibbsConfig)  # as for all published planners
     search = dataclasses.replace(trained, iterations=max(ITERATIONS), fill="together", resampled=1)
 
     def plans_of(found: Drawn) -> tuple[BabyAIAdapter, list[list[Cell]]]:
-        """The level as it was at first, and where plans lead after more and more iterations."""
+        """Returns the level at its start, and the plan's path after each number of iterations."""
         with closing(BabyAIAdapter(find_level(level))) as start:
             start.reset(found.level_seed)
         return start, [find_way(start, found.trace[n - 1]) for n in ITERATIONS]
@@ -142,7 +150,7 @@ def draw_refinement(level: str, first: int) -> list[Image.Image]:
 
 
 def draw_unlearned(work: Work, case_name: str, way_name: str, options: Options) -> Image.Image:
-    """What models do in a world that they were not trained in."""
+    """Draws how models act in a world that they were not trained in."""
     (case,) = (case for case in properties.CASES if case.name == case_name)
     (way,) = (way for way in case.ways if way.name == way_name)
     models = cases.load_models(work, case, way.method, options.seed)
@@ -150,7 +158,7 @@ def draw_unlearned(work: Work, case_name: str, way_name: str, options: Options) 
     planner = cases.make_planner(cases.make_played_domain(case.level, models), way, models, search)
     found = find_episode(case.level, planner, way.executed, options.test_seed)
     halves: list[tuple[list[Cell], Colour]] = []
-    if case_name.startswith("composition"):  # who sees which obstacles
+    if case_name.startswith("composition"):  # each model sees a half of the obstacles
         state = found.adapter.observe()
         halves = [
             (
@@ -165,7 +173,7 @@ def draw_unlearned(work: Work, case_name: str, way_name: str, options: Options) 
 def draw_executed(
     found: Drawn, name: str = "", marked: Sequence[tuple[Sequence[Cell], Colour]] = ()
 ) -> Image.Image:
-    """What came of an episode's plans, each in a colour of its own."""
+    """Draws the paths of an episode's plans, each in its own colour."""
     plans = f"{len(found.ways)} plan{'s' * (len(found.ways) > 1)}"
     text = f"{name}{': ' * bool(name)}{plans}, {found.steps} steps, {found.outcome}"
     return draw_picture(found.adapter, text, found.ways, marked)
@@ -178,17 +186,17 @@ def find_episode(
     first: int,
     wanted: Callable[[Drawn], bool] = lambda found: True,
 ) -> Drawn:
-    """The first episode of some length that is wanted.
+    """Finds the first wanted episode of at least `STEPS` steps.
 
     Args:
-        level: its name.
-        planner: for it.
-        limit: actions of each plan that are executed; None for all.
-        first: level seed to look from.
-        wanted: whether to draw it.
+        level: name of the level.
+        planner: planner for the level.
+        limit: executed actions of each plan; `None` for all.
+        first: level seed where the search begins.
+        wanted: whether to draw an episode.
 
     Raises:
-        UserError: there is none among many.
+        UserError: `MOST_LEVELS` levels have no such episode.
     """
     for level_seed in range(first, first + MOST_LEVELS):
         with closing(BabyAIAdapter(find_level(level))) as adapter:
@@ -201,7 +209,7 @@ def find_episode(
 def play_episode(
     adapter: BabyAIAdapter, planner: Pretrained, limit: int | None, level_seed: int
 ) -> Drawn:
-    """One episode."""
+    """Plays one episode, and records its plans and paths."""
     traces: list[np.ndarray] = []
     ways: list[list[Cell]] = []
     steps, outcome = 0, "gave up"

@@ -1,6 +1,6 @@
 """Tables in the documents, made from the committed rows: `python -m experiments.report`.
 
-What is in each is a function of rows in `experiments/tables/`.
+`experiments/tables/` holds the functions that make tables from rows.
 """
 
 import argparse
@@ -25,7 +25,7 @@ EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Rewrites every table here; the exit code."""
+    """Rewrites the tables and figures in the current folder; returns the exit code."""
     given = shell.read_arguments(arguments)
     about = "Rewrites the tables in the documents, and the figures, from results/ in this folder."
     command = startup.format_command("experiments.report")
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def rewrite_tables() -> None:
-    """Rewrites every table, and draws every figure of rows, here."""
+    """Rewrites every table, and draws every figure of rows, in the current folder."""
     for path, text in make_documents(Path()).items():
         write_text(path, text)
     rows, folder = read_rows(Path(), "babyai"), Path("docs")
@@ -50,10 +50,10 @@ def rewrite_tables() -> None:
 
 
 def read_rows(root: Path, *names: str) -> list[Row]:
-    """Reads the rows of some experiments, each with its episodes where they are recorded.
+    """Reads the rows of some experiments, each with its recorded episodes, if there are any.
 
     Raises:
-        UserError: a row that tables could not be made from, or of another experiment.
+        UserError: a row is invalid, or belongs to another experiment.
     """
     found = []
     for name in names:
@@ -75,14 +75,14 @@ def _read_measured(root: Path, name: str) -> Any:
 
 
 def read_sources(root: Path) -> dict[str, Any]:
-    """What tables are made from: rows by experiment, and what was measured, by file."""
+    """Reads the sources of the tables: rows by experiment, and measurements by file."""
     rows: dict[str, Any] = {name: read_rows(root, name) for name in EXPERIMENTS}
     rows |= {name: _read_measured(root, name) for name in MEASURED}
     return rows | {"puzzles": [row for name in PUZZLES for row in rows[name]]}
 
 
 def make_documents(root: Path) -> dict[Path, str]:
-    """What each document with tables should say, given the rows."""
+    """Returns the text of each document, with its tables made from the rows."""
     rows = read_sources(root)
     sections = list_sections(rows)
     written = {}
@@ -96,10 +96,10 @@ def make_documents(root: Path) -> dict[Path, str]:
 
 
 def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], str], str]]:
-    """By name of the section, what makes its table, and the source of the rows that it takes.
+    """Lists, by name of the section, the function that makes its table and that function's source.
 
     Args:
-        rows: by source: some tables take a second one.
+        rows: rows and measurements by source, for tables that need a second source.
     """
     properties = ANALYSES["properties"]
     return {
@@ -146,7 +146,7 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
 
 
 def replace_section(text: str, name: str, section: str) -> str:
-    """The text with what is between the two markers of that name replaced."""
+    """Replaces the text between the two markers of a section."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, rest = text.split(begin)
     _, after = rest.split(end)

@@ -1,4 +1,4 @@
-"""The way through star graphs being found, by planners side by side, as an animated GIF."""
+"""An animated GIF of planners that search for the path through a star graph, side by side."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ from leapjax.pretrained import Pretrained
 from leapjax.running.run import Run
 
 SIDE, CAPTION, RADIUS = 330, 44, 11  # pixels, as are the next two
-SPACING, MOST = 28, 1000  # from node to node; of a side
+SPACING, MOST = 28, 1000  # between two nodes; of a side, at most
 PASS_MS, LAST_MS = 700, 2200
 SHOWN = ("Gibbs sampling, random order", "most certain first")
 WHITE, GREY, BLACK = (255, 255, 255), (170, 170, 170), (0, 0, 0)
@@ -26,7 +26,7 @@ BLUE, LIGHT, GREEN, RED = (80, 160, 255), (205, 228, 255), (60, 170, 80), (215, 
 
 
 def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> None:
-    """Draws the passes over one graph per level seed; nothing for methods of one action."""
+    """Draws the passes over one graph per level seed; skips methods that plan one action."""
     if not list_searches(run.config):
         return
     horizon, fills = run.config.planner.horizon, planner.energy.accepts_mask
@@ -58,7 +58,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
 def _draw_frames(
     star: Star, graph: Graph, path: np.ndarray, traces: dict[str, np.ndarray]
 ) -> list[Frame]:
-    """One frame for each pass, the planners side by side."""
+    """Draws one frame for each pass, with the planners side by side."""
     places, side = place_nodes(star, graph), choose_side(star)
     passes = len(next(iter(traces.values())))
     found = []
@@ -73,12 +73,12 @@ def _draw_frames(
 
 
 def choose_side(star: Star) -> int:
-    """Pixels of a picture whose nodes do not cover each other, unless it would be too large."""
+    """Returns a picture's side in pixels: its nodes do not overlap, unless it gets too large."""
     return min(max(SIDE, 2 * (SPACING * star.length + 2 * RADIUS)), MOST)
 
 
 def place_nodes(star: Star, graph: Graph) -> dict[int, tuple[float, float]]:
-    """Where each node is drawn: the centre in the middle, arms as rays."""
+    """Returns the position of each node: the centre in the middle, arms as rays."""
     after: dict[int, list[int]] = {}
     for parent, child in graph.edges.tolist():
         after.setdefault(parent, []).append(child)
@@ -106,10 +106,11 @@ def draw_picture(
     name: str,
     last: bool,
 ) -> Image.Image:
-    """The graph, the plan after the last pass of `trace [n, T]`, and what it is.
+    """Draws the graph and the plan after the last pass of `trace [n, T]`, with a caption.
 
-    Nodes of the plan are blue, those of this pass dark; at the end green where they are right.
-    """  # fmt: skip
+    Nodes of the plan are light blue, and dark blue if this pass changed them. After the last pass
+    right nodes are green, and wrong nodes red.
+    """
     image = Image.new("RGB", (side, side + CAPTION), WHITE)
     pen = ImageDraw.Draw(image)
     plan = trace[-1]

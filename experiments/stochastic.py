@@ -1,6 +1,6 @@
 """Turns that fail (paper, appendix): `python -m experiments.stochastic --help`.
 
-A turn becomes one of the five other actions with probability 0.2, in demonstrations and in tests.
+With probability 0.2 a turn becomes any of the five other actions, in demonstrations and in tests.
 """
 
 import sys
@@ -30,7 +30,7 @@ ANALYSIS = Analysis(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Every case asked for; the exit code."""
+    """Runs the chosen cases; returns the exit code."""
     return cases.main(ANALYSIS, arguments)
 
 

@@ -1,7 +1,8 @@
 """Imperfect demonstrations (paper, appendix): `python -m experiments.suboptimal --help`.
 
-A quarter of the demonstrator's actions are random. They are executed, and it goes on from where
-they lead; or, as the file of the paper's authors suggests, only what is recorded is wrong.
+A quarter of the demonstrator's actions are random. On levels `...Mistakes` it executes them, and
+goes on from there. On levels `...Mislabelled` only the recorded actions are wrong, as the file of
+the paper's authors suggests.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from experiments.common import cases
 from experiments.common.cases import NOISE, Analysis, Case, Model, Way
 from leapjax.planners import GibbsConfig
 
-# The paper's success of LEAP and DT, from optimal demonstrations and from others.
+# The paper's success of (LEAP, DT) in percent: from optimal, then from imperfect demonstrations.
 PAPER = {
     "GoToObjMazeS4": ((65.0, 46.5), (63.0, 45.0)),
     "GoToObjMazeS7": ((45.5, 22.0), (44.0, 19.5)),
@@ -21,7 +22,7 @@ PAPER = {
 
 
 def lower_temperature(trained: GibbsConfig) -> GibbsConfig:
-    """Plans are samples: drawn at the temperature of sequences, they have as many mistakes."""
+    """Limits the temperature to 0.5: at 1, plans have as many mistakes as demonstrations."""
     return dataclasses.replace(trained, temperature=min(trained.temperature, 0.5))
 
 
@@ -46,7 +47,7 @@ ANALYSIS = Analysis(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Every case asked for; the exit code."""
+    """Runs the chosen cases; returns the exit code."""
     return cases.main(ANALYSIS, arguments)
 
 

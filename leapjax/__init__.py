@@ -88,7 +88,7 @@ __all__ = [
     "wilson_interval",
 ]
 
-# By module, the names that it defines: it is imported when one of them is first used.
+# Public names by module. The first use of a name imports its module.
 _DEFINED = {
     "leapjax.batching": ("CompiledPlanner", "compile_planner", "plan_keys"),
     "leapjax.domain": ("Domain",),
@@ -129,13 +129,13 @@ _DEFINED = {
 }
 _PLACES = {name: module for module, names in _DEFINED.items() for name in names}
 
-if not TYPE_CHECKING:  # a type checker would take every name for one that exists
+if not TYPE_CHECKING:  # `__getattr__` would hide wrong names from a type checker
 
     def __getattr__(name: str) -> Any:
         """Imports a public name when it is first used (PEP 562)."""
         if name not in _PLACES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from leapjax.extras import report_missing  # noqa: PLC0415  (only then)
+        from leapjax.extras import report_missing  # noqa: PLC0415  (rarely needed)
 
         with report_missing():
             value = getattr(importlib.import_module(_PLACES[name]), name)
@@ -144,5 +144,5 @@ if not TYPE_CHECKING:  # a type checker would take every name for one that exist
 
 
 def __dir__() -> list[str]:
-    """Lists the names that are imported later, too."""
+    """Lists all names, also public names that are not imported yet."""
     return sorted({*globals(), *_PLACES})

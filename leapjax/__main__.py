@@ -1,4 +1,4 @@
-"""Trains a planner, plays it, records what it reached: `leapjax DOMAIN`."""
+"""Trains a planner, plays it and records the results: `leapjax DOMAIN`."""
 
 import sys
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ A checkout has more programs, which reproduce the tables of the paper: python -m
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Trains on a domain and plays it; the exit code."""
+    """Trains and plays a planner in a domain; returns the exit code."""
     from leapjax.domains import DOMAINS, Place  # noqa: PLC0415  (all of these import JAX)
     from leapjax.errors import did_you_mean  # noqa: PLC0415
     from leapjax.running import shell  # noqa: PLC0415
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         expected = f"expected one of {', '.join(DOMAINS)}{did_you_mean(name, DOMAINS)}"
         print(f"error: unknown domain {name!r}: {expected}", file=sys.stderr)
         return 2
-    # An extra that is missing ends this import.
+    # This import fails if an extra is missing.
     failed = shell.run_program(
         f"leapjax.{name}", rest, lambda: import_module("leapjax.running.main")
     )
@@ -42,11 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(domain: str, arguments: Sequence[str]) -> int:
-    """Runs the command line of a domain; the exit code."""
+    """Runs the command line of a domain; returns the exit code."""
     from leapjax.configuration import Config  # noqa: PLC0415  (it needs an extra)
-    from leapjax.running import main as running  # noqa: PLC0415  (so)
-    from leapjax.running.run import Experiment  # noqa: PLC0415  (so)
-    from leapjax.running.spelling import SPELLINGS  # noqa: PLC0415  (so)
+    from leapjax.running import main as running  # noqa: PLC0415  (also)
+    from leapjax.running.run import Experiment  # noqa: PLC0415  (also)
+    from leapjax.running.spelling import SPELLINGS  # noqa: PLC0415  (also)
 
     config = SPELLINGS.get(domain, Config)
     return running.main(Experiment(domain, domain, config=config, package="leapjax"), arguments)

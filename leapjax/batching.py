@@ -1,4 +1,4 @@
-"""Planners for batches: jitted once, cut into chunks of a few sizes, split over devices."""
+"""Planners for batches: cut into chunks of a few sizes, jitted, and split over devices."""
 
 import contextlib
 import operator
@@ -17,15 +17,19 @@ from leapjax.planners import PlannerConfig, find_planner
 from leapjax.types import Array, EncodeNext, Energy, Params, Plan, PyTree
 
 CHUNK_SIZES = (1, 16, 128)
-KEYS = "threefry2x32"  # the kind of all keys made here, whatever JAX is set to: see `plan_keys`
+KEYS = "threefry2x32"  # kind of all keys made here, whatever JAX's default is
 
 
 class NotANumber(ValueError):
-    """An energy that was minimised is NaN or -inf; `plan` is what came of it all the same."""
+    """An energy was NaN or -inf during planning.
+
+    Attributes:
+        plan: the plans made anyway, as NumPy arrays; `plan.valid` marks the rows to trust.
+    """
 
     def __init__(self, message: str, plan: Plan) -> None:
         super().__init__(message, plan)
-        self.plan = plan  # of NumPy arrays; `plan.valid` says which rows can be trusted
+        self.plan = plan
 
     def __str__(self) -> str:
         return self.args[0]
@@ -37,7 +41,7 @@ class CompiledPlanner:
     It keeps a reference to the parameters of its last call.
 
     Attributes:
-        chunk_sizes: allowed numbers of plans per call of the compiled function, ascending.
+        chunk_sizes: allowed numbers of plans in a call of the compiled function, ascending.
         num_actions: A of the energy, the end action included.
     """
 
@@ -72,7 +76,7 @@ class CompiledPlanner:
 
         nothing = jax.tree.structure(())
         self._last: tuple[list[Array], Any, dict[int, Params]] = ([], nothing, {})
-        # Plans have nothing to say to each other: each device plans its rows by itself.
+        # Plans are independent, so each device plans its rows by itself.
         self._meshes = {size: sharding.make_mesh(size, devices) for size in self.chunk_sizes}
         self._programs = {
             mesh.size: sharding.split_batches(plan_rows, mesh) for mesh in self._meshes.values()
@@ -82,7 +86,7 @@ class CompiledPlanner:
         """Plans for B contexts.
 
         Args:
-            params: of the energy.
+            params: parameters of the energy.
             keys: `[B]`, or raw `[B, 2]` uint32 from `plan_keys`.
             contexts: leaves with a leading `[B]`.
 
@@ -90,10 +94,10 @@ class CompiledPlanner:
             A `Plan` of NumPy arrays with a leading `[B]`.
 
         Raises:
-            ValueError: no contexts, or not as many as keys; contexts that are not numbers; numbers
-                of 64 bits, in contexts or parameters, that do not fit 32; or a call inside of
-                `jit`, `vmap` or `grad`.
-            NotANumber: the energy of some action was NaN or -inf; it holds the plans.
+            ValueError: There are no contexts, or not as many as keys. Contexts are not numbers.
+                64-bit contexts or parameters do not fit 32 bits. The call is inside `jit`, `vmap`
+                or `grad`.
+            NotANumber: the energy of some action was NaN or -inf; the exception holds the plans.
         """
         return self.plan_next(params, keys, contexts, None)[0]
 
@@ -103,19 +107,19 @@ class CompiledPlanner:
         """Plans for B contexts, and returns a cache for the contexts one action later.
 
         Args:
-            params: of the energy.
-            keys: as in a call.
-            contexts: as in a call.
-            cache: from the plans for the contexts one action earlier, a row for each context; None:
-                episodes begin, or other states came in between.
+            params: as in `__call__`.
+            keys: as in `__call__`.
+            contexts: as in `__call__`.
+            cache: returned with the plans one action earlier, a row for each context. `None` at the
+                start of episodes, or after states without a plan.
 
         Returns:
-            The plans; and the cache, opaque NumPy arrays with a leading `[B]`, or None if the
+            The plans, and the cache: opaque NumPy arrays with a leading `[B]`, or `None` if the
             planner has no `encode_next`.
 
         Raises:
-            ValueError: as in a call.
-            NotANumber: as in a call.
+            ValueError: as in `__call__`.
+            NotANumber: as in `__call__`.
         """
         leaves = jax.tree.leaves((params, keys, contexts))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
@@ -153,7 +157,7 @@ class CompiledPlanner:
                     "numbers: encode it first"
                 )
         check_fit("context", contexts)
-        # Cut with NumPy: each slice of a device array would be a program of its own.
+        # Slice with NumPy: JAX would compile a program for each slice of a device array.
         if typed:
             kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
         else:
@@ -163,7 +167,7 @@ class CompiledPlanner:
         placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
         plans = []
         for start, size, _ in chunks:
-            # A last chunk that is not full repeats its last row, which is then cut off.
+            # The last chunk repeats its last row until it is full. The copies are cut off below.
             rows = np.minimum(np.arange(start, start + size), batch - 1)
             count = self._meshes[size].size
             chunk = jax.tree.map(lambda leaf, r=rows: leaf[r], inputs)
@@ -183,11 +187,10 @@ class CompiledPlanner:
         return plan, cache
 
     def _place(self, params: Params, meshes: set[Mesh]) -> dict[int, Params]:
-        """The parameters on the devices of each mesh, by its size.
+        """Places the parameters on the devices of each mesh, and returns them by mesh size.
 
-        Remembered while they are the very same arrays, which is what a caller passes call
-        after call: placing them costs more than a single plan. Arrays of NumPy may be
-        written to, so they are placed each time.
+        Placing costs more than a single plan. So the placed parameters are reused while callers
+        pass the same JAX arrays. NumPy arrays can be written to, so they are placed in each call.
         """
         leaves, structure = jax.tree.flatten(params)
         last, last_structure, placed = self._last
@@ -198,34 +201,34 @@ class CompiledPlanner:
         if missing:
             check_fit("params", params)
             placed = placed | {mesh.size: sharding.replicate(params, mesh) for mesh in missing}
-            self._last = leaves, structure, placed  # at once: another thread sees all or nothing
+            self._last = leaves, structure, placed  # one assignment, for other threads
         return placed
 
     def compile(self, params: Params, context: PyTree, batch: int = 1, again: bool = True) -> None:
-        """Compiles what batches of at most `batch` plans need, so that later calls start at once.
+        """Compiles the programs for up to `batch` plans, so that later calls start at once.
 
         It plans once for each chunk size, and drops the plans.
 
         Args:
-            params: of the energy; their shapes and types count.
-            context: of one plan, without a leading `[B]`; its shapes and types count.
+            params: parameters of the energy; only their shapes and types matter.
+            context: context of one plan, without a leading `[B]`; only shapes and types matter.
             batch: B, the largest number of contexts in a call.
-            again: also compile plans after the first of an episode, which use a cache if there is
-                one (see `plan_next`).
+            again: whether to compile plans with a cache too, for later plans of an episode (see
+                `plan_next`).
 
         Raises:
-            ValueError: see `__call__`; or `batch` is not positive.
+            ValueError: `batch` is not positive; or as in `__call__`.
         """
         for size in self.sizes_up_to(check_integer("batch", batch, 1)):
             contexts = jax.tree.map(lambda leaf, n=size: np.stack([np.asarray(leaf)] * n), context)
             keys = plan_keys(0, np.arange(size), np.zeros(size, int))
-            with contextlib.suppress(NotANumber):  # these numbers are nobody's
+            with contextlib.suppress(NotANumber):  # the numbers may be made up
                 _, cache = self.plan_next(params, keys, contexts, None)
                 if again and cache is not None:
                     self.plan_next(params, keys, contexts, cache)
 
     def sizes_up_to(self, batch: int) -> list[int]:
-        """The chunk sizes that batches of at most so many plans can need."""
+        """Lists the chunk sizes that batches of at most `batch` plans can need."""
         batches = range(1, min(batch, 2 * self.chunk_sizes[-1]) + 1)
         return sorted({size for b in batches for _, size, _ in split_batch(b, self.chunk_sizes)})
 
@@ -237,40 +240,43 @@ def compile_planner(
     devices: Sequence[jax.Device] | None = None,
     encode_next: EncodeNext | None = None,
 ) -> CompiledPlanner:
-    """Builds, once, the planner that serves batches of any size.
+    """Builds a planner for batches of any size; build it once.
 
-    A batch is split into chunks of a few fixed sizes, so that 7, 300 or 10,000 contexts
-    just work: each chunk size compiles at its first use, a chunk fits the cache, only the
-    last chunk is ever padded, and all are dispatched before any is waited for. (`compile` on what
-    is returned compiles ahead.)
+    A batch is split into chunks of a few fixed sizes. Each size compiles at its first use, or ahead
+    with `CompiledPlanner.compile`. A chunk fits the processor's cache, and only the last chunk is
+    padded. All chunks are dispatched before the first result is awaited.
 
     Compiled programs are kept on disk, in the user's cache folder, unless JAX has a cache already
-    (`jax_compilation_cache_dir`); `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
+    (`jax_compilation_cache_dir`). `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
 
     Args:
-        energy: what to minimise.
-        config: of `gibbs`, `random_shooting`, `cross_entropy_method` or `beam_search`, and which
-            of them.
-        chunk_sizes: allowed numbers of plans per call of the compiled function. Each is
-            split over as many of the devices as divide it.
-        devices: to plan on; all of this process, if not given.
-        encode_next: `energy.encode` with a cache, of `Agent.encode_next`; None: each context is
-            encoded as a whole.
+        energy: energy to minimise.
+        config: settings of the planner. Their class chooses `gibbs`, `random_shooting`,
+            `cross_entropy_method` or `beam_search`.
+        chunk_sizes: allowed numbers of plans in a call of the compiled function. A chunk is split
+            over as many devices as divide its size.
+        devices: devices to plan on; `None` for all devices of this process.
+        encode_next: `energy.encode` with a cache, such as `Agent.encode_next`; `None`: each context
+            is encoded as a whole.
 
     Raises:
-        TypeError: a `config` that is of no planner.
-        ValueError: chunk sizes that are not positive.
+        TypeError: no planner takes such a `config`.
+        ValueError: a chunk size is not positive.
     """
     compilation.use_disk_cache()
     return CompiledPlanner(energy, config, chunk_sizes, devices, encode_next)
 
 
 def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Covers a batch with chunks: `(start, size, rows used)`, sizes in ascending order.
+    """Splits a batch into chunks `(start, size, rows used)`, greedily from the largest size.
 
-    Greedy from the largest. What is left at the end is padded to the next size if it nearly
-    fills it, or if it would take more than four chunks of the smallest size: one plan alone
-    takes about a quarter of the time of sixteen.
+    The remainder is padded to the next size if it fills more than 80% of that size. It is also
+    padded if it would take more than four chunks of the smallest size: a single plan takes about a
+    quarter of the time of sixteen plans.
+
+    Args:
+        batch: number of plans.
+        sizes: chunk sizes, ascending.
     """
     chunks: list[tuple[int, int, int]] = []
     start = 0
@@ -289,20 +295,20 @@ def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
 
 
 def _is_real(dtype: np.dtype) -> bool:
-    """Whether JAX computes with a type, or with a shorter one in its place: reals and booleans."""
+    """Says whether JAX computes with a type or its shorter equivalent: reals and booleans."""
     kinds = (np.bool_, np.integer, jnp.floating)
     return dtype.itemsize <= 8 and any(jnp.issubdtype(dtype, kind) for kind in kinds)
 
 
 def check_fit(name: str, tree: PyTree) -> None:
-    """Refuses numbers that JAX, which computes with 32 bits, would change beyond rounding.
+    """Checks that JAX, which computes with 32 bits, will only round the numbers of a tree.
 
     Args:
-        name: of the tree, for the message.
-        tree: arrays of any kind; those of JAX are as they are.
+        name: name of the tree, for the message.
+        tree: arrays of any kind; JAX arrays always pass.
 
     Raises:
-        UserError: names the first leaf that holds such a number.
+        UserError: a number does not fit; the message names the first such leaf.
     """
     for path, leaf in jax.tree.leaves_with_path(tree):
         if isinstance(leaf, jax.Array):
@@ -326,10 +332,10 @@ def check_fit(name: str, tree: PyTree) -> None:
 
 
 def _name_kind(keys: Array) -> str:
-    """The kind of raw keys `[B, width]`, which their width tells: 2 of `KEYS`, else the default.
+    """Names the kind of raw keys `[B, width]`: `KEYS` if the width is 2, else JAX's default.
 
     Raises:
-        UserError: they are of no kind.
+        UserError: neither kind has keys of this type and width.
     """
     if keys.dtype == np.uint32 and keys.shape[1] == 2:
         return KEYS
@@ -341,25 +347,25 @@ def _name_kind(keys: Array) -> str:
 
 
 def planner_key(seed: int) -> jax.Array:
-    """The key that all plans of a seed derive theirs from.
+    """Makes the key from which all plans of a seed derive their keys.
 
     Raises:
-        UserError: not a seed; see `leapjax.checks.check_seed`.
+        UserError: `seed` is not a seed; see `leapjax.checks.check_seed`.
     """
     return jax.random.key(check_seed(seed), impl=KEYS)
 
 
 def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarray:
-    """Raw keys `[B, 2]` uint32: functions of (seed, episode, replan index), not of the row.
+    """Makes raw keys `[B, 2]` uint32 from (seed, episode, replan index), whatever the row.
 
     Args:
-        seed: of all plans.
-        episodes: `[B]` whose plan it is, such as a level seed.
-        replans: `[B]` how many plans the episode has had.
+        seed: seed of all plans.
+        episodes: `[B]` episode of each plan, such as its level seed.
+        replans: `[B]` number of earlier plans of the episode.
 
     Raises:
-        UserError: one of these is not an integer in 0 .. 2^32 - 1, or there are not as many replans
-            as episodes.
+        UserError: a value is not an integer in 0 .. 2^32 - 1, or `episodes` and `replans` differ in
+            length.
     """
     key = planner_key(seed)
     episodes = check_seeds(_convert_whole(episodes), "episode")
@@ -369,14 +375,14 @@ def plan_keys(seed: int, episodes: np.ndarray, replans: np.ndarray) -> np.ndarra
         raise UserError(f"{batch} episodes, but {len(replans)} replans: expected one for each")
     if batch == 0:
         return np.zeros((0, 2), np.uint32)
-    # Padded to a power of two, so that a shrinking batch does not compile at every size.
+    # Pad to a power of two, so that a shrinking batch does not compile at every size.
     rows = np.minimum(np.arange(1 << (batch - 1).bit_length()), batch - 1)
     folded = np.stack([episodes, replans])[:, rows]
     return np.asarray(_fold_in(key, folded))[:batch]
 
 
 def _convert_whole(values: np.ndarray) -> np.ndarray:
-    """Integers where all numbers are whole: `np.zeros(B)`, which holds floats, means B zeros."""
+    """Converts floats to integers if all are whole, so that `np.zeros(B)` means B zeros."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
             integers = values.astype(np.int64)
@@ -385,13 +391,13 @@ def _convert_whole(values: np.ndarray) -> np.ndarray:
 
 
 def plan_key(key: jax.Array, episode: jax.Array, replan: jax.Array) -> jax.Array:
-    """The key of one plan, inside a program: see `plan_keys`."""
+    """Derives the key of one plan, inside a program; see `plan_keys`."""
     return jax.random.fold_in(jax.random.fold_in(key, episode), replan)
 
 
 @jax.jit
 def _fold_in(key: jax.Array, indices: jax.Array) -> jax.Array:
-    """Key data `[B, 2]` of one key and indices `[2, B]`."""
+    """Derives key data `[B, 2]` from one key and indices `[2, B]`."""
 
     def fold(episode: jax.Array, replan: jax.Array) -> jax.Array:
         return jax.random.key_data(plan_key(key, episode, replan))

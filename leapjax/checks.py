@@ -1,6 +1,6 @@
 """Checks of arguments: each returns the value in a plain type, or raises `UserError`.
 
-A number is taken for what it says, never rounded, wrapped or truncated to fit.
+No check wraps or truncates a number to make it fit. Only conversions to floats round.
 """
 
 import dataclasses
@@ -17,22 +17,22 @@ import numpy as np
 from leapjax.errors import UserError, first_line
 
 T = TypeVar("T")
-MOST = 2**31 - 1  # the largest int32, the integers that JAX computes with
-LARGEST = float(np.finfo(np.float32).max)  # the largest number that JAX computes with
-LARGEST_SEED = 2**32 - 1  # the largest seed that JAX's random keys tell from all others
+MOST = 2**31 - 1  # the largest int32: JAX computes with int32
+LARGEST = float(np.finfo(np.float32).max)  # JAX computes with float32
+LARGEST_SEED = 2**32 - 1  # JAX's random keys distinguish all seeds up to this
 
 
 def check_integer(name: str, value: Any, least: int = 0, most: int = MOST) -> int:
-    """Returns an integer of Python.
+    """Returns a Python integer.
 
     Args:
-        name: of the argument, for the message.
-        value: any integer type; booleans, floats and arrays of several numbers are refused.
+        name: name of the argument, for the error message.
+        value: value of any integer type, but no boolean, float or array of several numbers.
         least: the smallest value allowed.
         most: the largest value allowed.
 
     Raises:
-        UserError: not an integer, or out of range.
+        UserError: the value is not an integer, or is out of range.
     """
     try:
         if isinstance(value, bool | np.bool_):
@@ -48,16 +48,16 @@ def check_integer(name: str, value: Any, least: int = 0, most: int = MOST) -> in
 
 
 def check_number(name: str, value: Any, least: float = -LARGEST, most: float = LARGEST) -> float:
-    """Returns a finite float of Python.
+    """Returns a finite Python float.
 
     Args:
-        name: of the argument, for the message.
-        value: any real number; booleans, texts and arrays are refused.
+        name: name of the argument, for the error message.
+        value: any real number, but no boolean, text or array.
         least: the smallest value allowed.
         most: the largest value allowed.
 
     Raises:
-        UserError: not a number, NaN, infinite, or out of range.
+        UserError: the value is not a number, is NaN or infinite, or is out of range.
     """
     try:
         if isinstance(value, bool | np.bool_ | str | bytes) or np.ndim(value):
@@ -76,10 +76,10 @@ def check_number(name: str, value: Any, least: float = -LARGEST, most: float = L
 
 
 def check_kind(value: T, kind: type[T]) -> T:
-    """Returns a value of one class.
+    """Returns the value if it is an instance of a class.
 
     Raises:
-        UserError: it is of another.
+        UserError: the value is of another class.
     """
     if not isinstance(value, kind):
         raise UserError(f"expected {kind.__name__}, got {type(value).__name__}")
@@ -87,10 +87,10 @@ def check_kind(value: T, kind: type[T]) -> T:
 
 
 def check_seed(value: Any, name: str = "seed") -> int:
-    """Returns a seed: an integer in 0 .. 2^32 - 1, the seeds that JAX tells apart.
+    """Returns a seed: an integer in 0 .. 2^32 - 1, the range that JAX distinguishes.
 
     Raises:
-        UserError: any other value.
+        UserError: the value is not an integer in this range.
     """
     return check_integer(name, value, 0, LARGEST_SEED)
 
@@ -99,7 +99,7 @@ def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.nd
     """Returns seeds as an array `[n]` uint32; see `check_seed`.
 
     Raises:
-        UserError: one of them is no seed.
+        UserError: the values are not a sequence, or `check_seed` refuses a value.
     """
     try:
         flat = np.ndim(values) == 1
@@ -109,7 +109,7 @@ def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.nd
         raise UserError(f"{name}s must be a sequence of integers, got {_shorten(values)}")
     whole = isinstance(values, np.ndarray | jax.Array) and np.issubdtype(values.dtype, np.integer)
     if whole and len(values):
-        array = np.asarray(values)  # of one type, so that its extremes speak for all
+        array = np.asarray(values)  # of one type, so checking the extremes checks all
         for extreme in (array.min(), array.max()):
             check_seed(extreme, name)
         return array.astype(np.uint32)
@@ -117,14 +117,14 @@ def check_seeds(values: Sequence[Any] | np.ndarray, name: str = "seed") -> np.nd
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Returns a boolean of Python.
+    """Returns a Python boolean.
 
     Args:
-        name: of the flag, for the message.
-        value: true or false in any type, or 1 or 0; an array may hold one of these.
+        name: name of the flag, for the error message.
+        value: true, false, 1 or 0 in any type, or an array with a single such element.
 
     Raises:
-        UserError: anything else.
+        UserError: any other value.
     """
     if isinstance(value, bool):
         return value
@@ -138,12 +138,12 @@ def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray
     """Returns counts as an array `[n]` int64.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the error message.
         values: any sequence of integers.
         least: the smallest value allowed.
 
     Raises:
-        UserError: no sequence, or one of them is not an integer, or out of range.
+        UserError: the values are not a sequence, or a value is not an integer or out of range.
     """
     return np.array(
         [check_integer(name, value, least) for value in _list_items(name, values)], np.int64
@@ -153,24 +153,25 @@ def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray
 def check_numbers(
     name: str, values: Sequence[Any], least: float = -LARGEST, most: float = LARGEST
 ) -> list[float]:
-    """Returns finite floats of Python; see `check_number`.
+    """Returns finite Python floats; see `check_number`.
 
     Raises:
-        UserError: no sequence, or one of them is no such number.
+        UserError: the values are not a sequence, or `check_number` refuses a value.
     """
     return [check_number(name, value, least, most) for value in _list_items(name, values)]
 
 
 def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ...]:
-    """Returns the indices that a sequence of integers or a boolean mask names, sorted.
+    """Returns the sorted indices that a sequence of integers or a boolean mask selects.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the error message.
         values: distinct integers in 0 .. count - 1, or `[count]` booleans.
-        count: how many there are to choose from.
+        count: number of elements to select from.
 
     Raises:
-        UserError: other types, an index out of range or named twice, a mask of another length.
+        UserError: the values have other types, an index is out of range or occurs twice, or a mask
+            has another length.
     """
     items = _list_items(name, values)
     if items and all(isinstance(item, bool | np.bool_) for item in items):
@@ -184,15 +185,15 @@ def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ..
 
 
 def check_fits(name: str, values: Any, dtype: np.dtype) -> np.ndarray:
-    """Returns the same numbers in another type; a type of floats rounds them.
+    """Converts numbers to another type; types of floats round them.
 
     Args:
-        name: of the numbers, for the message.
-        values: an array of booleans, integers or floats, or what NumPy makes one of.
-        dtype: the type.
+        name: name of the numbers, for the error message.
+        values: booleans, integers or floats, as an array or as a value that NumPy converts.
+        dtype: type to convert to.
 
     Raises:
-        UserError: no numbers, numbers that the type does not have, or NaN or infinite.
+        UserError: the values are not numbers, are not finite, or do not fit the type.
     """
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
@@ -211,8 +212,8 @@ def check_range(name: str, values: np.ndarray, least: int, most: int) -> None:
     """Checks that all numbers of an array are in a range.
 
     Args:
-        name: of the numbers, for the message.
-        values: at least one.
+        name: name of the numbers, for the error message.
+        values: array of at least one number.
         least: the smallest value allowed.
         most: the largest value allowed.
 
@@ -226,18 +227,18 @@ def check_range(name: str, values: np.ndarray, least: int, most: int) -> None:
 
 
 def check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
-    """Returns real numbers as JAX's array of floats: unsigned integers have no negatives.
+    """Converts real numbers to a JAX array of floats: unsigned integers have no negatives.
 
     Args:
-        name: of the numbers, for the message.
-        values: an array, or what JAX makes one of.
-        shape: that they must have.
+        name: name of the numbers, for the error message.
+        values: array, or a value that JAX converts to an array.
+        shape: required shape.
 
     Raises:
-        UserError: another shape, or no real numbers.
+        UserError: the array has another shape, or its elements are not real numbers.
     """
     try:
-        # Python's integers may be larger than those of JAX.
+        # Python's integers may exceed the range of JAX's.
         array = jnp.asarray(float(values) if isinstance(values, int) else values)
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{name} must be numbers: {first_line(error)}") from error
@@ -252,18 +253,18 @@ def check_floats(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
 
 
 def check_types(config: Any, *unlimited: str) -> None:
-    """Checks that every field of a configuration holds what its type says.
+    """Checks that the fields of a configuration have their declared types.
 
-    Numbers must be finite. A number of NumPy or JAX becomes Python's, so that a configuration can
-    be hashed and written as JSON. Fields of other types than numbers, booleans, texts, tuples of
-    them and None are not looked at.
+    Numbers must be finite. NumPy and JAX numbers become Python numbers, so that a configuration
+    can be hashed and written as JSON. The check covers numbers, booleans, texts, `None`, and tuples
+    of these; it skips fields of other types.
 
     Args:
-        config: an instance of a frozen dataclass.
-        unlimited: fields that may be infinite.
+        config: instance of a frozen dataclass.
+        unlimited: names of fields that may be infinite.
 
     Raises:
-        UserError: names the field, and what it holds.
+        UserError: a field has another type; names the field and its value.
     """
     types_of = typing.get_type_hints(type(config))
     for field in dataclasses.fields(config):
@@ -276,7 +277,7 @@ def check_types(config: Any, *unlimited: str) -> None:
 
 
 def _check_type(name: str, value: Any, kind: Any) -> Any:
-    """The value, in the plain type that a field is declared with."""
+    """Checks a value against the declared type of its field; returns it as a Python value."""
     kinds = typing.get_args(kind)
     if type(None) in kinds:
         if value is None:
@@ -299,17 +300,17 @@ def _check_type(name: str, value: Any, kind: Any) -> Any:
         raise UserError(f"{name} must be a text, got {_shorten(value)}")
     elif kind in (bool, str):
         checked = kind(value)
-    # An integer that stands for a number stays one: names of runs are made from what is written.
+    # An integer in a field of floats stays an integer: the names of runs depend on its text.
     return value if type(value) in (int, float, bool, str) else checked
 
 
 def check_at_least(config: object, least: int, *names: str, most: int = MOST) -> None:
-    """Checks fields of a configuration that are integers.
+    """Checks integer fields of a configuration.
 
     Args:
-        config: that has the fields.
+        config: configuration with the fields.
         least: the smallest value allowed.
-        names: of the fields.
+        names: names of the fields.
         most: the largest value allowed.
 
     Raises:
@@ -320,13 +321,13 @@ def check_at_least(config: object, least: int, *names: str, most: int = MOST) ->
 
 
 def check_within(config: object, least: float, most: float, *names: str) -> None:
-    """Checks fields of a configuration that are numbers.
+    """Checks number fields of a configuration.
 
     Args:
-        config: that has the fields.
+        config: configuration with the fields.
         least: the smallest value allowed.
         most: the largest value allowed.
-        names: of the fields.
+        names: names of the fields.
 
     Raises:
         UserError: a field is not a finite number, or out of range.
@@ -336,17 +337,17 @@ def check_within(config: object, least: float, most: float, *names: str) -> None
 
 
 def _list_items(name: str, values: Any) -> list[Any]:
-    """What a sequence holds."""
+    """Returns the elements of a sequence as a list."""
     try:
-        if isinstance(values, str | bytes | Mapping):  # whose items are keys
+        if isinstance(values, str | bytes | Mapping):  # its items would be keys
             raise TypeError
-        # Of an array of JAX as NumPy's, whose booleans and integers can be told apart.
+        # Converts JAX arrays: the elements of NumPy arrays tell booleans from integers.
         return list(np.asarray(values) if hasattr(values, "dtype") else values)
     except TypeError:
         raise UserError(f"{name} must be a sequence, got {_shorten(values)}") from None
 
 
 def _shorten(value: Any) -> str:
-    """A value as a message quotes it."""
+    """Returns a value as text of at most 60 characters, for an error message."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""Compiled programs on disk: what one process has compiled, the next one loads."""
+"""Keeps compiled programs on disk, so that later processes load them."""
 
 import functools
 import os
@@ -13,19 +13,20 @@ from leapjax import files
 from leapjax.errors import UserError
 
 CPU = Path("/proc/cpuinfo")  # on Linux
-SHORTEST = 0.5  # seconds: what compiles sooner is not kept
+SHORTEST = 0.5  # seconds: programs that compile faster are not kept
 SHORTEST_OF_JAX = 1.0  # JAX's own default
 
 
 def use_disk_cache() -> None:
     """Keeps compiled programs in the user's cache folder: a second start takes seconds.
 
-    Programs are compiled for one processor, so each kind has its own folder. A compiled program is
-    code that this process will run: a folder to which others can write is not used, and stderr
-    says so once.
+    Programs are compiled for one kind of processor, so each kind has its own folder. This process
+    will run the programs in the folder. It therefore refuses a folder to which others can write,
+    and says so once on stderr.
 
-    Nothing changes if JAX has a cache already (`jax_compilation_cache_dir`) or may have none
-    (`jax_enable_compilation_cache`). `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
+    JAX's settings stay as they are if JAX has a cache already (`jax_compilation_cache_dir`) or may
+    not have a cache (`jax_enable_compilation_cache`). The environment variable
+    `LEAPJAX_COMPILATION_CACHE` names another folder, or is "off".
     """
     config = jax.config
     kept: str | None = config.jax_compilation_cache_dir  # type: ignore[attr-defined]
@@ -36,14 +37,14 @@ def use_disk_cache() -> None:
     try:
         folder = Path(choice) if choice else files.find_cache_folder() / "xla" / name_processor()
         files.make_private(folder.absolute())
-    except UserError as error:  # JAX would say so at every program, with its traceback
+    except UserError as error:  # JAX would print a traceback for every program
         _say_once(f"compiled programs are not kept: {error}")
         return
     config.update("jax_compilation_cache_dir", str(folder))
     shortest = config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
     if shortest == SHORTEST_OF_JAX:
         config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-    # JAX decides at its first compilation, which may be over, whether it has a cache.
+    # JAX decides at its first compilation whether it has a cache: let it decide again.
     compilation_cache.reset_cache()
 
 

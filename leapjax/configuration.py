@@ -26,39 +26,39 @@ D = TypeVar("D")
 P = TypeVar("P")
 
 
-# A program that calls options otherwise has a subclass, which annotates their fields.
+# A program with other names of options has a subclass, which annotates the renamed fields.
 @dataclasses.dataclass(frozen=True)
 class Config(Generic[M, D, P]):
     """Train a method on demonstrations of a level, then measure its success.
 
     Attributes:
-        level: Level by its name or id, or "all" for those of the paper.
-        method: How to learn and to act, one or more of: leap, classifier, bc, dt, bcq, iql, mopo,
-            plate, cql, qr_dqn, rem, rules, random; or "all" for those that fit every level.
+        level: Name or id of a level, or "all" for the paper's levels.
+        method: One or more methods: leap, classifier, bc, dt, bcq, iql, mopo, plate, cql, qr_dqn,
+            rem, rules, random; or "all" for the methods that fit every level.
         preset: Defaults of all other options: "leapjax" for ours, "paper" for the paper's.
         seeds: Training seeds; each draws its own demonstrations.
-        demos: Demonstrations to train on; of a given data set at most those that it has.
-        demonstrations: Id of a Minari data set to train on, in place of demonstrations that are
-            made for the level; the level follows from it if the data set names one.
+        demos: Demonstrations to train on; at most as many as a given data set has.
+        demonstrations: Id of a Minari data set to train on, instead of demonstrations made for the
+            level. If the data set names a level, that level is the default.
         episodes: Held-out episodes to measure success on.
         test_seed: Level seed of the first of these episodes.
         validation: Measure success on validation levels instead, to choose settings.
         context: K, past steps that the planner sees.
-        executed: Actions to execute before replanning; None for the whole plan, as in the paper.
+        executed: Actions to execute before replanning; `None` for the whole plan, as in the paper.
         rules: Weight of the level's own rules in the energy while planning; 0 leaves them out.
         checkpoint: Folder of an earlier run to evaluate instead of training. Its settings become
-            the defaults, except those of `--executed` and `--rules`.
-        play: Level to play instead of the one that the planner of a checkpoint was trained on.
+            the defaults, except `--executed` and `--rules`.
+        play: Level to play instead of the level that the checkpoint's planner was trained on.
         pretrained: Evaluate the planner that comes with the library for the level, instead of
             training.
-        record: Append the row to results/, which is committed, and skip what is recorded already.
-        force: With `--record`: run again what is recorded, and replace its row.
+        record: Append the row to results/, which is committed; skip a run that is already there.
+        force: With `--record`: repeat a recorded run and replace its row.
         runs: Folder for checkpoints, metrics, plots and unrecorded rows.
         pictures: Draw the plots and the animation.
         loggers: Where measurements also go: "tensorboard", "wandb" (offline, unless WANDB_MODE says
             otherwise).
-        checkpoint_seconds: Seconds between checkpoints, which a killed run can lose at most (a run
-            of several processes: and up to 20 steps more).
+        checkpoint_seconds: Seconds between checkpoints: the most work that a killed run can lose. A
+            run of several processes can lose up to 20 steps more.
     """
 
     method_settings: Annotated[M, tyro.conf.arg(name="")]
@@ -92,15 +92,15 @@ class Config(Generic[M, D, P]):
 
     @classmethod
     def flag(cls, field: str) -> str:
-        """What the command line calls a field, such as "--level"."""
+        """Returns the name of a field on the command line, such as "--level"."""
         hint = typing.get_type_hints(cls, include_extras=True)[field]
         names = [getattr(each, "name", None) for each in getattr(hint, "__metadata__", ())]
         return f"--{next(filter(None, names), field.replace('_', '-'))}"
 
 
-AnyConfig = Config[Any, Any, Any]  # of whatever method, domain and planner
+AnyConfig = Config[Any, Any, Any]  # of any method, domain and planner
 
-# What a result does not depend on, or what its row holds on its own.
+# Fields on which a result does not depend, or which its name and row hold separately.
 _NOT_HASHED = (
     "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
     "checkpoint_seconds", "cluster", "loggers",
@@ -108,10 +108,10 @@ _NOT_HASHED = (
 
 
 def make_config(domain: str, level: str, method: str) -> AnyConfig:
-    """The defaults of every option, before any preset.
+    """Returns the default of every option, without any preset.
 
     Raises:
-        UserError: an unknown domain or method.
+        UserError: the domain or the method is unknown.
     """
     chosen = find_method(method)
     settings = chosen.settings(), find_domain(domain).settings(), chosen.planner()
@@ -119,11 +119,11 @@ def make_config(domain: str, level: str, method: str) -> AnyConfig:
 
 
 def change(config: AnyConfig, **changes: Any) -> AnyConfig:
-    """Returns a configuration with fields changed, also those of its parts.
+    """Returns a copy of a configuration with some fields changed.
 
     Args:
-        config: to change.
-        changes: by field; of a part the fields of its own that change, by name, as in
+        config: configuration to copy.
+        changes: new values by field. A dictionary changes fields inside a part, as in
             `change(config, executed=3, planner={"temperature": 1.0})`.
     """
     found = {
@@ -136,17 +136,17 @@ def change(config: AnyConfig, **changes: Any) -> AnyConfig:
 
 
 def list_settings(config: AnyConfig, seed: int) -> dict[str, Any]:
-    """All settings that one seed's result depends on, as JSON values."""
+    """Returns all settings that the result of a training seed depends on, as JSON values."""
     values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
     return json.loads(json.dumps({**values, "seed": seed}))
 
 
 def hash_config(config: AnyConfig, seed: int) -> str:
-    """Twelve hexadecimal digits that name a configuration.
+    """Returns twelve hexadecimal digits that name a configuration and a seed.
 
-    They are those of domain, level, method and what differs from the defaults alone, so that a
-    setting that is added later, with what was done before as its default, changes no name. To
-    train and to play a checkpoint again are two things.
+    The hash covers the domain, the level, the method, and every setting that differs from its
+    default. So a new setting whose default keeps the old behaviour changes no hash. A run that
+    trains and a run that evaluates a checkpoint have different hashes.
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
     defaults = list_settings(make_config(**names), seed=-1)
@@ -159,12 +159,12 @@ def hash_config(config: AnyConfig, seed: int) -> str:
 
 
 def make_domain(config: AnyConfig) -> Domain:
-    """The level of a configuration: the one that is played."""
+    """Makes the level that a configuration plays."""
     return make_level(config.domain, config.play or config.level, config.domain_settings)
 
 
 def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
-    """What a run leaves beside its parameters."""
+    """Makes the specification that a run saves beside its parameters."""
     return Specification(
         config.domain, config.level, config.method, config.context,
         **{group: getattr(config, group) for group in GROUPS},
@@ -174,10 +174,10 @@ def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
 
 
 def choose_episode_seeds(config: AnyConfig) -> range:
-    """The level seeds of the episodes that success is measured on.
+    """Returns the level seeds of the episodes that measure success.
 
     Raises:
-        UserError: they leave their range.
+        UserError: the seeds leave the range of test or validation seeds.
     """
     first = seeds.validation_seeds if config.validation else seeds.test_seeds
     return first(config.test_seed, config.episodes)

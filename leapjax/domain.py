@@ -1,4 +1,4 @@
-"""`Domain`: what training and planning need of one level of a family of environments.
+"""`Domain`: a level of a family of environments, as training and planning need it.
 
 A family is BabyAI, the games of Atari, or one environment of your own. A `DomainType` makes the
 `Domain` of each of its levels. To add a family, write both in a folder of its own, and add a line
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
 Encoders = Mapping[str, EncoderMaker]  # by architecture
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
-# Statistics of training data, kept in checkpoints: by array of an observation, by column, numbers.
+# Statistics of training data, kept in checkpoints: [array of an observation][column][number].
 Augmentation = Callable[[jax.Array, Window], Window]  # (key, window) -> changed window
 
 
@@ -46,13 +46,13 @@ Collect = Callable[[int, int, Callable[[int], None]], Collection]
 
 
 class Recording(NamedTuple):
-    """An episode of n steps from a data set, whose observations may not be the domain's.
+    """An episode of n steps from a data set; its observations may differ from the domain's.
 
     Attributes:
         observations: `[n + 1, ...]`.
         actions: `[n]` int64.
         rewards: `[n]` float32.
-        seed: of the environment's reset; negative if unknown.
+        seed: seed of the environment's reset; negative if unknown.
     """
 
     observations: Any
@@ -67,11 +67,12 @@ class Described(NamedTuple):
     Attributes:
         level: id of the environment.
         episodes: number of episodes in the data set.
-        arguments: of the environment.
+        arguments: keyword arguments of the environment.
         wrappers: around the environment, the innermost first, each with `name`, `entry_point` and
             `kwargs`.
         max_steps: step limit of the environment.
-        spaces: of "observation" and "action", if they say more than shapes and types.
+        spaces: spaces by name, "observation" and "action"; a space that says no more than shapes
+            and types is absent.
     """
 
     level: str | None = None
@@ -86,13 +87,13 @@ class Source(NamedTuple):
     """Where demonstrations are stored, and how they are made and read.
 
     Attributes:
-        default: the place, if the user does not name another.
+        default: place to use if the user does not name another.
         exists: (place) -> whether the demonstrations are there.
         make: (place, progress) -> a summary; makes and stores the demonstrations.
         load: (place, training seed) -> at least as many demonstrations as were asked for, or
             UserError.
-        amount: how many units `make` makes, and reports the progress of.
-        unit: of the amount, such as "demonstrations".
+        amount: number of units that `make` makes; its progress counts them.
+        unit: unit of the amount, such as "demonstrations".
     """
 
     default: str
@@ -119,18 +120,18 @@ def _make_no_extras(demonstration: Demonstration) -> PyTree:
 class Demonstrations(NamedTuple):
     """How demonstrations of a level are made, and how recorded episodes are checked.
 
-    A domain gives `collect`, whose demonstrations are stored as Minari data sets, or `source`, or
-    neither: the user then names a data set.
+    A domain gives `collect`, whose demonstrations the library stores as Minari data sets, or it
+    gives `source`. If it gives neither, the user names a data set.
 
     Attributes:
         collect: (count, training seed, progress) -> `count` demonstrations, or UserError.
-        source: of demonstrations in a format of the domain's own.
+        source: source of demonstrations in the domain's own format.
         check: (observations `[n + 1, ...]`, where) -> UserError if a value is out of range.
         check_environment: (description of a data set, where) -> UserError if the data set was
             recorded in another environment.
-        replay: makes a demonstration of an episode with other observations, or returns the reason
-            why it cannot; `None` if it does not know such observations.
-        criterion: when a recorded episode succeeds; `None` if only the environment can tell.
+        replay: (episode with other observations) -> demonstration, or the reason why there cannot
+            be one, or `None` if it does not know such observations.
+        criterion: decides whether a recorded episode succeeds; `None` if only the environment can.
     """
 
     collect: Collect | None = None
@@ -172,7 +173,7 @@ class Scaling(NamedTuple):
 class Domain(NamedTuple):
     """One level: its environment, its actions, and how a network reads its observations.
 
-    The first six fields are needed; `demonstrations` and `augmentations` matter for training.
+    The first six fields are required; `demonstrations` and `augmentations` matter for training.
     All functions are pure, except `make_adapter` and the functions of `demonstrations`.
 
     Attributes:
@@ -182,14 +183,14 @@ class Domain(NamedTuple):
         max_steps: steps of the longest episode.
         blank: an observation of zeros, as NumPy arrays: shapes and types.
         encoders: by architecture, (model, K) -> encoder of contexts.
-        demonstrations: how they are made and checked.
+        demonstrations: how demonstrations are made and checked.
         augmentations: random changes of training windows.
-        scaling: of returns and observations.
-        rules: an energy without parameters, `()`, that is lowest for plans that obey known rules;
-            `None` without such rules.
+        scaling: scaling of returns and observations.
+        rules: energy with parameters `()` that is lowest for plans that obey known rules; `None`
+            without such rules.
         signature: JSON values that a checkpoint and the level must agree on.
-        made_from: name in `leapjax.domains` and settings that `make_domain` made the level from;
-            `None` for a domain that is not registered, whose planners cannot be saved.
+        made_from: (name in `leapjax.domains`, settings), from which `make_domain` made the level;
+            `None` for an unregistered domain, whose planners cannot be saved.
     """
 
     level: str
@@ -207,7 +208,7 @@ class Domain(NamedTuple):
 
     @property
     def num_actions(self) -> int:
-        """A, the end action included."""
+        """A, the number of actions, with the end action."""
         return len(self.actions)
 
 
@@ -234,7 +235,7 @@ def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
     """Returns a level whose encoders scale by statistics of their training data.
 
     Raises:
-        UserError: the statistics are of other observations.
+        UserError: the statistics belong to other observations.
     """
     if domain.scaling.encoders is None or not statistics:
         return domain
@@ -242,7 +243,7 @@ def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
 
 
 def blank_context(domain: Domain, length: int) -> Context:
-    """Makes a context with K = `length` of zeros, with the shapes and types of a level's."""
+    """Makes a context of zeros with K = `length`, in the shapes and types of a level."""
     blank = to_plain_dicts(domain.blank)
     past = jax.tree.map(lambda x: np.zeros((length, *x.shape), x.dtype), blank)
     return Context(
@@ -256,10 +257,10 @@ def blank_context(domain: Domain, length: int) -> Context:
 
 
 def check_context(context: Context, domain: Domain, length: int) -> None:
-    """Checks the structure, shapes and types of a context; works while a program is traced.
+    """Checks the structure, shapes and types of a context, also while JAX traces a program.
 
     Args:
-        context: to check.
+        context: context to check.
         domain: level of the network that reads the context.
         length: K of that network.
 

@@ -190,7 +190,7 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
         ValueError: no energies, different action sets, or weights that are negative, not
             finite or not as many as the energies.
     """
-    if isinstance(energies, Energy):  # a tuple itself, of functions
+    if isinstance(energies, Energy):  # an energy is a tuple, too
         raise UserError("compose takes a sequence of energies, got one energy")
     energies = tuple(check_kind(energy, Energy) for energy in energies)
     if weights is None:
@@ -428,7 +428,7 @@ def _check_integers(name: str, values: jax.Array, end: int, expected: str) -> ja
     if not jnp.issubdtype(values.dtype, jnp.integer):
         raise ValueError(f"{name} must be integers, got {values.dtype}")
     if not isinstance(values, jax.core.Tracer) and values.size:
-        concrete = np.asarray(values)  # a constant of a program is an array there too
+        concrete = np.asarray(values)  # also inside `jit`, if it is a constant
         if int(concrete.min()) < 0 or int(concrete.max()) >= end:
             raise ValueError(f"{name} {concrete} are not all in {expected}")
     return jnp.asarray(values, jnp.int32)

@@ -1,4 +1,4 @@
-"""Environments as the rollout sees them: the `Adapter` protocol, and Gymnasium's."""
+"""How a rollout sees environments: the `Adapter` protocol, and an adapter of Gymnasium."""
 
 import contextlib
 import inspect
@@ -17,35 +17,48 @@ A = TypeVar("A", bound="Adapter")
 
 
 class Transition(NamedTuple):
-    """What one environment step gave."""
+    """The result of one environment step.
+
+    Attributes:
+        observation: the observation after the step.
+        reward: the reward, on the scale of demonstrations: planners see it.
+        terminated: whether the episode came to an end of its own.
+        truncated: whether the episode was cut off, for instance by a step limit.
+        success: whether the episode has succeeded, by the environment's own measure.
+        score: the step's part of the reported return; `None` for the reward.
+        taken: the action that was executed; `None` for the requested action.
+    """
 
     observation: PyTree
-    reward: float  # as demonstrations have it, since planners see it
+    reward: float
     terminated: bool
     truncated: bool
-    success: bool  # by the environment's own measure
-    score: float | None = None  # what counts in the end, where that is not the reward
-    taken: int | None = None  # the action that was executed, where it is another than asked for
+    success: bool
+    score: float | None = None
+    taken: int | None = None
 
     def executed(self, action: Array) -> Array:
-        """What was done when `action` was asked for."""
+        """Returns the action that was executed when `action` was requested."""
         return action if self.taken is None else self.taken
 
     @property
     def counted(self) -> float:
-        """What it adds to an episode's return as reported."""
+        """The step's part of the reported return of its episode."""
         return self.reward if self.score is None else self.score
 
 
 class Adapter(Protocol):
-    """One environment with discrete actions `0 .. A - 2`; the rollout keeps `A - 1`, end.
+    """One environment with discrete actions `0 .. A - 2`; it never gets the end action, `A - 1`.
 
-    An observation is any pytree of NumPy arrays whose shapes never change. An adapter whose
-    environment works on its own may be `Eager`; one whose environment holds files, ports or
-    processes should be `Closable`.
+    An observation is any pytree of NumPy arrays whose shapes never change. An adapter may be
+    `Eager` if its environment works in the background. It should be `Closable` if its environment
+    holds files, ports or processes.
+
+    Attributes:
+        num_actions: A, the end action included.
     """
 
-    num_actions: int  # A, the end action included
+    num_actions: int
 
     def reset(self, seed: int) -> PyTree:
         """Starts the episode of a seed and returns its first observation."""
@@ -58,27 +71,28 @@ class Adapter(Protocol):
 
 @runtime_checkable
 class Eager(Protocol):
-    """An `Adapter` whose environment works on its own, so that many can work at once."""
+    """An `Adapter` whose environment steps in the background, so that many can step at once."""
 
     def begin(self, action: int) -> None:
-        """Begins to take an action; the next `step`, with the same one, waits for what it gives."""
+        """Starts to take an action; the next `step`, with the same action, waits for its result."""
         ...
 
 
 class Criterion(NamedTuple):
-    """When an episode succeeds, in an environment that has no measure of success of its own.
+    """When an episode succeeds, for environments without their own measure of success.
 
     Attributes:
-        least_return: that the episode has to reach; None: it has to terminate with a positive
-            reward.
-        given: whether the user gave it; if not, it is the environment's `reward_threshold`.
+        least_return: return that the episode must reach. `None`: the episode must terminate with a
+            positive reward.
+        given: whether the user chose this return; if not, it is the environment's
+            `reward_threshold`.
     """
 
     least_return: float | None
     given: bool = False
 
     def __str__(self) -> str:
-        """In words, with where it comes from."""
+        """Describes the criterion and its origin in words."""
         if self.least_return is None:
             return "a positive reward at the end (nobody has named a return)"
         origin = "given"
@@ -91,8 +105,8 @@ def find_criterion(env: "gym.Env", success_return: float | None = None) -> Crite
     """Chooses when an episode of an environment succeeds.
 
     Args:
-        env: whose authors may ask for a return (`reward_threshold`).
-        success_return: that the user asks for; None: what the authors ask for.
+        env: environment, whose specification may have a `reward_threshold`.
+        success_return: return that the user asks for; `None` for the `reward_threshold`.
 
     Raises:
         UserError: `success_return` is not a finite number.
@@ -108,11 +122,11 @@ def judge_episode(
     """Says whether an episode has succeeded so far.
 
     Args:
-        criterion: to judge by.
-        total: the episode's return so far.
-        reward: of its last step.
-        terminated: with its last step.
-        truncated: with its last step.
+        criterion: criterion of success.
+        total: return of the episode so far.
+        reward: reward of the last step.
+        terminated: whether the last step terminated the episode.
+        truncated: whether the last step truncated the episode.
     """
     if criterion.least_return is None:
         return bool(terminated and reward > 0)
@@ -124,10 +138,10 @@ def judge_episode(
 
 @runtime_checkable
 class Closable(Protocol):
-    """An `Adapter` whose environment holds something that must be given back."""
+    """An `Adapter` whose environment holds resources that must be released."""
 
     def close(self) -> None:
-        """Gives it back; the adapter is not played again."""
+        """Releases the resources; the adapter is not played again."""
         ...
 
 
@@ -139,7 +153,7 @@ def close(adapter: Adapter) -> None:
 
 @contextlib.contextmanager
 def closing(adapter: A) -> Iterator[A]:
-    """Yields an adapter and closes it, also after an error, which a failing `close` never hides."""
+    """Yields an adapter and closes it. A failing `close` never hides an earlier error."""
     try:
         yield adapter
     except BaseException:
@@ -150,13 +164,13 @@ def closing(adapter: A) -> Iterator[A]:
 
 
 def list_environments(adapter: Adapter) -> list[object]:
-    """The Gymnasium environments that an adapter steps, without their wrappers.
+    """Lists the Gymnasium environments that an adapter steps, without their wrappers.
 
-    Finds attributes of the adapter, of its class, and of other adapters inside it. Lists are not
-    searched: a list of environments that all adapters know says nothing of which one is stepped.
+    Searches the attributes of the adapter, of its class, and of other adapters inside it. Lists are
+    not searched: adapters may share a list of environments, and each step its own.
     """
     gymnasium = sys.modules.get("gymnasium")
-    if gymnasium is None:  # not imported, so nothing can be one of its environments
+    if gymnasium is None:  # not imported, so it has no environments yet
         return []
     kinds = (gymnasium.Env, gymnasium.vector.VectorEnv)
     found: list[object] = []
@@ -171,24 +185,31 @@ def list_environments(adapter: Adapter) -> list[object]:
 
 
 def _describe_returned(found: Any) -> str:
-    """What a step returned, in a message."""
+    """Describes the return value of a step, for a message."""
     return f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
 
 
 def _list_attributes(owner: object) -> list[Any]:
-    """The attributes of an object and of its class; not what containers among them hold."""
+    """Lists attributes of an object and of its class, but not the contents of containers."""
     kinds = type(owner).__mro__
     found = [part for place in (*kinds, owner) for part in getattr(place, "__dict__", {}).values()]
-    slots = filter(inspect.ismemberdescriptor, found)  # which no `__dict__` of an object has
+    slots = filter(inspect.ismemberdescriptor, found)  # not in the object's `__dict__`
     return [*found, *(getattr(owner, slot.__name__, None) for slot in slots)]
 
 
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
-    An episode succeeds when its return reaches `success_return`. If that is None, the return is
-    the environment's `reward_threshold`. If there is none either, an episode succeeds when it
-    terminates with a positive reward.
+    An episode succeeds when its return reaches `success_return` or, by default, the environment's
+    `reward_threshold`. Without either, it succeeds when it terminates with a positive reward.
+
+    Args:
+        env: a Gymnasium environment.
+        success_return: return that counts as success; `None` for the default.
+
+    Raises:
+        UserError: `env` is not an environment, or `success_return` is not a finite number.
+        ValueError: the action space is not `Discrete`.
     """
 
     def __init__(self, env: "gym.Env", success_return: float | None = None) -> None:
@@ -197,7 +218,7 @@ class GymnasiumAdapter:
             raise UserError(
                 f"expected a Gymnasium environment, such as gymnasium.make returns, got {env!r}"
             )
-        gymnasium = sys.modules.get("gymnasium")  # imported, if this is one of its environments
+        gymnasium = sys.modules.get("gymnasium")  # already imported, if `env` is from there
         if gymnasium is None or not isinstance(actions, gymnasium.spaces.Discrete):
             raise ValueError(f"a Discrete action space is needed, got {actions}")
         self.env = env

@@ -7,13 +7,13 @@ LONGEST = 2000  # characters
 
 
 class UserError(ValueError):
-    """Input that cannot be used: says what was wrong, what was expected, what to do.
+    """Unusable input: the message names the mistake, the expected input and the remedy.
 
-    It is one line, whatever the input that it quotes.
+    The message is one line, even if it quotes input of several lines.
 
     Args:
-        message: of any number of lines.
-        fields: of configurations that would have to change; a command line names its options.
+        message: text of any number of lines, which are joined.
+        fields: names of configuration fields to change; a command line names their options.
     """
 
     def __init__(self, message: str, *fields: str) -> None:
@@ -22,12 +22,12 @@ class UserError(ValueError):
 
 
 def first_line(error: Exception) -> str:
-    """What another library's error says, short enough for one line of ours."""
+    """Returns the first line of another library's error, short enough to quote in our messages."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A hint at names that are nearly this one, to end a message with; empty where none is."""
+    """Returns a hint at similar names, to append to a message; "" if no name is similar."""
     lowered = {candidate.lower(): candidate for candidate in known}
     near = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.4)
     return f"; did you mean {', '.join(lowered[match] for match in near)}?" if near else ""

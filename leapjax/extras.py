@@ -1,11 +1,11 @@
-"""The extras of the package: which of them brings an optional module, and how to install it."""
+"""Names the extra of the package that installs an optional module."""
 
 import contextlib
 from collections.abc import Iterator
 
 from leapjax.errors import UserError
 
-# By top-level module, the smallest extra of pyproject.toml that brings it.
+# For each top-level module, the smallest extra in pyproject.toml that installs it.
 EXTRAS = {
     "optax": "train",
     "orbax": "train",
@@ -22,19 +22,19 @@ EXTRAS = {
     "tensorboardX": "tensorboard",
     "wandb": "wandb",
 }
-WITH_TRAIN = ("babyai", "atari")  # extras that bring all of `train`, too
+WITH_TRAIN = ("babyai", "atari")  # extras that include all of `train`
 
 
 def explain_missing(error: BaseException | None, extra: str = "train") -> str | None:
-    """Says which extra brings the module that could not be imported.
+    """Names the extra that installs a module that could not be imported.
 
     Args:
-        error: of the import.
-        extra: that the importing program needs. It is named instead of `train` if it brings all of
-            `train`, so that one command installs everything.
+        error: error of the import.
+        extra: extra that the importing program needs. The line names it instead of `train` if it
+            includes all of `train`, so that one command installs everything.
 
     Returns:
-        One line, or None if the error is another one, or the module belongs to no extra.
+        One line, or `None` if the error is of another kind or no extra installs the module.
     """
     if not isinstance(error, ModuleNotFoundError):
         return None
@@ -48,7 +48,7 @@ def explain_missing(error: BaseException | None, extra: str = "train") -> str | 
 
 @contextlib.contextmanager
 def report_missing(extra: str = "train") -> Iterator[None]:
-    """Turns the failing import of an optional module into one line; other errors pass.
+    """Turns the failed import of an optional module into a UserError; other errors pass.
 
     Args:
         extra: see `explain_missing`.

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and folders that one process or one user has to itself."""
+"""Atomic file writes, locks and permissions of folders, and checks of disk and memory."""
 
 import contextlib
 import os
@@ -11,24 +11,24 @@ from pathlib import Path
 
 from leapjax.errors import UserError, first_line
 
-SPARE = 2**23  # bytes that are left free on every disk
-LARGEST_TEXT = 2**26  # bytes of a file of text: more is not ours, and parsing takes many times that
+SPARE = 2**23  # bytes that must stay free on a disk
+LARGEST_TEXT = 2**26  # bytes: our text files are smaller, and parsing takes many times the size
 CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")  # the limit of a container, on Linux
 
 try:
     import fcntl
     import grp
     import pwd
-except ImportError:  # not on Windows: there, nothing keeps two processes apart
+except ImportError:  # Windows lacks these modules: no locks there
     fcntl = None  # type: ignore[assignment]
 
 
 def check_path(path: str | os.PathLike[str]) -> Path:
-    """Returns a path under which the system can look for something, whether it is there or not.
+    """Returns a path that the system can look up; the file need not exist.
 
     Raises:
-        UserError: not a path, too long, holds a null byte, or leads into a folder that this user
-            may not look into.
+        UserError: the value is not a path, is too long, holds a null byte, or leads into a folder
+            that this user may not search.
     """
     try:
         found = Path(path)
@@ -45,14 +45,14 @@ def check_path(path: str | os.PathLike[str]) -> Path:
 
 
 def read_text(path: Path, most: int = LARGEST_TEXT) -> str:
-    """Reads a file of text.
+    """Reads a text file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         most: the largest size allowed, in bytes.
 
     Raises:
-        UserError: it cannot be read, is too large, or is not text.
+        UserError: the file cannot be read, is too large, or is not text.
     """
     try:
         _check_regular(path)
@@ -60,35 +60,35 @@ def read_text(path: Path, most: int = LARGEST_TEXT) -> str:
             data = file.read(most + 1)
         if len(data) > most:
             raise ValueError(f"larger than {most >> 20} MiB")
-        # As in text mode, line ends of other systems become our own.
+        # As in text mode, every kind of line end becomes "\n".
         return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {first_line(error)}") from None
 
 
 def _check_regular(path: Path) -> None:
-    """Refuses what is no file with an end: a pipe may never end, or never begin."""
+    """Raises ValueError unless a path is a regular file: reading a pipe might block for ever."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise ValueError("not a file")
 
 
 def read_sizes(path: Path) -> dict[str, int]:
-    """Reads to how many bytes each array in a NumPy archive unpacks, and unpacks none.
+    """Returns the unpacked bytes of each array in a NumPy archive, without unpacking it.
 
     Raises:
         Exception: the archive is damaged (zipfile raises many kinds).
     """
     _check_regular(path)
     with zipfile.ZipFile(path) as archive:
-        # Nobody reads more of a member than its size says.
+        # Readers of the archive stop at the size that it claims for an array.
         return {each.filename.removesuffix(".npy"): each.file_size for each in archive.infolist()}
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file so that a reader sees all of it or the one before.
+    """Writes a text file atomically: a reader sees the old text or the new text, never a part.
 
     Raises:
-        UserError: it cannot be written, for example because the disk is full.
+        UserError: the file cannot be written, for example because the disk is full.
     """
     with write_whole(path) as scratch:
         scratch.write_text(text, encoding="utf-8")
@@ -96,24 +96,24 @@ def write_text(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def write_whole(path: Path) -> Iterator[Path]:
-    """Gives a path to write to; what was written is at `path` afterwards, or nothing is.
+    """Yields a scratch path; the file written there replaces `path` when the block succeeds.
 
-    It is on the disk then, whatever happens to the power.
+    By then the file is on the disk and survives a power failure.
 
     Raises:
-        UserError: it cannot be written, for example because the disk is full.
+        UserError: the file cannot be written, for example because the disk is full.
     """
-    # The same suffix: what writes pictures goes by it.
+    # Keeps the suffix, from which libraries choose the format of a picture.
     scratch = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch.unlink(missing_ok=True)
-        scratch.touch(exist_ok=False)  # ours: in a shared folder, not what another put there
+        scratch.touch(exist_ok=False)  # fails if another user put a file there
         yield scratch
         flush(scratch)
         scratch.replace(path)
         flush(path.parent)
-    except (OSError, ValueError) as error:  # ValueError: a suffix that names no kind of picture
+    except (OSError, ValueError) as error:  # ValueError: unknown picture suffix
         raise UserError(f"cannot write {path}: {first_line(error)}") from None
     finally:
         with contextlib.suppress(OSError):
@@ -121,26 +121,26 @@ def write_whole(path: Path) -> Iterator[Path]:
 
 
 def find_cache_folder() -> Path:
-    """Returns the folder in which leapjax keeps what it can make again for this user.
+    """Returns this user's folder for files that leapjax can make again.
 
     Raises:
-        UserError: the system does not say where this user's files are.
+        UserError: XDG_CACHE_HOME names no absolute path, and this user has no home folder.
     """
     chosen = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
-        # A relative one is ignored, as the XDG specification has it.
+        # The XDG specification says to ignore a relative path.
         return (chosen if chosen.is_absolute() else Path.home() / ".cache") / "leapjax"
     except RuntimeError:
         raise UserError("this user has no home folder: name a folder in XDG_CACHE_HOME") from None
 
 
 def make_private(folder: Path) -> None:
-    """Makes a folder to which only this user can write; one that is there is checked.
+    """Makes a folder to which only this user can write, or checks an existing folder.
 
-    What is read from it again would otherwise be somebody else's choice.
+    Otherwise another user could choose the files that this process reads from it.
 
     Raises:
-        UserError: it cannot be made; or others can write to it, or put another in its place.
+        UserError: the folder cannot be made, or others can write to it or replace it.
     """
     try:
         for path in (*reversed(folder.parents), folder):
@@ -154,11 +154,11 @@ def make_private(folder: Path) -> None:
 
 
 def _check_private(folder: Path, sticky: bool) -> None:
-    """Refuses a folder to which others can write.
+    """Raises UserError if another user owns a folder or can write to it.
 
     Args:
-        folder: to check.
-        sticky: whether a sticky folder will do, in which nobody replaces what another owns.
+        folder: folder to check.
+        sticky: whether to accept a sticky folder, in which users cannot replace each other's files.
     """
     if not hasattr(os, "getuid"):  # Windows keeps the folders of users apart
         return
@@ -172,10 +172,10 @@ def _check_private(folder: Path, sticky: bool) -> None:
 
 
 def _is_own_group(group: int) -> bool:
-    """Whether a group is this user's own, as systems make one for each user.
+    """Returns whether a group is the private group that the system made for this user.
 
-    By convention it has the number or the name of the user. The numbers differ where a group was
-    made for something else before.
+    By convention it has the user's number or name. The numbers differ if an earlier group had
+    taken the user's number.
     """
     user = os.getuid()
     if group == user:
@@ -188,8 +188,8 @@ def _is_own_group(group: int) -> bool:
 
 
 def flush(path: Path) -> None:
-    """Waits until a file, or what a folder says of its files, is on the disk."""
-    if path.is_dir() and not hasattr(os, "O_DIRECTORY"):  # Windows has no way to
+    """Waits until a file, or a folder's list of files, is on the disk."""
+    if path.is_dir() and not hasattr(os, "O_DIRECTORY"):  # Windows cannot flush a folder
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -199,14 +199,14 @@ def flush(path: Path) -> None:
 
 
 def check_room(folder: Path, needed: int) -> None:
-    """Refuses to begin what the disk has no room for: other libraries may crash there.
+    """Checks that the disk has room: other libraries may crash when it is full.
 
     Args:
-        folder: to be written to.
-        needed: bytes, at most; as many again as `SPARE` must be free.
+        folder: folder to write to.
+        needed: largest number of bytes to write; `SPARE` bytes must remain free.
 
     Raises:
-        UserError: says how much is free, and how much would be needed.
+        UserError: the disk lacks room; says how much is free and how much may be needed.
     """
     free = shutil.disk_usage(folder).free
     if free < needed + SPARE:
@@ -217,19 +217,19 @@ def check_room(folder: Path, needed: int) -> None:
 
 
 def check_memory(needed: int, what: str) -> None:
-    """Refuses what is larger than the memory of this machine, or of the container that we are in.
+    """Checks that this machine, or the container of this process, has enough memory.
 
     Args:
-        needed: bytes, at least.
-        what: needs them.
+        needed: smallest number of bytes that the work takes.
+        what: the work, or the options that enlarge it, for the error message.
 
     Raises:
-        UserError: says how much would be needed.
+        UserError: the memory is too small; says how much is needed.
     """
-    if not hasattr(os, "sysconf"):  # Windows does not say
+    if not hasattr(os, "sysconf"):  # Windows
         return
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, ValueError):  # no container, or "max"
+    with contextlib.suppress(OSError, ValueError):  # no container, or no limit ("max")
         memory = min(memory, int(CONTAINER_MEMORY.read_text()))
     if needed > memory:
         raise UserError(
@@ -239,10 +239,10 @@ def check_memory(needed: int, what: str) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Refuses a folder in which no file could be made, whether it is there already or not.
+    """Checks that files can be made in a folder, which need not exist yet.
 
     Raises:
-        UserError: it could not be made, or nothing can be written there.
+        UserError: the folder cannot be made or written to.
     """
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
@@ -254,18 +254,18 @@ def check_writable(folder: Path) -> None:
 
 @contextlib.contextmanager
 def lock_folder(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Keeps other processes out of a folder; the system lets go however the process ends.
+    """Locks a folder inside the block; the system releases the lock even of a killed process.
 
     Args:
-        folder: made if it is not there.
-        wait: for another process to leave, instead of refusing.
+        folder: folder to lock; made if it does not exist.
+        wait: whether to wait while another process holds the lock, instead of raising.
 
     Raises:
-        UserError: another process is in there, or the folder cannot be made.
+        UserError: another process holds the lock, or the folder cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Not a link: what it leads to would be emptied.
+        # O_NOFOLLOW: the file is emptied below, which must not happen to a link's target.
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
         file = os.fdopen(os.open(folder / ".lock", flags, 0o666), "ab+", buffering=0)
     except (OSError, ValueError) as error:  # ValueError: a null byte

@@ -24,7 +24,7 @@ from leapjax.training import make_begin, make_train_step, train
 from leapjax.types import Demonstration, TrainState
 
 PRESET = "leapjax"
-ANY = "gymnasium"  # its presets serve a level of no registered domain
+ANY = "gymnasium"  # its presets serve levels of unregistered domains
 
 
 def report_nothing(step: int, means: dict[str, float]) -> None:
@@ -33,17 +33,17 @@ def report_nothing(step: int, means: dict[str, float]) -> None:
 
 
 def make_domain(name: str, level: str, settings: Any = None) -> Domain:
-    """Makes one level of a domain, as `leapjax.fit` and `leapjax.evaluate` need it.
+    """Makes one level of a domain, for `leapjax.fit` and `leapjax.evaluate`.
 
     Args:
-        name: of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
-        level: by name, such as "GoToLocalS7N5"; of Gymnasium, the id of an environment.
-        settings: options of encoder and augmentation, as in the module of the domain; None for
-            those that preset `leapjax` has for LEAP on this level.
+        name: name of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
+        level: name of the level, such as "GoToLocalS7N5"; for Gymnasium, id of an environment.
+        settings: options of encoder and augmentation, as in the module of the domain; `None` for
+            the options that preset `leapjax` has for LEAP on this level.
 
     Raises:
-        UserError: an unknown domain or level, settings of another domain, or an environment that
-            cannot be made.
+        UserError: the domain or the level is unknown, the settings belong to another domain, or
+            the environment cannot be made.
     """
     if settings is None:
         settings = find_preset(name, level, "leap", PRESET).domain_settings
@@ -65,30 +65,31 @@ def fit(
     settings: Any = None,
     progress: Callable[[int, dict[str, float]], None] = report_nothing,
 ) -> Pretrained:
-    """Trains a planner on demonstrations; nothing is kept on disk (see `Pretrained.save`).
+    """Trains a planner on demonstrations, without saving it (see `Pretrained.save`).
 
-    What is None is what preset `leapjax` of the command line has for the domain and the method.
-    The same demonstrations, settings and seed give the same parameters on the same devices.
+    An argument that is `None` takes its value from preset `leapjax` of the command line, for the
+    domain and the method. The same demonstrations, settings and seed give the same parameters on
+    the same devices.
 
     Args:
         demonstrations: episodes, or the id of a Minari data set.
-        domain: the level that they are of, such as
+        domain: the level of the demonstrations, such as
             `leapjax.make_domain("gymnasium", "CartPole-v1")`.
         method: a name in `leapjax.methods.METHODS`.
-        steps: of training; None for those of `training`.
-        seed: of parameters, batches and noise.
-        horizon: T, planned actions; None for that of `planner`.
-        context: K, past steps that the network sees.
-        model: the size of the network.
-        training: batch, learning rate and so on.
+        steps: number of training steps; `None` for `training.steps`.
+        seed: seed of parameters, batches and noise.
+        horizon: T, number of planned actions; `None` for `planner.horizon`.
+        context: K, number of past steps that the network sees.
+        model: size of the network.
+        training: batch size, learning rate and so on.
         planner: how to search.
-        settings: options of the method alone, an instance of its `Settings`.
+        settings: options of the method, an instance of its `Settings`.
         progress: called with (step, mean metrics) every 20 steps and at the end.
 
     Raises:
-        UserError: before any training: no demonstrations, some of another domain, none with
-            rewards where the method learns from them, an unknown method, or settings that cannot
-            be.
+        UserError: raised before training. The demonstrations are missing, of another domain, or
+            without the rewards that the method learns from; or the method is unknown, or a
+            setting is invalid.
         NonFiniteLoss: see `leapjax.training.train`.
     """
     check_kind(domain, Domain)
@@ -109,7 +110,7 @@ def fit(
         planner = dataclasses.replace(planner, horizon=asked.get("horizon", planner.horizon))
         settings = config.method_settings if settings is None else settings
         mesh = sharding.make_mesh(training.batch // training.consecutive, jax.local_devices())
-    except ValueError as error:  # the dataclasses refuse values that cannot be
+    except ValueError as error:  # a dataclass refuses a value
         raise UserError(str(error)) from None
     data = _read(demonstrations, domain, seed)
     if not data and training.steps:
@@ -147,7 +148,7 @@ def fit(
 def _read(
     demonstrations: Sequence[Demonstration] | str, domain: Domain, seed: int
 ) -> list[Demonstration]:
-    """The demonstrations that `fit` was given, each checked against the domain."""
+    """Reads the demonstrations given to `fit`, and checks each against the domain."""
     if isinstance(demonstrations, str):
         if domain.demonstrations.source is not None:
             return domain.demonstrations.source.load(demonstrations, seed).demonstrations

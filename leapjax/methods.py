@@ -1,4 +1,4 @@
-"""The table of methods: what `leapjax.load` and the experiments find by name."""
+"""The table of methods, in which `leapjax.load` and the experiments look up names."""
 
 from typing import Any
 
@@ -36,15 +36,15 @@ METHODS: dict[str, Method] = {
 
 
 def learns_from_rewards(name: str, settings: Any) -> bool:
-    """Whether a method with these settings learns from rewards, so that data must hold some."""
+    """Returns whether a method with these settings learns from rewards: its data must have some."""
     return find_method(name).rewards or getattr(settings, "returns", False)
 
 
 def find_method(name: str) -> Method:
-    """The method of that name.
+    """Returns a method by its name.
 
     Raises:
-        UserError: there is none; names those that there are.
+        UserError: the name is unknown; lists the known names.
     """
     if name not in METHODS:
         raise UserError(f"unknown method {name!r}: expected one of {', '.join(METHODS)}")

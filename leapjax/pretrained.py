@@ -1,4 +1,4 @@
-"""Trained planners on disk: what `leapjax.load` reads and every run writes."""
+"""Trained planners on disk: `leapjax.load` reads them, and every run writes its own."""
 
 import dataclasses
 import importlib
@@ -32,21 +32,20 @@ from leapjax.types import Agent, Array, Context, Energy, Params, Plan
 SPECIFICATION = "specification.json"
 LARGEST_SPECIFICATION = 2**20  # bytes
 CHECKPOINTS = "checkpoints"
-WEIGHTS = "weights.npz"  # in place of checkpoints, in the folder of a published planner
+WEIGHTS = "weights.npz"  # a published planner has it in place of checkpoints
 PUBLISHED = Path(__file__).parent / "published"
-GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")  # of settings
+GROUPS = ("model", "training", "planner", "method_settings", "domain_settings")  # settings
 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """What a planner was trained on, and by which preset: nothing that rebuilding it needs.
+    """The data, preset and seed of training. They are not needed to rebuild the planner.
 
     Attributes:
-        preset: by name.
-        seed: of training.
-        demos: how many demonstrations.
-        demonstrations: the data set that they are of; None: the domain made them, or they were in
-            memory.
+        preset: name of the preset.
+        seed: seed of training.
+        demos: number of demonstrations.
+        demonstrations: their data set; `None` if the domain made them or they were in memory.
     """
 
     preset: str
@@ -60,21 +59,22 @@ class Origin:
 
 @dataclasses.dataclass(frozen=True)
 class Specification:
-    """All that is needed to rebuild a planner around its parameters.
+    """Everything but the parameters that is needed to rebuild a planner.
 
     Attributes:
-        domain: its name in `leapjax.domains`.
-        level: that it was trained for.
-        method: its name in `leapjax.methods`.
-        context: K, past steps that the network sees.
-        model: the size of the network.
-        training: how it was trained.
-        planner: how it searches; its horizon is the network's too.
-        method_settings: options of the method alone.
-        domain_settings: options of encoder and augmentation.
-        signature: of the domain, when it was trained.
-        origin: what it was trained on.
-        statistics: of what it learned from, as far as its network needs them.
+        domain: name of the domain in `leapjax.domains`.
+        level: level that the planner was trained for.
+        method: name of the method in `leapjax.methods`.
+        context: K, number of past steps that the network sees.
+        model: architecture and size of the network.
+        training: settings of training.
+        planner: settings of the search; the network has its horizon.
+        method_settings: options that only this method has.
+        domain_settings: options of encoders, augmentations and environment.
+        signature: signature of the domain at the time of training.
+        origin: data, preset and seed of training.
+        statistics: statistics of the training data that the network needs; `()` if it needs no
+            statistics.
     """
 
     domain: str
@@ -100,11 +100,11 @@ class Pretrained:
     """A ready planner: `pretrained(keys, contexts)` plans for any number of contexts.
 
     Attributes:
-        specification: all that it is rebuilt from, but the parameters.
-        energy: what it minimises.
-        params: of the energy.
+        specification: everything but the parameters that is needed to rebuild it.
+        energy: energy that it minimises.
+        params: parameters of the energy.
         plan: the compiled planner: `(params, keys, contexts) -> Plan`.
-        domain: the level that it plays; `domain.make_adapter()` is an environment of it.
+        domain: level that it plays; `domain.make_adapter()` makes an environment.
     """
 
     specification: Specification
@@ -120,17 +120,19 @@ class Pretrained:
     def plan_for(self, adapter: Adapter, seed: int = 0) -> Plan:
         """Resets an environment and makes one plan for its first state.
 
-        The plan is the first one of `leapjax.evaluate` for the same level seed.
+        `leapjax.evaluate`, with its default seed, begins the episode of this level seed with the
+        same plan.
 
         Args:
-            adapter: an environment, such as `domain.make_adapter()` gives.
+            adapter: an environment, such as `domain.make_adapter()` makes.
             seed: level seed, in 0 .. 2^32 - 1.
 
         Returns:
             A `Plan` of NumPy arrays, without a leading `[B]`: `actions` is `[T]`.
 
         Raises:
-            UserError: no adapter, other actions than the planner's, or another observation.
+            UserError: `adapter` is not an adapter, or the network does not fit its observations.
+            ValueError: the environment and the planner have different actions.
         """
         seed = check_seed(seed)
         rollouts.check_adapter(adapter)
@@ -143,15 +145,15 @@ class Pretrained:
         return jax.tree.map(lambda leaf: leaf[0], plans)
 
     def compile(self, batch: int = 1, executed: int | None = None) -> None:
-        """Compiles what batches of at most `batch` plans need, so that later calls start at once.
+        """Compiles the programs for up to `batch` plans, so that later calls start at once.
 
         Args:
             batch: B, the largest number of contexts in a call.
-            executed: actions of each plan in `leapjax.evaluate`; None for all. If it is 1, plans
-                after the first use a cache.
+            executed: number of actions that `leapjax.evaluate` executes of each plan; `None` for
+                all. If it is 1, plans after the first use a cache.
 
         Raises:
-            UserError: a number that is not a positive integer.
+            UserError: `batch` or `executed` is not a positive integer.
         """
         context = blank_context(self.domain, self.specification.context)
         executed, _ = rollouts.check_limits(executed, None)
@@ -162,11 +164,11 @@ class Pretrained:
         """Writes a folder that `leapjax.load` reads: a specification, and the parameters.
 
         Args:
-            folder: to make.
+            folder: new folder.
 
         Raises:
-            UserError: it is there already, or cannot be written; or `leapjax.make_domain` did not
-                make the domain, so that nothing on disk would say how to make its network.
+            UserError: the folder exists or cannot be written; or `leapjax.make_domain` did not make
+                the domain, so no file could say how to rebuild the network.
         """
         if not self.specification.domain:
             raise UserError(
@@ -200,11 +202,11 @@ class Pretrained:
 
 
 def make_domain(specification: Specification, level: str | None = None) -> Domain:
-    """The level that a planner was trained for, or another one for the same network.
+    """Makes the level that a planner was trained for, or another level for the same network.
 
     Raises:
-        UserError: it cannot be made, or only the specification names it and its module has not
-            been imported.
+        UserError: the level cannot be made; or only the specification names it, and its module has
+            not been imported.
     """
     if level is None:
         level = specification.level
@@ -214,10 +216,15 @@ def make_domain(specification: Specification, level: str | None = None) -> Domai
 
 
 def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None = None) -> Agent:
-    """The agent of a specification; `mesh`: of devices to train on, None for one device.
+    """Makes the agent of a specification.
+
+    Args:
+        specification: of the agent.
+        domain: level to train on, such as `make_domain` makes.
+        mesh: devices to train on; `None` for one device.
 
     Raises:
-        UserError: the method cannot be had with these settings.
+        UserError: the method does not support these settings.
     """
     setup = Setup(
         domain, specification.context, specification.planner.horizon, specification.model,
@@ -227,19 +234,19 @@ def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None =
 
 
 def describe_identity(specification: Specification) -> str:
-    """What checkpoints of a run are sealed with: all of its specification but the defaults."""
+    """Describes a run as JSON, to seal its checkpoints; leaves out settings with their default."""
     defaults = {name: type(getattr(specification, name))() for name in GROUPS}
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
     changed = {name: serialization.find_differences(values[name], plain[name]) for name in GROUPS}
     changed["training"] = drop_unnamed(changed["training"])
-    if not specification.statistics:  # as before there were any
+    if not specification.statistics:  # so that older checkpoints keep their seal
         del values["statistics"]
     return json.dumps(values | changed, sort_keys=True)
 
 
 def drop_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of training that a result depends on."""
+    """Drops the settings of training that do not change a result."""
     return {name: value for name, value in training.items() if name not in UNNAMED}
 
 
@@ -249,18 +256,20 @@ def save_specification(folder: Path, specification: Specification) -> None:
 
 
 def read_specification(folder: Path) -> Specification:
-    """The specification that a run left in its folder, if its parameters were saved with it.
+    """Reads the specification of a run, and checks that the saved parameters belong to it.
 
     Raises:
-        UserError: missing, damaged, of an unknown method or domain, or changed since.
+        UserError: the file is missing, damaged or changed since, or has an unknown method or
+            domain.
     """
     return _read_sealed(folder)[0]
 
 
 def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
-    """The specification in a folder, and how many numbers each array saved with it has.
+    """Reads and checks a specification; also returns the size of each saved array.
 
-    Nothing is built, imported or unpacked before this: a specification is what a file says.
+    Call this before you build the network, import the level's module or unpack the arrays: the
+    specification is an input, which may be wrong.
     """
     specification = parse_specification(check_path(folder))
     whose = describe_identity(specification)
@@ -270,20 +279,20 @@ def _read_sealed(folder: Path) -> tuple[Specification, list[int]]:
 
 
 def _import_checkpoints() -> types.ModuleType:
-    """Imports Orbax, which takes a while, and which published planners do not need.
+    """Imports Orbax late: the import is slow, and published planners do not need it.
 
     Raises:
-        UserError: it is not installed.
+        UserError: Orbax is not installed.
     """
     with report_missing():
         return importlib.import_module("leapjax.checkpoints")
 
 
 def parse_specification(folder: Path) -> Specification:
-    """What the specification in a folder says, whether parameters were saved with it or not.
+    """Reads the specification in a folder, without looking for saved parameters.
 
     Raises:
-        UserError: missing, damaged, or of an unknown method or domain.
+        UserError: the file is missing or damaged, or has an unknown method or domain.
     """
     path = folder / SPECIFICATION
     if not path.is_file():
@@ -305,10 +314,10 @@ def parse_specification(folder: Path) -> Specification:
 
 
 def find_published(name: str) -> Path:
-    """The folder of a planner that comes with the library.
+    """Finds the folder of a planner that comes with the library.
 
     Raises:
-        UserError: there is none of this name.
+        UserError: no published planner has this name.
     """
     names = sorted(path.name for path in PUBLISHED.glob("*") if path.is_dir())
     if name not in names:
@@ -319,14 +328,14 @@ def find_published(name: str) -> Path:
 def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
     """Writes a trained planner as two small files, its parameters in half precision.
 
-    `load` reads the folder of both, `specification.json` and `weights.npz`, wherever it is.
+    The files are `specification.json` and `weights.npz`. `load` reads their folder from any place.
 
     Args:
-        folder: of a run, or of `Pretrained.save`.
-        target: the folder to write to.
+        folder: folder of a run, or of `Pretrained.save`.
+        target: folder to write to.
 
     Raises:
-        UserError: the run cannot be read, has not come to its end, or the target not be written.
+        UserError: the run cannot be read or is not finished, or the target cannot be written.
     """
     planner, target = load(folder, finished=True), check_path(target)
     weights.write(target / WEIGHTS, planner.params, describe_identity(planner.specification))
@@ -334,10 +343,10 @@ def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
 
 
 def find_folder(path: str | os.PathLike[str]) -> Path:
-    """The folder of a run; or, where there is none, of the published planner of a level.
+    """Finds the folder of a run or, if it does not exist, of a level's published planner.
 
     Raises:
-        UserError: the system cannot look for such a path.
+        UserError: the system cannot look up the path.
     """
     folder = check_path(path)
     published = not folder.exists() and (PUBLISHED / folder).is_dir()
@@ -345,10 +354,10 @@ def find_folder(path: str | os.PathLike[str]) -> Path:
 
 
 def ask_for_return(specification: Specification, target_return: float) -> Specification:
-    """The same planner, asked for another return.
+    """Returns the specification with another return to aim at.
 
     Raises:
-        UserError: it is not conditioned on returns.
+        UserError: the planner is not conditioned on returns, or does not accept this return.
     """
     settings = specification.method_settings
     if not hasattr(settings, "target_return") or not getattr(settings, "returns", True):
@@ -366,20 +375,21 @@ def ask_for_return(specification: Specification, target_return: float) -> Specif
 def _trace_parameters(
     agent: Agent, specification: Specification, saved: Sequence[int], folder: Path
 ) -> Params:
-    """The shapes and types of an agent's parameters.
+    """Finds the shapes and types of an agent's parameters, without computing them.
 
     Args:
-        agent: of the specification.
-        specification: that says how large its network is.
-        saved: how many numbers each array has that is there.
-        folder: of both, for the message.
+        agent: made from the specification.
+        specification: gives the size of the network.
+        saved: number of elements of each saved array.
+        folder: folder of the planner, for the message.
 
     Raises:
-        UserError: the network is larger than what was saved, or than any can be.
+        UserError: the network is larger than the saved arrays, or too large to build.
     """
     largest = max(saved, default=0)
     model = specification.model
-    # Each layer, and each round of an encoder, has arrays of its own; one is as wide as all.
+    # Each layer and each round of an encoder has its own arrays. At least one array of the network
+    # has as many numbers as the network is wide.
     parts = max(model.layers, getattr(specification.domain_settings, "rounds", 0))
     if saved and (parts > len(saved) or model.width > largest):
         raise UserError(
@@ -400,25 +410,25 @@ def load(
     target_return: float | None = None,
     finished: bool = False,
 ) -> Pretrained:
-    """A trained planner from the folder of its run, or one that comes with the library.
+    """Loads a trained planner from the folder of its run, or a planner of the library.
 
-    Compiled programs are kept on disk, as `leapjax.compile_planner` says, so that the first plan
-    of a second process takes little more than its imports.
+    Compiled programs are kept on disk (see `leapjax.compile_planner`), so the first plan of a
+    second process takes little more than its imports.
 
     Args:
-        path: the folder that a run printed; or the name of a level, where there is no such
-            folder: the published planner, trained on it with seed 0 (README, "Results").
-        planner: search settings, of the same horizon; None for those it was trained with.
+        path: folder that a run printed. If it does not exist: the name of a level, for the
+            published planner that was trained on this level with seed 0 (README, "Results").
+        planner: search settings with the same horizon; `None` for the settings of the run.
         chunk_sizes: see `leapjax.compile_planner`.
-        level: to plan for, where it is another than it was trained on, and its network serves both.
-            A run on a level `module:id` needs it too, unless that module is imported already.
-        target_return: to ask for, where that is another than it was trained for.
-        finished: whether nothing will do but what the run has learned at its end. If not, what it
-            had learned at its newest readable checkpoint will, with a warning.
+        level: level to plan for; `None` for the level of training. The network must fit both. If
+            the run's level is `module:id` and the module is not imported yet, give the level again.
+        target_return: return to aim at; `None` for the target of the run.
+        finished: whether the run must be finished. If not, the newest readable checkpoint is
+            loaded, with a warning if training had not ended.
 
     Raises:
-        UserError: no such run, one that cannot be read or has not come to its end, another
-            horizon, a level that needs another network, or a return that it cannot be asked for.
+        UserError: the run does not exist, cannot be read or is not finished. `planner` has another
+            horizon, `level` needs another network, or the planner cannot aim at `target_return`.
     """
     if planner is not None and not isinstance(planner, PlannerConfig):
         raise UserError(f"planner must be a configuration such as GibbsConfig, got {planner!r}")
@@ -432,7 +442,7 @@ def load(
     horizon = specification.planner.horizon
     if planner is not None and planner.horizon != horizon:
         raise UserError(f"{folder} plans {horizon} actions, not {planner.horizon}: its horizon")
-    # First: the module of a level that the caller names is imported by it.
+    # This comes first, because it imports the module of the level that the caller names.
     other = None if level is None else make_domain(specification, level)
     domain = make_domain(specification)
     for name, value in domain.signature.items():
@@ -445,7 +455,7 @@ def load(
                     f"{folder} was trained on {domain.level}, whose {name} is "
                     f"{domain.signature.get(name)}: it cannot play {level}, where it is {value}"
                 )
-        # A network that counts steps counts no further than it has learned to.
+        # A network that embeds step numbers has embeddings up to the limit of its training level.
         domain = other._replace(max_steps=domain.max_steps)
     agent = make_agent(specification, domain)
     like = _trace_parameters(agent, specification, saved, folder)

@@ -1,7 +1,7 @@
-"""Several processes that work as one: who writes, and what all of them agree on.
+"""Lets several processes work as one: the first process writes, and all agree on results.
 
-With one process nothing here costs anything. With more (`jax.distributed`), all of them
-call these functions, and everything that runs on the shared devices, in the same order.
+With one process these functions do not communicate. With several (`jax.distributed`), all
+processes call these functions, and run the programs on the shared devices, in the same order.
 """
 
 import dataclasses
@@ -26,12 +26,12 @@ class Cluster:
     """The processes and devices that share a run.
 
     Attributes:
-        coordinator: Address host:port of process 0, for several processes; SLURM and Open MPI give
+        coordinator: Address host:port of process 0, for several processes; SLURM and Open MPI set
             it themselves.
         num_processes: Number of processes, with a coordinator.
-        process_id: Which of the processes this is, from 0, with a coordinator.
+        process_id: Number of this process, from 0, with a coordinator.
         fsdp: Devices that share one copy of the parameters and the optimizer; 1 keeps a whole copy
-            on each.
+            on each device.
     """
 
     coordinator: str | None = None
@@ -61,17 +61,17 @@ class Cluster:
 
 
 def is_first() -> bool:
-    """Whether this process is the one that writes."""
+    """Returns whether this is the first process, which writes the files."""
     return jax.process_index() == 0
 
 
 def gather(value: Any) -> list[Any]:
-    """A JSON value of every process, by process."""
+    """Collects a JSON value from every process, in the order of the processes."""
     if jax.process_count() == 1:
         return [value]
     data = np.frombuffer(json.dumps(value).encode(), np.uint8)
     sizes = multihost_utils.process_allgather(np.int32(data.size))
-    # Padded to a power of two: every length would be a program of its own.
+    # Padded to a power of two: JAX compiles a program for every length.
     padded = np.zeros(1 << (int(sizes.max()) - 1).bit_length(), np.uint8)
     padded[: data.size] = data
     rows = multihost_utils.process_allgather(padded)
@@ -79,10 +79,10 @@ def gather(value: Any) -> list[Any]:
 
 
 def run_together(work: Callable[[], T]) -> T:
-    """Does something on every process; what goes wrong on one stops them all.
+    """Calls a function on every process; an error of one process stops all of them.
 
     Raises:
-        UserError: that of the first process that had one.
+        UserError: a process raised it; if several did, the error of the first of them.
     """
     result, failure = None, None
     try:
@@ -96,14 +96,14 @@ def run_together(work: Callable[[], T]) -> T:
 
 
 def run_on_first(work: Callable[[], Any]) -> Any:
-    """Does something on the first process; its result, a JSON value, on all of them.
+    """Calls a function on the first process and returns its result, a JSON value, on all.
 
     Raises:
-        UserError: that of the first process.
+        UserError: the first process raised it.
     """
     return gather(run_together(lambda: work() if is_first() else None))[0]
 
 
 def broadcast(tree: PyTree) -> PyTree:
-    """The first process's arrays of NumPy, on all of them; the others pass arrays like them."""
+    """Returns the first process's NumPy arrays on all; the others pass arrays of equal shapes."""
     return multihost_utils.broadcast_one_to_all(tree)

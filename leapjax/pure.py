@@ -1,6 +1,7 @@
-"""Plan, act, replan entirely inside `jit`, for environments that are pure functions.
+"""Plays episodes entirely inside `jit`, in environments that are pure functions.
 
-The same episodes as `leapjax.rollouts.evaluate`, thousands of them in one call of one program.
+The episodes are the same as in `leapjax.rollouts.evaluate`. One call of one program plays thousands
+of them.
 """
 
 import time
@@ -26,13 +27,13 @@ NUMBER = (jnp.floating, *INTEGER, *BOOLEAN)
 class PureEnvironment(NamedTuple):
     """An environment as two pure functions of one episode.
 
-    A step hands on what a reset began: states and observations of the same structure, shapes and
-    types, numbers that are finite.
+    `step` returns states and observations with the structure, shapes and types that
+    `reset` returns. Observations, rewards and scores must be finite.
 
     Attributes:
-        reset: (key) -> state, observation.
-        step: (state, action `[]` int32) -> state, what the step gave, as arrays.
-        num_actions: A, the end action included: the environment has A - 1.
+        reset: (key) -> (state, observation).
+        step: (state, action `[]` int32) -> (state, `Transition` of arrays).
+        num_actions: A, the end action included; `step` takes actions `0 .. A - 2`.
     """
 
     reset: Callable[[jax.Array], tuple[PyTree, PyTree]]
@@ -41,16 +42,16 @@ class PureEnvironment(NamedTuple):
 
 
 class _Episode(NamedTuple):
-    """An episode under way."""
+    """An episode in progress."""
 
     state: PyTree
     context: Context
-    score: jax.Array  # [] float32: its return as reported
+    score: jax.Array  # [] float32: the reported return
     over: jax.Array  # [] bool
     success: jax.Array  # [] bool
     plans: jax.Array  # [] int32
-    valid: jax.Array  # [] bool: no energy met was NaN
-    strange: jax.Array  # [] int32: the first step that gave a number that is not finite; -1: none
+    valid: jax.Array  # [] bool: no energy was NaN or -inf
+    strange: jax.Array  # [] int32: the first step with a number that is not finite, or -1
 
 
 def compile_rollout(
@@ -65,24 +66,25 @@ def compile_rollout(
     """Builds, once, a function that plays any number of episodes.
 
     Args:
-        environment: to play in.
-        energy: to minimise; of as many actions.
-        config: of the planner.
+        environment: environment to play in.
+        energy: energy to minimise, with as many actions as the environment.
+        config: settings of the planner.
         context: K.
-        max_steps: of an episode, at most; it is then cut off.
-        executed: actions to execute before replanning; None for all T.
+        max_steps: number of steps after which an episode is cut off.
+        executed: number of actions to execute before replanning; `None` for all T.
 
     Returns:
         `(params, level seeds [E], seed of the planner's randomness) -> Episodes`. The episode of a
-        level seed begins with `jax.random.key(level seed)`; plans are those of `evaluate`. The
-        time of planning cannot be told from the rest of the program: it is all of it.
+        level seed begins with `jax.random.key(level seed)`. Plans are the same as in `evaluate`.
+        `planning_seconds` is the time of the whole program, which cannot time planning alone.
 
     Raises:
-        UserError: a count that is not an integer of its range, other actions than the energy's, or
-            a step that returns something else than the reset began; raised by the function
-            returned, a seed that is not an integer in 0 .. 2^32 - 1, parameters of 64 bits that do
-            not fit 32, or an environment that gave numbers that are not finite.
-        ValueError: raised by the function returned, an energy that was NaN.
+        UserError: A count is not an integer in its range, or `step` returns other structures,
+            shapes or types than `reset`. The returned function raises it if there are no seeds or
+            a seed is not an integer in 0 .. 2^32 - 1. It also does if 64-bit parameters do not fit
+            32 bits, or the environment gave numbers that are not finite.
+        ValueError: The environment and the energy have different actions. The returned function
+            raises it if an energy was NaN or -inf.
     """
     context, max_steps = check_integer("context", context), check_integer("max_steps", max_steps, 1)
     executed, _ = check_limits(executed, max_steps)
@@ -105,7 +107,7 @@ def compile_rollout(
         return _Episode(state, blank, jnp.float32(0), no, no, jnp.int32(0), yes, strange)
 
     def act(carry: tuple[_Episode, jax.Array], action: jax.Array) -> tuple[PyTree, None]:
-        """One action of a plan, unless the plan or the episode is over."""
+        """Takes one action of a plan, unless the plan or the episode is over."""
         episode, ended = carry
         ended |= action >= end  # or MASK
         state, found = environment.step(episode.state, jnp.minimum(action, end - 1))
@@ -129,7 +131,7 @@ def compile_rollout(
             actions = found.actions[:executed]
             episode = episode._replace(plans=episode.plans + 1, valid=episode.valid & found.valid)
             (acted, _), _ = jax.lax.scan(act, (episode, jnp.bool_(False)), actions)
-            return acted._replace(over=acted.over | (actions[0] >= end))  # it has given up
+            return acted._replace(over=acted.over | (actions[0] >= end))  # the planner gave up
 
         return jax.lax.while_loop(lambda e: ~e.over, replanned, begin(level_seed))
 
@@ -165,10 +167,10 @@ def compile_rollout(
 
 
 def _check_environment(environment: PureEnvironment) -> None:
-    """Compares what a step returns with what a reset returns, without computing either.
+    """Compares the shapes and types that `step` and `reset` return, without running them.
 
     Raises:
-        UserError: names the part that differs, and how.
+        UserError: a part differs; the message names it and the difference.
     """
     began = jax.eval_shape(environment.reset, jax.eval_shape(jax.random.key, 0))
     if not (isinstance(began, tuple) and len(began) == 2):
@@ -204,12 +206,17 @@ def _is_one_of(dtype: Any, types: Sequence[Any]) -> bool:
 
 
 def _check_same(name: str, began: PyTree, led: PyTree) -> None:
-    """Checks that a step hands on what a reset began, as abstract values.
+    """Checks that `step` returns the structure, shapes and types that `reset` returns.
 
-    Types may differ where JAX promotes that of the step to that of the reset.
+    The type of a leaf may differ if JAX promotes the type in `step` to the type in `reset`.
+
+    Args:
+        name: "state" or "observation", for the message.
+        began: abstract value that `reset` returns.
+        led: abstract value that `step` returns.
 
     Raises:
-        UserError: names the first leaf that differs, and how.
+        UserError: a leaf differs; the message names the first, and the difference.
     """
     before: Any = jax.tree.structure(began)
     after: Any = jax.tree.structure(led)
@@ -227,30 +234,30 @@ def _check_same(name: str, began: PyTree, led: PyTree) -> None:
 
 
 def _is_promoted(first: jax.ShapeDtypeStruct, then: jax.ShapeDtypeStruct) -> bool:
-    """Whether a loop can carry a value that begins as `first` and goes on as `then`."""
+    """Returns whether a loop can carry a value that begins as `first` and goes on as `then`."""
     if first.dtype == then.dtype or first.weak_type:
         return True
     try:
         return jax.eval_shape(jnp.add, first, then).dtype == first.dtype
-    except TypeError:  # keys of random numbers are added to nothing
+    except TypeError:  # random keys cannot be added
         return False
 
 
 def _describe_shapes(tree: PyTree) -> str:
-    """Shapes and types in a message."""
+    """Describes shapes and types, for a message."""
     leaves = [f"{leaf.dtype}{list(leaf.shape)}" for leaf in jax.tree.leaves(tree)]
     return ", ".join(leaves) or str(tree)
 
 
 def _is_finite(tree: PyTree) -> jax.Array:
-    """`[]` bool: whether all floats of a tree are finite."""
+    """Returns whether all floats of a tree are finite: `[]` bool."""
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
     floats = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.array([jnp.isfinite(leaf).all() for leaf in floats], bool).all()
 
 
 def _advance_context(context: Context, action: jax.Array, found: Transition) -> Context:
-    """The context after a step."""
+    """Makes the context after a step."""
 
     def shifted(past: jax.Array, latest: Array) -> jax.Array:
         return jnp.concatenate([past, jnp.asarray(latest, past.dtype)[None]])[1:]

@@ -1,4 +1,4 @@
-"""Plan, act, replan: many episodes in lockstep, so that hundreds are planned per call."""
+"""Plays many episodes in lockstep: plans for many in one call, acts, and replans."""
 
 import contextlib
 import itertools
@@ -17,21 +17,21 @@ from leapjax.environments import Adapter, Eager, Transition, close, list_environ
 from leapjax.errors import UserError
 from leapjax.types import Array, Context, Params, Plan, PyTree, pad_token, to_plain_dicts
 
-MOST_OPEN = 128  # environments at once: as many as plans in a chunk; each may hold files, or a port
+MOST_OPEN = 128  # environments at once: plans in a chunk. Each may hold files or a port.
 LARGEST = float(np.finfo(np.float32).max)
 
 
 class Episodes(NamedTuple):
-    """What E episodes gave.
+    """The results of E episodes.
 
     Attributes:
         seeds: `[E]` level seeds.
         successes: `[E]` bool.
         lengths: `[E]` int, environment steps.
-        returns: `[E]` float, sums of rewards, or of scores where those are something else.
-        plans: plans made in all.
-        planning_seconds: of the planner alone, compilation included.
-        seconds: in all.
+        returns: `[E]` float, sums of rewards, or of scores if the environment reports scores.
+        plans: number of plans in all episodes.
+        planning_seconds: seconds of the planner alone, compilation included.
+        seconds: seconds in all.
     """
 
     seeds: np.ndarray
@@ -44,7 +44,7 @@ class Episodes(NamedTuple):
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:
-    """Joins episodes that were played at the same time: plans add up, the longest time counts."""
+    """Joins results of parallel episodes: adds their plans, and takes the longest times."""
     return Episodes(
         np.concatenate([part.seeds for part in parts]),
         np.concatenate([part.successes for part in parts]),
@@ -60,10 +60,10 @@ class History:
     """The last K states, actions and rewards of one episode, as a planner's context.
 
     Args:
-        observation: of the first state.
+        observation: observation of the first state.
         length: K.
-        num_actions: A.
-        seed: of the episode, for messages.
+        num_actions: A, the end action included.
+        seed: level seed, for messages.
 
     Raises:
         UserError: see `advance`.
@@ -88,21 +88,21 @@ class History:
 
     @property
     def where(self) -> str:
-        """The episode and the step that it is at, for messages."""
+        """The step and the level seed, for messages."""
         return f"step {self.step}" + ("" if self._seed is None else f" of level seed {self._seed}")
 
     def advance(self, action: int, observation: PyTree, reward: float) -> None:
         """Records one step.
 
         Args:
-            action: that was taken.
-            observation: what it led to.
-            reward: what it gave.
+            action: the action taken.
+            observation: the observation after it.
+            reward: the reward of the step.
 
         Raises:
-            UserError: an observation of other parts or shapes than the first; a number in it, a
-                reward or a return that is not finite, or does not fit float32; an action that is
-                not an integer in 0 .. A - 1.
+            UserError: The observation has other parts or shapes than the first, or numbers that are
+                not finite. The reward or the return is not finite or does not fit float32. The
+                action is not an integer in 0 .. A - 1.
         """
         self.step += 1
         action = check_integer(
@@ -123,7 +123,7 @@ class History:
                 )
 
     def _checked(self, observation: PyTree) -> PyTree:
-        """A copy: environments may write the next observation into the arrays of the last."""
+        """Checks and copies an observation: the next step may write into the same arrays."""
         structure: Any
         observation = to_plain_dicts(observation)
         leaves, structure = jax.tree.flatten(observation)
@@ -144,7 +144,7 @@ class History:
         return structure.unflatten(copies)
 
     def context(self) -> Context:
-        """As NumPy arrays, padded at the front where the episode is younger than K."""
+        """Returns the context as NumPy arrays, padded at the front in the first K steps."""
         missing, pad = self._length - len(self._past), pad_token(self._num_actions)
         past = [self._blank] * missing + self._past
         if past:
@@ -162,14 +162,14 @@ class History:
 
 
 def check_limits(executed: int | None, max_steps: int | None) -> tuple[int | None, int | None]:
-    """Returns both limits as integers of Python, or None.
+    """Checks two limits, and returns each as an `int`, or `None` if it is not set.
 
     Args:
-        executed: actions of a plan.
-        max_steps: of an episode.
+        executed: number of actions to execute of a plan.
+        max_steps: number of steps of an episode.
 
     Raises:
-        UserError: one of them is not an integer, or less than 1.
+        UserError: a limit is not an integer, or less than 1.
     """
     limits = {"executed": executed, "max_steps": max_steps}
     checked = [
@@ -180,12 +180,13 @@ def check_limits(executed: int | None, max_steps: int | None) -> tuple[int | Non
 
 
 def check_adapter(adapter: Adapter) -> None:
-    """Refuses what is not an `Adapter`.
+    """Checks that a value is an `Adapter`.
 
     Raises:
-        UserError: says what it is, and what to do with an environment of Gymnasium.
+        UserError: it is not. The message names its type, and says how to wrap a Gymnasium
+            environment.
     """
-    # Not `isinstance`, which does not see what `__getattr__` of a wrapper finds.
+    # `isinstance` would miss attributes that a wrapper finds in its `__getattr__`.
     parts = ("num_actions", "reset", "step")
     if isinstance(adapter, type) or not all(hasattr(adapter, part) for part in parts):
         raise UserError(
@@ -196,20 +197,20 @@ def check_adapter(adapter: Adapter) -> None:
 
 
 def _name_kind(value: Any) -> str:
-    """What a value is, in a message."""
+    """Names the type of a value, for a message."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
 def _read_number(name: str, value: Any, where: str) -> float:
-    """Returns a reward or a score as a float of Python, which may be NaN or infinite.
+    """Returns a reward or a score as a `float`, which may be NaN or infinite.
 
     Args:
-        name: of the number, for the message.
+        name: name of the number, for the message.
         value: one real number of any type.
-        where: the episode and the step.
+        where: episode and step, for the message.
 
     Raises:
-        UserError: not one real number.
+        UserError: the value is not a single real number.
     """
     try:
         if isinstance(value, str | bytes) or np.ndim(value):
@@ -222,15 +223,15 @@ def _read_number(name: str, value: Any, where: str) -> float:
 
 
 def check_actions(of: str, planned: int, possible: int) -> None:
-    """Refuses a planner, or an energy, with other actions than its environment.
+    """Checks that a planner or an energy has as many actions as its environment.
 
     Args:
-        of: what plans, for the message.
+        of: "planner" or "energy", for the message.
         planned: A of the plans.
         possible: A of the environment.
 
     Raises:
-        ValueError: says how many each has.
+        ValueError: the numbers differ; the message gives both.
     """
     possible = check_integer("num_actions of the environment", possible, 1)
     if possible != planned:
@@ -241,22 +242,22 @@ def check_actions(of: str, planned: int, possible: int) -> None:
 
 
 def stack_contexts(histories: Sequence[History]) -> Context:
-    """The contexts of B episodes, leaves with a leading `[B]`."""
+    """Stacks the contexts of B episodes: each leaf gets a leading `[B]`."""
     contexts = [history.context() for history in histories]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *contexts)
 
 
 class _Episode:
-    """An episode under way: its place among all, its environment, and what a planner sees."""
+    """An episode in progress: its index, its environment, and its history for the planner."""
 
     def __init__(self, place: int, seed: int, adapter: Adapter, history: History) -> None:
         self.place, self.seed = place, seed
         self.adapter, self.history = adapter, history
         self.eager = adapter if isinstance(adapter, Eager) else None
-        # What no other episode may step, by identity.
+        # Objects that only this episode may step, by identity.
         self.owned = {id(part): part for part in (adapter, *list_environments(adapter))}
         self.replans = 0
-        self.cache: PyTree = None  # its row of what the planner returned with the last plan
+        self.cache: PyTree = None  # its row of the cache of the last plans
 
 
 def plan_episodes(
@@ -267,16 +268,16 @@ def plan_episodes(
     caches: Sequence[PyTree],
     executed: int | None,
 ) -> tuple[Plan, list[PyTree]]:
-    """Plans for B episodes, and returns the cache of each for its next plan.
+    """Plans for B episodes; returns the plans, and each episode's cache for its next plan.
 
     Args:
         plan: from `compile_planner`.
-        params: of the energy.
+        params: parameters of the energy.
         keys: `[B]`, see `CompiledPlanner`.
         histories: of the episodes.
-        caches: of the episodes: all from their last plan, or all None.
-        executed: actions of each plan that will be executed; None for all. After more than one
-            there is no cache: the states in between are not encoded.
+        caches: of the episodes, all from their last plan, or all `None`.
+        executed: number of actions that will be executed of each plan; `None` for all. If it is
+            more than 1, the returned caches are `None`: the states in between are not encoded.
     """
     stacked = jax.tree.map(lambda *rows: np.stack(rows), *caches)
     plans, cache = plan.plan_next(params, keys, stack_contexts(histories), stacked)
@@ -286,7 +287,7 @@ def plan_episodes(
 
 
 def _group_alike(episodes: Sequence[_Episode]) -> Iterator[list[_Episode]]:
-    """Episodes that can be planned for together: those with a cache, and those without."""
+    """Groups episodes that can share a call of the planner: with a cache, and without."""
     for begun in (True, False):
         group = [each for each in episodes if (each.cache is not None) == begun]
         if group:
@@ -308,32 +309,33 @@ def evaluate(
 ) -> Episodes:
     """Plays one episode per level seed, in lockstep, replanning when a plan is used up.
 
-    At most `MOST_OPEN` episodes are under way at once. When one is over its environment is closed
-    (see `leapjax.environments.Closable`), and the next one begins. An episode whose plan ends
-    before its first action has given up. A plan's randomness derives from (seed, level seed,
+    At most `MOST_OPEN` episodes are in progress at once. When an episode is over, its environment
+    is closed (see `leapjax.environments.Closable`) and the next episode begins. A plan that starts
+    with the end action gives the episode up. A plan's randomness derives from (seed, level seed,
     replan index), so an episode plays the same way whatever else is in the batch.
 
-    Episodes under way take turns, so their environments must not share anything that a step or a
-    reset changes. The same adapter twice is refused, and so is one Gymnasium environment in two
-    adapters (see `leapjax.environments.list_environments`); other shared state is not found.
+    Episodes take turns, so their environments must not share state that a step or a reset changes.
+    It is an error to return the same adapter twice, or two adapters of the same Gymnasium
+    environment (see `leapjax.environments.list_environments`). Other shared state is not detected.
 
     Args:
         make_adapter: makes one environment; called once per episode, in the order of the seeds.
         seeds: level seeds, integers in 0 .. 2^32 - 1.
         plan: from `compile_planner`.
-        params: of the energy.
+        params: parameters of the energy.
         context: K.
-        seed: of the planner's randomness, in the same range.
-        executed: actions to execute before replanning; None for all T.
-        iteration: execute the plan as it stood after this many iterations; None: the last.
-        max_steps: cut an episode off after so many; None: only the environment ends it.
+        seed: seed of the planner's randomness, in 0 .. 2^32 - 1.
+        executed: number of actions to execute before replanning; `None` for all T.
+        iteration: executes each plan as it stood after this many iterations; `None` for the last.
+        max_steps: number of steps after which an episode is cut off; `None` for no limit but the
+            environment's.
         progress: called with (episodes over, successes) after every round.
 
     Raises:
-        UserError: no seeds, or a seed or a count that is not an integer of its range; environments
-            that are not adapters, that are one and the same, that have other actions than the
-            planner, or that give values which `History` refuses, a score that is not finite, or
-            ends and successes that are not booleans.
+        UserError: There are no seeds, or a seed or a count is not an integer in its range. An
+            environment is not an adapter, or is used twice. It gives values that `History` refuses,
+            a score that is not finite, or flags that are not booleans.
+        ValueError: an environment has other actions than the planner.
         NotANumber: see `CompiledPlanner`.
     """
     if not callable(make_adapter):
@@ -353,9 +355,9 @@ def evaluate(
     count = len(level_seeds)
     successes, lengths, scores = np.zeros(count, bool), np.zeros(count, int), np.zeros(count)
     waiting = iter(range(count))
-    opened: dict[int, Adapter] = {}  # by place
+    opened: dict[int, Adapter] = {}  # by index
     active: list[_Episode] = []
-    owned: set[int] = set()  # by those under way
+    owned: set[int] = set()  # ids of objects that active episodes step
     over, planned, planning_seconds = 0, 0, 0.0
 
     def begin(place: int) -> _Episode:
@@ -374,7 +376,7 @@ def evaluate(
         return episode
 
     def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray]]:
-        """Plans for some episodes: the actions `[executed]` of each."""
+        """Plans for some episodes; pairs each with its next actions, `[executed]`."""
         nonlocal planned, planning_seconds
         before = time.perf_counter()
         keys = plan_keys(
@@ -394,11 +396,11 @@ def evaluate(
         return zip(group, np.asarray(chosen)[:, :executed], strict=True)
 
     def act(episode: _Episode, actions: np.ndarray) -> bool:
-        """Executes a plan; whether the episode is over."""
+        """Executes a plan; returns whether the episode is over."""
         place, history = episode.place, episode.history
         episode.replans += 1
         for action in actions:
-            if action >= end:  # or MASK, of a plan that is executed before it is complete
+            if action >= end:  # end; or MASK, in the plan of an early iteration
                 return bool(actions[0] >= end)
             found = episode.adapter.step(int(action))
             if not isinstance(found, Transition):
@@ -442,7 +444,7 @@ def evaluate(
                     active.append(episode)
             progress(over, int(successes.sum()))
     finally:
-        for adapter in opened.values():  # after an error, which must not be hidden by another
+        for adapter in opened.values():  # after an error, which `close` must not hide
             with contextlib.suppress(Exception):
                 close(adapter)
     return Episodes(

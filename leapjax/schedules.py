@@ -1,4 +1,4 @@
-"""Which actions of a window are masked in training: a small pure schedule."""
+"""Chooses which actions of a window are masked in training."""
 
 import jax
 import jax.numpy as jnp
@@ -6,20 +6,28 @@ import jax.numpy as jnp
 from leapjax.checks import check_integer
 
 MASKINGS = ("one", "each", "all", "random", "stratified")
-SINGLE = ("one", "each")  # those that mask one action in every copy
+SINGLE = ("one", "each")  # they mask a single action in each copy
 
 
 def sample_masks(key: jax.Array, horizon: int, masking: str) -> jax.Array:
-    """Which actions of one window to mask: booleans `[copies, T]`, never all False.
+    """Samples which actions of a window to mask: `[copies, T]` bool, at least one in each copy.
 
     - `one`: one random position (paper, appendix "Experiment details"); 1 copy.
     - `each`: every position in turn, T copies (what the authors' code does).
-    - `all`: every position, so that the state alone says what to do (the authors' code, in
-      PickUpLoc); 1 copy.
-    - `random`: n positions with n uniform in 1 .. T, so that the all-masked start of
-      planning is an input that training has seen; 1 copy.
-    - `stratified`: the same with n = 1, 2, .. T, T copies: every window is also learned from as
-      planning starts. For encoders that cost much more than a pass over T actions.
+    - `all`: every position, so that actions are predicted from the state alone (the authors'
+      code, in PickUpLoc); 1 copy.
+    - `random`: n random positions, n uniform in 1 .. T, so that training includes the all-masked
+      start of planning; 1 copy.
+    - `stratified`: as `random`, with n = 1, 2, .. T in T copies, so that every window trains the
+      all-masked start. For encoders that cost much more than a pass over T actions.
+
+    Args:
+        key: random key.
+        horizon: T.
+        masking: a name of the list above.
+
+    Raises:
+        ValueError: the horizon is not a positive integer, or the masking is unknown.
     """
     horizon = check_integer("horizon", horizon, 1)
     if masking == "each":

@@ -8,11 +8,11 @@ import numpy as np
 from leapjax.checks import check_counts, check_integer, check_number
 
 BOOTSTRAPS = 20_000
-# Of success between two training seeds on the same level, where only counts are known. Measured in
-# our recorded episodes: 0.47 in BabyAI, 0.32 in Sudoku.
+# Assumed correlation of success between two training seeds on the same level, if only counts are
+# known. Measured in our recorded episodes: 0.47 in BabyAI, 0.32 in Sudoku.
 CORRELATION = 0.5
-# Outcomes of one task: whether each of S training seeds solves each of L levels, `[S, L]` bool; or,
-# where that is not known, the successes `[S]` and the episodes `[S]` of each seed.
+# Outcomes of one task: whether each of S training seeds solves each of L levels, `[S, L]` bool. If
+# only counts are known: the successes `[S]` and the episodes `[S]` of each seed.
 Outcomes = np.ndarray | tuple[Sequence[int], Sequence[int]]
 
 
@@ -22,13 +22,13 @@ def wilson_interval(successes: int, episodes: int, z: float = 1.959964) -> tuple
     Unlike the normal approximation it stays inside 0 .. 1 and is sound at 0% and 100%.
 
     Args:
-        successes: of the episodes.
-        episodes: how many.
+        successes: number of successful episodes.
+        episodes: number of episodes.
         z: standard errors to each side; 1.96 for 95%.
 
     Raises:
-        ValueError: counts that are not integers, no episodes, more successes than episodes, or a
-            `z` that is negative or not finite.
+        ValueError: the counts are not integers, there are no episodes or more successes than
+            episodes, or `z` is negative or not finite.
     """
     episodes = check_integer("episodes", episodes, 1)
     successes = check_integer("successes", successes, 0, episodes)
@@ -51,22 +51,22 @@ def interval_over_seeds(
 
     Use `interval_of_episodes` where the outcome of every episode is known. The interval contains
     the spread of seeds and of levels. All seeds play the same levels, and some levels are hard for
-    all seeds, so S seeds tell less than S times as many levels would. A planner without failures is
-    not taken for one that cannot fail: the prior of its rate is Jeffreys'. One seed shows only the
-    spread of levels.
+    all seeds, so S seeds tell less than S times as many levels would. The rate has Jeffreys' prior,
+    so a planner without failures in these episodes may still fail in others. One seed shows only
+    the spread of levels.
 
     Args:
-        successes: `[S]`, of each training seed.
-        episodes: `[S]`, of each training seed, one on each level.
+        successes: `[S]`, number of successes of each training seed.
+        episodes: `[S]`, number of episodes of each training seed, one per level.
         level: confidence, between 0 and 1.
-        correlation: of success between two seeds on the same level, 0 to 1.
+        correlation: correlation of success between two seeds on the same level, 0 to 1.
 
     Returns:
         The bounds of the confidence interval, as fractions.
 
     Raises:
-        ValueError: counts that are not integers, or not of the same seeds; no seeds, no episodes,
-            or more successes than episodes; or a level or a correlation out of range.
+        ValueError: The counts are not integers, or not of the same seeds. There are no seeds, no
+            episodes, or more successes than episodes. The level or the correlation is out of range.
     """
     correlation = check_number("correlation", correlation, 0, 1)
     rng = np.random.default_rng(0)
@@ -76,11 +76,12 @@ def interval_over_seeds(
 def interval_of_episodes(solved: np.ndarray, level: float = 0.95) -> tuple[float, float]:
     """Estimates the mean success rate over training seeds from episodes.
 
-    Levels are drawn in a Bayesian bootstrap (Rubin, 1981) with Jeffreys' prior; all seeds share a
-    drawn level, so the correlation between them is that of the episodes. The mean of the seeds is
-    drawn from Student's t distribution with S - 1 degrees of freedom; its scale is the variance
-    between seeds (analysis of variance), less what chance explains. Seeds drawn with replacement
-    would be too few: where seeds differ, the 95% interval of three covers the truth in 84%.
+    Levels are drawn in a Bayesian bootstrap (Rubin, 1981) with Jeffreys' prior. All seeds share a
+    drawn level, so they are as correlated as in the episodes. The mean of the seeds is drawn from
+    Student's t distribution with S - 1 degrees of freedom. Its scale comes from the variance
+    between seeds (analysis of variance), without the part that chance explains. Seeds drawn with
+    replacement would vary too little: where seeds differ, the 95% interval of three seeds covers
+    the truth in 84% of cases.
 
     Args:
         solved: `[S, L]` bool, whether each training seed solved each level.
@@ -90,23 +91,23 @@ def interval_of_episodes(solved: np.ndarray, level: float = 0.95) -> tuple[float
         The bounds of the confidence interval, as fractions.
 
     Raises:
-        ValueError: `solved` is not such a matrix, or a level out of range.
+        ValueError: `solved` is not such a matrix, or the level is out of range.
     """
     return _bounds(*_draw_from_episodes(solved, np.random.default_rng(0)), level)
 
 
 def standard_error(values: np.ndarray) -> float | None:
-    """Of the mean of values `[n]`; None for fewer than two, which say nothing of it."""
+    """Estimates the standard error of the mean of values `[n]`; returns `None` if n < 2."""
     if len(values) < 2:
         return None
     return float(np.std(values, ddof=1) / math.sqrt(len(values)))
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """The mean of the middle half of values `[..., L]` (Agarwal et al., 2021): `[...]`.
+    """Computes the mean of the middle half of values `[..., L]` (Agarwal et al., 2021): `[...]`.
 
-    As scipy's `trim_mean` and rliable have it: a quarter of the values, rounded down, is left out
-    at each end.
+    A quarter of the values, rounded down, is left out at each end, as in scipy's `trim_mean` and in
+    rliable.
     """
     cut = values.shape[-1] // 4
     return np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1)
@@ -125,10 +126,10 @@ def aggregate(tasks: Sequence[Outcomes], level: float = 0.95) -> tuple[float, tu
         level: confidence, between 0 and 1.
 
     Returns:
-        The mean, and (low, high), as fractions.
+        The interquartile mean, and its interval (low, high), as fractions.
 
     Raises:
-        ValueError: no tasks; or see `interval_of_episodes` and `interval_over_seeds`.
+        ValueError: there are no tasks; or see `interval_of_episodes` and `interval_over_seeds`.
     """
     if not tasks:
         raise ValueError("no tasks to aggregate over")
@@ -147,10 +148,10 @@ def aggregate(tasks: Sequence[Outcomes], level: float = 0.95) -> tuple[float, tu
 def _check_outcomes(
     successes: Sequence[int], episodes: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Successes and episodes `[S]`, of the same seeds.
+    """Checks successes and episodes `[S]` of the same seeds, and returns them as arrays.
 
     Raises:
-        ValueError: says what is wrong with them.
+        ValueError: they are not such counts; the message shows them.
     """
     good, count = check_counts("successes", successes), check_counts("episodes", episodes, 1)
     if not len(good) or len(good) != len(count) or (good > count).any():
@@ -159,16 +160,16 @@ def _check_outcomes(
 
 
 def variance_components(solved: np.ndarray) -> tuple[float, float, float]:
-    """Splits the variance of success into that of seeds, of levels, and the rest.
+    """Splits the variance of success into three parts: seeds, levels, and the rest.
 
-    An analysis of variance, two-way and without replication. The correlation of success between two
+    It is a two-way analysis of variance without replication. The correlation of success between two
     seeds on the same level is the share of `levels` in `levels + rest`.
 
     Args:
-        solved: `[S, L]`, S and L at least 2.
+        solved: `[S, L]` bool, S and L at least 2.
 
     Returns:
-        `seeds`, `levels` and `rest`; estimates without bias, so the first two may be negative.
+        `seeds`, `levels` and `rest`: unbiased estimates, so the first two may be negative.
     """
     seeds, levels = solved.mean(axis=1), solved.mean(axis=0)
     residuals = solved - seeds[:, None] - levels + solved.mean()
@@ -186,8 +187,9 @@ def _draw_from_episodes(solved: np.ndarray, rng: np.random.Generator) -> tuple[n
             f"{solved.shape}"
         )
     seeds, count = solved.shape
-    # Levels that equally many seeds solve are alike; half a level more is solved by all, half by
-    # none. With one seed this is the Beta distribution of Jeffreys' prior.
+    # Count the levels that 0, 1, .. S seeds solve. The prior adds half a level that no seed solves,
+    # and half a level that all seeds solve. With one seed this is the Beta posterior of Jeffreys'
+    # prior.
     alike = np.bincount(solved.sum(axis=0), minlength=seeds + 1).astype(float)
     alike[[0, -1]] += 0.5
     weights = rng.gamma(alike, size=(BOOTSTRAPS, seeds + 1))
@@ -206,7 +208,7 @@ def _draw_from_counts(
     good, count = _check_outcomes(successes, episodes)
     rates, seeds, levels = good / count, len(good), count.min()
     mean = float(rates.mean())
-    independent = levels * seeds / (1 + (seeds - 1) * correlation)  # episodes that tell as much
+    independent = levels * seeds / (1 + (seeds - 1) * correlation)  # effective number of episodes
     means = rng.beta(independent * mean + 0.5, independent * (1 - mean) + 0.5, BOOTSTRAPS)
     chance = mean * (1 - mean) * (1 - correlation) / levels
     between = float(rates.var(ddof=1)) - chance if seeds > 1 else 0.0
@@ -216,7 +218,7 @@ def _draw_from_counts(
 def _vary_seeds(
     means: np.ndarray, between: float, seeds: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Adds to means `[N]` what the mean of a few seeds is off, given the variance between seeds."""
+    """Adds the error of a mean over few seeds to means `[N]`, given the variance between seeds."""
     if between <= 0:
         return means
     scale = math.sqrt(between / seeds)
@@ -224,7 +226,7 @@ def _vary_seeds(
 
 
 def _bounds(drawn: np.ndarray, found: float, level: float) -> tuple[float, float]:
-    """Returns the interval of drawn values, which holds what was found."""
+    """Returns the interval of drawn values, extended to contain the value found."""
     if not 0 < check_number("level", level) < 1:
         raise ValueError(f"level must be between 0 and 1, got {level}")
     low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2])

@@ -1,4 +1,4 @@
-"""Configurations as JSON, and the digest that parameters are sealed with."""
+"""Reads and compares configurations as JSON, and hashes the identity of parameters."""
 
 import dataclasses
 import hashlib
@@ -14,28 +14,28 @@ import numpy as np
 from leapjax import files
 from leapjax.errors import UserError, first_line
 
-IDENTITY = "identity"  # the array that says whose parameters are beside it
+IDENTITY = "identity"  # array beside parameters: hash of the configuration that they belong to
 T = TypeVar("T")
 
 
 def hash_identity(identity: str) -> np.ndarray:
-    """The SHA-256 of an identity: `[32]` uint8."""
+    """Returns the SHA-256 of an identity: `[32]` uint8."""
     return np.frombuffer(hashlib.sha256(identity.encode()).digest(), np.uint8)
 
 
 def from_json(kind: type[T], values: Any, **types_of: type) -> T:
-    """A frozen configuration dataclass from what `dataclasses.asdict` and JSON made of it.
+    """Makes a frozen configuration dataclass from JSON; inverts `dataclasses.asdict`.
 
-    A field that is missing has its default: a setting that was added later changes nothing
-    that was written before it.
+    A missing field gets its default, so that files written before a setting was added stay valid.
 
     Args:
-        kind: of dataclass.
-        values: a JSON object.
-        types_of: the type of a field, where the dataclass leaves it open.
+        kind: class of the dataclass.
+        values: JSON object with the fields.
+        types_of: types of fields that the dataclass leaves open, by name.
 
     Raises:
-        UserError: a field that is unknown, of another type, or missing without a default.
+        UserError: a field is unknown, of another type, or missing without a default; or the
+            dataclass refuses a value.
     """
     if not isinstance(values, dict):
         raise UserError(f"a {kind.__name__} must be a JSON object, got {type(values).__name__}")
@@ -78,14 +78,14 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
 
 
 def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
-    """The contents of a JSON file.
+    """Reads a JSON file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         most: the largest size allowed, in bytes.
 
     Raises:
-        UserError: it is missing, is too large, or is not JSON.
+        UserError: the file is missing, too large, or not JSON.
     """
     text = files.read_text(path, most)
     try:
@@ -95,10 +95,10 @@ def read_json(path: Path, most: int = files.LARGEST_TEXT) -> Any:
 
 
 def find_differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """What is not the default, part by part.
+    """Returns the settings that differ from their defaults, nested as given.
 
-    Names made from it do not change when a setting is added later, with what was done before
-    as its default.
+    A new setting whose default keeps the old behaviour does not change the result, nor names made
+    from the result.
     """
     found = {}
     for name, value in values.items():

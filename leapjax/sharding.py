@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from leapjax.checks import check_integer
 from leapjax.types import PyTree
 
-DATA, FSDP = AXES = "data", "fsdp"  # of every mesh
+DATA, FSDP = AXES = "data", "fsdp"  # axes of every mesh
 
 REPLICATED = PartitionSpec()
 SPLIT = PartitionSpec(AXES)  # a batch, by its first dimension
@@ -33,7 +33,7 @@ def make_mesh(batch: int, devices: Sequence[jax.Device] | None = None, fsdp: int
 
     Args:
         batch: number of rows to split.
-        devices: devices to choose from, equally many of each process; None: all of this process.
+        devices: devices to choose from, equally many of each process; `None`: all of this process.
         fsdp: number of devices that split the parameters.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The training loop: a jitted pure step, and everything that has side effects around it."""
+"""The training loop: a jitted pure step, and a loop around it with all side effects."""
 
 import dataclasses
 import math
@@ -13,9 +13,9 @@ from leapjax import sharding
 from leapjax.types import Agent, PyTree, TrainState
 
 BATCH_STREAM, UPDATE_STREAM = 0, 1
-# Steps that may wait for their turn: enough to keep a device busy. On several CPU devices JAX
-# 0.10 stops for ever where more than 32 programs wait: the thread that would run the other
-# half of an exchange then waits for room to queue one more.
+# Steps that may be queued: enough to keep a device busy. On several CPU devices JAX 0.10 deadlocks
+# if more than 32 programs are queued: the thread that should run the other half of an exchange
+# waits for room in the queue.
 AHEAD = 4
 
 
@@ -24,9 +24,9 @@ class NonFiniteLoss(RuntimeError):
 
 
 def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, jax.Array]]:
-    """The jitted `(seed) -> (state, key)`: the first state of a run, and the key of its steps.
+    """Makes a jitted `(seed) -> (state, key)`: the first state of a run, and the key of its steps.
 
-    Both are on the mesh, the state split as `sharding.parameter_specs` says.
+    Both are placed on the mesh; `sharding.parameter_specs` says how the state is split.
     """
 
     def begin(seed: jax.Array) -> tuple[TrainState, jax.Array]:
@@ -35,7 +35,7 @@ def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, ja
 
     state, _ = jax.eval_shape(begin, 0)
     places = sharding.parameter_shardings(state, mesh), NamedSharding(mesh, sharding.REPLICATED)
-    # It runs once, so that what optimisation takes is never won back.
+    # The program runs once: optimising it would cost more time than it saves.
     return jax.jit(
         begin, out_shardings=places, compiler_options=sharding.choose_quick_options(mesh)
     )
@@ -45,28 +45,31 @@ def make_begin(agent: Agent, mesh: Mesh) -> Callable[[int], tuple[TrainState, ja
 class TrainStep:
     """One step `(state, data, key) -> (state, metrics)`, as two jitted programs.
 
-    Batch k and its noise are functions of (key, k) alone, k being the state's own step, so
-    a run that is stopped and continued is the run that was not.
+    Batch k and its noise are functions of (key, k) alone, where k is `state.step`. So a stopped and
+    resumed run equals an uninterrupted run.
+
+    Attributes:
+        draw: (key, step, data) -> batch.
+        update: (state, batch, key) -> (state, metrics); it consumes the state.
     """
 
-    draw: Callable[[jax.Array, jax.Array, PyTree], PyTree]  # (key, step, data) -> batch
+    draw: Callable[[jax.Array, jax.Array, PyTree], PyTree]
     update: Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, jax.Array]]]
-    # (state, batch, key) -> (state, metrics); it consumes the state
 
     def __call__(
         self, state: TrainState, data: PyTree, key: jax.Array
     ) -> tuple[TrainState, dict[str, jax.Array]]:
-        """Makes one step; it consumes `state`."""
+        """Takes one step of training; it consumes `state`."""
         return self.update(state, self.draw(key, state.step, data), key)
 
 
 def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
-    """The programs of a step. The long one to compile, `update`, is the same whatever the data.
+    """Makes the programs of a step. `update`, slow to compile, serves any amount of data.
 
     Args:
-        agent: what is trained.
-        mesh: that the agent was made with. The state and the key then come from `make_begin`,
-            and the data from `sharding.replicate`.
+        agent: agent to train.
+        mesh: mesh that the agent was made with; `None` for one device. With a mesh, `make_begin`
+            makes the state and the key, and `sharding.replicate` places the data.
     """
 
     def draw(key: jax.Array, step: jax.Array, data: PyTree) -> PyTree:
@@ -81,7 +84,7 @@ def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
     rows = None if mesh is None else NamedSharding(mesh, sharding.SPLIT)
     options = None if mesh is None else sharding.choose_core_options(mesh)
     return TrainStep(
-        jax.jit(draw, out_shardings=rows),  # each device draws, and augments, its own
+        jax.jit(draw, out_shardings=rows),  # each device draws and augments its own rows
         jax.jit(update, donate_argnums=0, compiler_options=options),
     )
 
@@ -89,12 +92,12 @@ def make_train_step(agent: Agent, mesh: Mesh | None = None) -> TrainStep:
 def compile_ahead(
     agent: Agent, mesh: Mesh, like: PyTree
 ) -> tuple[Callable[[int], tuple[TrainState, jax.Array]], TrainStep]:
-    """`make_begin` and `make_train_step` with all that is long to compile compiled.
+    """Calls `make_begin` and `make_train_step`, and compiles the programs that compile slowly.
 
     Args:
-        agent: that was made with the mesh.
-        mesh: to train on.
-        like: data of the right structure; how much of them there is does not matter.
+        agent: agent made with the mesh.
+        mesh: devices to train on.
+        like: data of the right structure, of any amount.
     """
     begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
     begun = begin.lower(0)  # type: ignore[attr-defined]
@@ -127,22 +130,23 @@ def train(
     report_every: int = 20,
     report_seconds: float = math.inf,
 ) -> TrainState:
-    """Runs until the state has seen `steps` steps, or `report` says stop.
+    """Trains until the state has seen `steps` steps, or `report` returns True.
 
     Args:
-        train_step: a `TrainStep`, or anything of its signature.
-        state: to start from; consumed.
-        data: on device.
-        key: of the run.
-        steps: in all, the steps that `state` has seen included.
+        train_step: a `TrainStep`, or a function with its signature.
+        state: state to start from; consumed.
+        data: training data, on the devices.
+        key: key of the run.
+        steps: number of steps in all, including the steps that `state` has seen.
         report: called with (step, state, mean metrics) every `report_every` steps and at
             the end. If it returns True, this step was the last.
-        report_every: steps.
-        report_seconds: and whenever so many have passed since. Processes that share a run have
-            their own clocks, and may not differ in when they report: there it is infinite.
+        report_every: number of steps between reports.
+        report_seconds: seconds after which a report comes earlier. It must be infinite if several
+            processes share a run: they must report at the same steps, but their clocks differ.
 
     Raises:
-        NonFiniteLoss: names the step; the state of the last report was still good.
+        NonFiniteLoss: a loss or a gradient is not finite. The message names the step; the state of
+            the last report was still good.
     """
     done = int(state.step)
     pending: list[dict[str, jax.Array]] = []

@@ -1,8 +1,13 @@
-"""The data that everything else passes around. Nothing here computes, or knows a domain.
+"""Data types that all modules share, for any domain.
 
-Shape letters, used throughout: B plans or windows in a batch, T planned actions (the
-horizon), K past steps in a context, N planning iterations, P positions resampled
-together, A actions (the end action included).
+Letters of shapes, in all modules:
+
+- B: plans or windows in a batch.
+- T: planned actions (the horizon).
+- K: past steps in a context.
+- N: planning iterations.
+- P: positions resampled together.
+- A: actions, the end action included.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,24 +24,24 @@ Array = Any  # a jax.Array inside a program, a NumPy array at its edges
 
 
 def to_plain_dicts(observation: PyTree) -> PyTree:
-    """Replaces mappings of any kind by dicts: to `jax.tree` each kind is another structure."""
+    """Replaces mappings by dicts: `jax.tree` tells different kinds of mappings apart."""
     if isinstance(observation, Mapping):
         return {key: to_plain_dicts(part) for key, part in observation.items()}
-    if isinstance(observation, tuple | list):  # which may hold mappings
+    if isinstance(observation, tuple | list):  # may hold mappings
         return jax.tree.map(to_plain_dicts, observation, is_leaf=lambda x: isinstance(x, Mapping))
     return observation
 
 
 class Context(NamedTuple):
-    """What a plan is conditioned on (paper, section 3: the trajectory context and s_n).
+    """The input of a planner (paper, section 3: the trajectory context and s_n).
 
     Attributes:
         observation: the current state s_n.
         past: `[K, ...]` the K states before it, oldest first; zeros before the start.
         actions: `[K]` int32, the action taken in each past state; PAD before the start.
-        rewards: `[K]` float32, what each of them gave; 0 before the start.
+        rewards: `[K]` float32, the reward of each of these actions; 0 before the start.
         step: `[]` int32, environment steps since the episode began.
-        return_so_far: `[]` float32, the sum of all rewards since then.
+        return_so_far: `[]` float32, the sum of all rewards since the episode began.
     """
 
     observation: PyTree
@@ -48,16 +53,16 @@ class Context(NamedTuple):
 
 
 class Demonstration(NamedTuple):
-    """One episode of `n` steps, played by somebody.
+    """One episode of `n` steps, played by a demonstrator.
 
     Attributes:
-        observations: `[n + 1, ...]` the state before each action, and the last.
+        observations: `[n + 1, ...]` the state before each action, and the last state.
         actions: `[n]` int32.
         rewards: `[n]` float32.
-        terminated: the episode came to an end of its own.
-        truncated: the episode was cut off, by a limit of steps for instance. The end action is
-            learned to follow, as after any other; the last state keeps its value.
-        seed: with which the environment was reset.
+        terminated: whether the episode came to an end of its own.
+        truncated: whether the episode was cut off, for instance by a step limit. As after any
+            episode, models learn to plan the end action; the last state keeps its value.
+        seed: seed of the environment's reset.
     """
 
     observations: PyTree
@@ -69,14 +74,14 @@ class Demonstration(NamedTuple):
 
 
 class Window(NamedTuple):
-    """One training example: what was done from one step of a demonstration on.
+    """One training example: a step of a demonstration, and the actions from this step on.
 
     Attributes:
-        context: at that step.
-        actions: `[T]` int32, what was done.
-        imitated: `[T]` bool, which of them to learn; the others are only shown.
-        return_to_go: `[]` float32, the demonstration's rewards from this step on.
-        extras: what the domain's augmentation must know of this step; no model sees it.
+        context: the context at this step.
+        actions: `[T]` int32, the demonstrated actions.
+        imitated: `[T]` bool, which actions to learn; a model only sees the others.
+        return_to_go: `[]` float32, the sum of the demonstration's rewards from this step on.
+        extras: data of this step for the domain's augmentations; no model sees them.
     """
 
     context: Context
@@ -87,11 +92,11 @@ class Window(NamedTuple):
 
 
 class TransitionWindow(NamedTuple):
-    """A step that was taken, and what came of it: for methods that learn from rewards.
+    """One step and its outcome, for methods that learn from rewards.
 
     Attributes:
-        context: after the step, one step longer than a network's: its last past step is this one.
-        terminated: `[]` bool, the episode came to its end with the step.
+        context: the context after the step, with K + 1 past steps; the step is the last of them.
+        terminated: `[]` bool, whether the step terminated the episode.
     """
 
     context: Context
@@ -99,16 +104,16 @@ class TransitionWindow(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What a planner returns, for one context.
+    """The result of a planner, for one context.
 
     Attributes:
         actions: `[T]` int32.
         trace: `[N, T]` int32, the actions after every iteration.
-        satisfied: `[]` bool, no constraint of the energy is violated.
-        valid: `[]` bool, no energy met on the way was NaN or -inf.
-        energy: `[]` float32, of the plan; only if asked for (`score`), since it costs T passes.
-        trace_energies: `[N]` float32, after every iteration; only if asked for (`score_trace`),
-            since it costs N * T passes.
+        satisfied: `[]` bool, whether all constraints of the energy hold.
+        valid: `[]` bool, whether no energy met during planning was NaN or -inf.
+        energy: `[]` float32, energy of the plan; only with `score`, since it costs T passes.
+        trace_energies: `[N]` float32, energy after every iteration; only with `score_trace`, since
+            it costs N * T passes.
     """
 
     actions: jax.Array
@@ -120,13 +125,13 @@ class Plan(NamedTuple):
 
 
 def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:
-    """That of an energy without constraints: 0."""
+    """Returns 0, the violation of an energy without constraints."""
     del params, memory, actions
     return jnp.zeros(())
 
 
 class Energy(NamedTuple):
-    """An energy over plans: pure functions of one trajectory, to be `vmap`ped outside.
+    """An energy over plans: pure functions of one trajectory, which callers `vmap`.
 
     Tokens: actions are `0 .. A-1`; `A` is MASK (see `mask_token`), legal only where
     `accepts_mask`; `A + 1` is PAD (see `pad_token`), legal only in a context.
@@ -152,32 +157,32 @@ class Energy(NamedTuple):
 
 
 def mask_token(num_actions: int) -> int:
-    """The token of an action that is not chosen yet."""
+    """Returns the token of an action that is not chosen yet, MASK."""
     return check_num_actions(num_actions)
 
 
 def pad_token(num_actions: int) -> int:
-    """The token of a past action that never was: the episode had not begun."""
+    """Returns the token of past actions before the episode began, PAD."""
     return check_num_actions(num_actions) + 1
 
 
 def check_num_actions(num_actions: int) -> int:
-    """Returns A, the end action included.
+    """Checks A, the end action included, and returns it as an `int`.
 
     Raises:
-        UserError: not an integer, or out of range.
+        UserError: A is not an integer, or out of range.
     """
-    return check_integer("num_actions", num_actions, 1, MOST - 1)  # PAD is one more
+    return check_integer("num_actions", num_actions, 1, MOST - 1)  # PAD, A + 1, must be an int32
 
 
 class TrainState(NamedTuple):
-    """All that training changes.
+    """Everything that training changes.
 
     Attributes:
-        params: of the energy.
-        optimizer: the optimizer's own state.
-        step: `[]` int32, updates done.
-        extra: what no gradient touches: target networks, running statistics.
+        params: parameters of the energy.
+        optimizer: state of the optimizer.
+        step: `[]` int32, number of updates so far.
+        extra: arrays that gradients do not change: target networks, running statistics.
     """
 
     params: Params
@@ -187,21 +192,21 @@ class TrainState(NamedTuple):
 
 
 EncodeNext = Callable[[Params, Context, PyTree], tuple[PyTree, PyTree]]
-# (params, context, cache) -> (memory, cache): as an energy's `encode`, for consecutive states of an
-# episode. The cache is what the network keeps from plan to plan; None at the first
+# (params, context, cache) -> (memory, cache): `encode` for consecutive states of an episode. The
+# network keeps the cache from plan to plan; for the first plan it is `None`.
 
 
 class Agent(NamedTuple):
-    """What every method has in common, so that one training and one rollout serve all.
+    """The interface of all methods: one training loop and one rollout serve them all.
 
     Attributes:
         init: (key) -> state.
         batch: (key, steps) -> batch `[B, ...]`; pure; `leapjax.data.windows` makes the steps.
-        update: (state, batch, key) -> (state, metrics); pure, not jitted; splits the batch itself.
-        energy: what is minimised to act; a method that chooses one action at a time has plans of
-            one.
-        encode_next: `energy.encode` with a cache, for `compile_planner`; None: a cache would save
-            nothing.
+        update: (state, batch, key) -> (state, metrics); pure, not jitted; it splits the batch over
+            the devices itself.
+        energy: the energy to minimise; T = 1 if the method chooses one action at a time.
+        encode_next: `energy.encode` with a cache, for `compile_planner`; `None` if a cache would
+            save no work.
     """
 
     init: Callable[[jax.Array], TrainState]

@@ -4,7 +4,7 @@ from importlib import metadata
 
 
 def find_version() -> str:
-    """The version that was installed; "0+unknown" in a checkout that was not."""
+    """Returns the installed version; "0+unknown" in a checkout that is not installed."""
     try:
         return metadata.version("leapjax")
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Parameters in one small file, in half precision: what a planner is published as."""
+"""Writes and reads the parameters of published planners: one small file, in half precision."""
 
 import contextlib
 from collections.abc import Iterator
@@ -14,21 +14,21 @@ from leapjax.serialization import IDENTITY, hash_identity
 from leapjax.types import Params
 
 ITEMSIZE = 2  # bytes of a number in half precision
-HEADER = 1024  # bytes that an array takes beside its numbers, at most
+HEADER = 1024  # bytes of an array in the archive beside its numbers, at most
 
 
 def write(path: Path, params: Params, identity: str) -> None:
     """Writes parameters as float16, atomically.
 
     Args:
-        path: of a NumPy archive, `.npz`.
-        params: of float32.
-        identity: without it they cannot be read again.
+        path: path of a NumPy archive, `.npz`.
+        params: parameters in float32.
+        identity: identity of their configuration; `read` needs the same identity.
 
     Raises:
-        ValueError: a parameter that is too large for half precision.
+        ValueError: a parameter is too large for half precision.
     """
-    with np.errstate(over="ignore"):  # said below
+    with np.errstate(over="ignore"):  # reported below
         arrays = {name: np.asarray(leaf, np.float16) for name, leaf in _name_parameters(params)}
     for name, array in arrays.items():
         if not np.isfinite(array).all():
@@ -40,17 +40,17 @@ def write(path: Path, params: Params, identity: str) -> None:
 
 
 def check_identity(path: Path, identity: str) -> list[int]:
-    """Checks with which identity parameters were written, and unpacks none of them.
+    """Checks the identity that parameters were written with, without unpacking them.
 
     Args:
-        path: of a file that `write` has made.
-        identity: that they should be of.
+        path: path of a file that `write` has made.
+        identity: expected identity.
 
     Returns:
-        How many numbers each array has, at most.
+        Number of elements of each array, at most.
 
     Raises:
-        UserError: the file cannot be read, or is of another configuration.
+        UserError: the file cannot be read, or belongs to another configuration.
     """
     with _explain_failure(path):
         sizes = files.read_sizes(path)
@@ -63,15 +63,15 @@ def check_identity(path: Path, identity: str) -> list[int]:
 
 
 def read(path: Path, like: Params, identity: str) -> Params:
-    """Parameters of float32.
+    """Reads parameters and converts them to float32.
 
     Args:
-        path: of a file that `write` has made.
-        like: gives structure and shapes.
-        identity: that they were written with.
+        path: path of a file that `write` has made.
+        like: parameters of the same structure and shapes.
+        identity: identity that the parameters were written with.
 
     Raises:
-        UserError: the file cannot be read, or is of another configuration.
+        UserError: the file cannot be read, or belongs to another configuration.
     """
     check_identity(path, identity)
     wanted = dict(_name_parameters(like))
@@ -106,6 +106,6 @@ def _make_mismatch_error(path: Path) -> UserError:
 
 
 def _name_parameters(params: Params) -> list[tuple[str, jax.Array]]:
-    """The leaves in the order of the tree, by their path in it."""
+    """Returns the (path in the tree, parameter) pairs, in the order of the tree."""
     leaves = jax.tree.leaves_with_path(params)
     return [(jax.tree_util.keystr(path, simple=True, separator="/"), leaf) for path, leaf in leaves]

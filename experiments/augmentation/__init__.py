@@ -42,10 +42,10 @@ class Settings(settings.Settings):
 
 
 def make(level: str, options: Settings) -> Domain:
-    """A level of BabyAI whose training windows are augmented further.
+    """Makes a level of BabyAI whose training windows are augmented further.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     plain = domain.make(level, options)
     return plain._replace(augmentations=plain.augmentations._replace(functions=choose(options)))

@@ -26,7 +26,7 @@ def add_detour(key: jax.Array, window: Window, share: float, words: GridWords) -
     Windows do not change if every try fails, or if there are past states.
 
     Args:
-        key: of the random choices.
+        key: random key.
         window: one training example.
         share: probability of trying.
         words: the words that name kinds and colours.
@@ -56,7 +56,7 @@ def _try_detour(
     probability = jax.random.uniform(share_key) ** 0.5  # many objects are likelier than few
     filled = (grid[..., 0] == EMPTY) & ~path
     filled &= jax.random.uniform(where_key, cells) < probability
-    # Grey walls, and objects that the instruction does not mean.
+    # Obstacles are grey walls, and objects that the instruction does not mean.
     target = grid[goal[0], goal[1]].astype(jnp.int32)
     both = names_both(observation.instruction, target, words)
     kinds, colours = draw_other(kind_key, colour_key, target, cells, both)
@@ -69,7 +69,7 @@ def _try_detour(
         free = find_passable(grid).at[goal[0], goal[1]].set(True)
         return count_moves(free, observation.pose[:2], goal)
 
-    # On a path that visits no cell twice, cells without the goal are as many as moves to the goal.
+    # A path that visits no cell twice has as many cells, without the goal, as moves to the goal.
     length = path.sum()
     first = (whole == FORWARD) & (jnp.arange(len(whole)) < count)
     possible &= length == window.extras.sum() + first.sum()

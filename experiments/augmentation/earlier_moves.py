@@ -18,7 +18,7 @@ def prepend_moves(
     because the agent's mark hides the door.
 
     Args:
-        key: of the moves.
+        key: random key of the moves.
         window: one training example, without past states.
         count: `[]` number of moves.
         most: largest number of moves, at least 1.
@@ -62,7 +62,7 @@ def prepend_moves(
     mark = grid[pose[0], pose[1]].at[2].set(start[2].astype(grid.dtype))
     moved = grid.at[pose[0], pose[1]].set(empty).at[start[0], start[1]].set(mark)
     place = jnp.arange(most + horizon)
-    # The window's actions follow, then ends in place of unknown actions: an end moves nothing.
+    # The window's actions follow. End actions, which do not move the agent, replace unknown ones.
     own = jnp.append(window.actions, END)[jnp.clip(place - count, 0, horizon)]
     whole = jnp.where(place < count, moves[jnp.minimum(place, most - 1)], own)
     needed = window.extras.at[visited[:, 0], visited[:, 1]].set(True)

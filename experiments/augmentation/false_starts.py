@@ -20,7 +20,7 @@ def add_false_start(key: jax.Array, window: Window, share: float) -> Window:
     Windows do not change if the moves are impossible, or if there are past states.
 
     Args:
-        key: of the random choices.
+        key: random key.
         window: one training example.
         share: probability of a false start.
     """

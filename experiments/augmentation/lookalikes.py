@@ -15,13 +15,13 @@ from leapjax.types import Window
 
 
 def add_lookalikes(key: jax.Array, window: Window, share: float, words: GridWords) -> Window:
-    """Adds objects like BabyAI's `add_clutter`, of which some resemble the target.
+    """Adds objects like BabyAI's `add_clutter`; some of them resemble the target.
 
-    If the instruction names both kind and colour of the target, a new object may share one of
-    them.
+    If the instruction names both kind and colour of the target, a new object may share either, but
+    not both.
 
     Args:
-        key: of the random choices.
+        key: random key.
         window: one training example.
         share: largest probability of a free cell to get an object, in 0 .. 1.
         words: the words that name kinds and colours.

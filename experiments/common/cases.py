@@ -1,7 +1,7 @@
-"""An analysis: what was trained on some levels is asked to plan on others, in several ways.
+"""Analyses: models trained on some levels plan on other levels, in several ways.
 
-Each way of asking is a row beside the paper's number. What must be trained is what
-`experiments.babyai` would train, in the same folder, and is trained once.
+Each way makes a row, beside the paper's number. Models are trained once, in the run folders of
+`experiments.babyai`.
 """
 
 import contextlib
@@ -56,8 +56,8 @@ class Model(NamedTuple):
     """A model that a case needs.
 
     Attributes:
-        level: that it is trained on.
-        change: of its method's configuration, where the preset is `leapjax`.
+        level: level that it is trained on.
+        change: changes the method's configuration, with preset `leapjax` only.
     """
 
     level: str
@@ -65,53 +65,78 @@ class Model(NamedTuple):
 
 
 def alone(energies: Sequence[Energy]) -> Energy:
-    """What the one model of a case says."""
+    """Returns the energy of a case's only model."""
     return energies[0]
 
 
 class Way(NamedTuple):
-    """A way to ask what was trained for plans."""
+    """A way to plan with the models of a case.
+
+    Attributes:
+        name: names its rows.
+        method: method of the models.
+        minimise: (energies of the case's models) -> energy to minimise; see `describe_function`.
+        search: (trained planner's configuration) -> configuration of the search.
+        executed: actions before replanning; `None` executes whole plans.
+        paper: the paper's success, in percent.
+        remembers: whether penalties see the whole episode; models still see their K steps.
+        explores: whether revisits cost, unlike in the paper.
+    """
 
     name: str
     method: str = "leap"
     minimise: Callable[[Sequence[Energy]], Energy] = alone
-    # (energies of the case's models) -> what the planner minimises; see `describe_function`
     search: Callable[[Any], PlannerConfig] = lambda trained: trained
-    # (settings that it was trained with) -> settings of how it searches
-    executed: int | None = None  # actions before replanning; None: all
-    paper: float | None = None  # the paper's success, in percent
-    remembers: bool = False  # may look at the whole episode; its models see no more than they do
-    explores: bool = False  # coming back costs: beyond what the paper asks for
+    executed: int | None = None
+    paper: float | None = None
+    remembers: bool = False
+    explores: bool = False
 
 
 def draw_at(temperature: float) -> Callable[[Any], PlannerConfig]:
-    """The search of a way: as trained, but for the temperature that actions are drawn at."""
+    """Makes a `Way.search` that changes only the temperature."""
     return lambda trained: dataclasses.replace(trained, temperature=temperature)
 
 
-# Who takes the likeliest of single actions walks to and fro, and noise leads out of it.
+# An agent that always takes the likeliest single action may walk to and fro; noise breaks this up.
 NOISE = draw_at(4.0)
 
 
 class Case(NamedTuple):
-    """Models, and the level that they are asked to plan on."""
+    """Models, and the level that they plan on.
+
+    Attributes:
+        name: names its rows.
+        models: the models.
+        level: level to play.
+        ways: ways to plan.
+        adapter: (level) -> adapter, by default the level's own; rows sum its `violations`. See
+            `describe_function`.
+    """
 
     name: str
     models: Sequence[Model]
     level: str
     ways: Sequence[Way]
     adapter: Callable[[str], Adapter] | None = None
-    # (level) -> adapter; rows sum its `violations`; see `describe_function`
 
 
 class Analysis(NamedTuple):
-    """The cases of one program."""
+    """The cases of one program.
 
-    name: str  # of its module, and of its file of rows
+    Attributes:
+        name: names its module, and its file of rows.
+        cases: the cases.
+        domain: domain of all levels.
+        timed: whether tables show the time of a plan, so that rows need an idle machine.
+        change: changes the configuration of every model, for tests.
+    """
+
+    name: str
     cases: Sequence[Case]
     domain: str = "babyai"
-    timed: bool = False  # what a plan costs is part of the comparison: take it on an idle machine
-    change: Change = keep_config  # of every model's configuration, for tests
+    timed: bool = False
+    change: Change = keep_config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,16 +144,16 @@ class Options:
     """Train models, plan with each in several ways, and print success beside the paper's.
 
     Attributes:
-        only: Cases to do, by name; all of them if none is given.
-        methods: Methods to do; all that a case has if none is given.
-        ways: Ways to plan, by name; all that a case has if none is given.
+        only: Names of the cases to run, by default all.
+        methods: Methods to run, by default all methods of a case.
+        ways: Names of the ways to plan, by default all ways of a case.
         preset: Preset that models are trained with: "leapjax" for ours, "paper" for the paper's.
         seeds: Training seeds.
         episodes: Held-out episodes to measure success on, for each row.
         test_seed: Level seed of the first of these episodes.
         validation: Measure success on validation levels instead, to choose settings.
-        record: Append rows to results/, which is committed, and skip what is recorded already.
-        force: With `--record`: do again what is recorded, and replace its rows.
+        record: Append rows to results/, which is committed, and skip rows that are recorded.
+        force: With `--record`: measure recorded rows again, and replace them.
         runs: Folder for trained models and unrecorded rows.
     """
 
@@ -146,13 +171,13 @@ class Options:
 
     @property
     def played(self) -> range:
-        """The level seeds of the episodes."""
+        """Level seeds of the episodes."""
         first = seeds.validation_seeds if self.validation else seeds.test_seeds
         return first(self.test_seed, self.episodes)
 
 
 def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
-    """Trains what is missing and does every way of every case; the exit code."""
+    """Trains missing models and measures every chosen way; returns the exit code."""
     given = shell.read_arguments(arguments)
     module = f"experiments.{analysis.name}"
     about = f"{inspect.getdoc(Options)}".partition("\n\n")[0]
@@ -166,28 +191,36 @@ def main(analysis: Analysis, arguments: Sequence[str] | None = None) -> int:
 
 
 class Work(NamedTuple):
-    """What every step of an analysis needs."""
+    """Values that every step of an analysis needs.
+
+    Attributes:
+        analysis: the analysis.
+        options: options of its command line.
+        versions: versions at the start; commits made meanwhile do not change them.
+        console: console for messages.
+        interruption: interruption of the program.
+    """
 
     analysis: Analysis
     options: Options
-    versions: dict[str, str]  # of the code that runs, whatever is committed meanwhile
+    versions: dict[str, str]
     console: Console
     interruption: Interruption
 
     @property
     def rows(self) -> Path:
-        """The file of its rows."""
+        """Path of the file of rows."""
         folder = results.choose_folder(self.options.record, self.options.runs)
         return folder / f"{self.analysis.name}.jsonl"
 
 
 def run_all(analysis: Analysis, options: Options, interruption: Interruption) -> None:
-    """Every case, method and seed asked for, and their table."""
+    """Runs every chosen case, method and seed, and prints their table."""
     wanted = choose_cases(analysis, options)
     jax_setup.start()
     versions = results.find_versions()
     work = Work(analysis, options, versions, Console(markup=False), interruption)
-    for where in (work.rows.parent, options.runs):  # not after hours of work
+    for where in (work.rows.parent, options.runs):  # fails before hours of work
         files.check_writable(where)
     rows: list[Row] = []
     for case in wanted:
@@ -198,13 +231,13 @@ def run_all(analysis: Analysis, options: Options, interruption: Interruption) ->
 
 
 def choose_cases(analysis: Analysis, options: Options) -> list[Case]:
-    """The cases that are asked for.
+    """Returns the cases that the options choose, with the chosen ways.
 
     Raises:
-        UserError: an unknown case, method or preset, or options that cannot be.
+        UserError: a case, method, way or preset is unknown, or an option is out of range.
     """
     check_counts(options, "episodes")
-    len(options.played)  # raises where their seeds leave their range
+    len(options.played)  # raises if a seed is out of range
     limits.check_seeds(options.seeds)
     known = [case.name for case in analysis.cases]
     for name in options.only:
@@ -237,7 +270,7 @@ def _join_names(cases: Sequence[Case]) -> str:
 
 
 def select_ways(case: Case, options: Options) -> list[Way]:
-    """The ways of a case that are asked for."""
+    """Returns the ways of a case that the options choose."""
     return [
         way
         for way in case.ways
@@ -247,14 +280,14 @@ def select_ways(case: Case, options: Options) -> list[Way]:
 
 
 def list_methods(case: Case) -> list[str]:
-    """The methods that a case has ways of, in their order."""
+    """Lists the methods of a case's ways, in their order."""
     return list(dict.fromkeys(way.method for way in case.ways))
 
 
 def make_training_config(
     analysis: Analysis, model: Model, method: str, seed: int, options: Options
 ) -> AnyConfig:
-    """The configuration of a run of `experiments.babyai` that trains a model."""
+    """Makes the configuration of a run of `experiments.babyai` that trains a model."""
     config = find_preset(analysis.domain, model.level, method, options.preset)
     if options.preset == "leapjax":
         config = model.change(config)
@@ -265,12 +298,12 @@ def make_training_config(
 def make_configs(
     analysis: Analysis, case: Case, method: str, seed: int, options: Options
 ) -> list[AnyConfig]:
-    """What each of a case's models is trained with, of one method."""
+    """Makes the training configurations of a case's models, with one method."""
     return [make_training_config(analysis, model, method, seed, options) for model in case.models]
 
 
 def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
-    """The rows of one case, method and training seed."""
+    """Returns the rows of one case, method and training seed; measures missing rows."""
     analysis, options = work.analysis, work.options
     settings = make_configs(analysis, case, method, seed, options)
     ways = {
@@ -278,13 +311,13 @@ def run_case(work: Work, case: Case, method: str, seed: int) -> list[Row]:
         for way in case.ways
         if way.method == method
     }
-    # Read even where nothing is looked for: a damaged file is better found now than later.
+    # Reads the file in any case, so that a damaged file ends the program before long work.
     found = {row["hash"]: row for row in results.read(work.rows)}
     rows = found if options.record and not options.force else {}
     missing = [name for name in ways if name not in rows]
     models = load_models(work, case, method, seed) if missing else []
     for name in missing:
-        # A sum of models may have one of them twice.
+        # A set, because a sum of models may hold a model twice.
         seconds = sum(
             map(read_training_seconds, {find_run_folder(each, seed) for each in settings})
         )
@@ -315,10 +348,10 @@ def hash_row(
     seed: int,
     options: Options,
 ) -> str:
-    """Twelve hexadecimal digits that name a row: what was trained, how it plans, and where.
+    """Hashes the trainings, the way to plan and the episodes of a row to 12 hexadecimal digits.
 
-    Of the planner, and of what is asked for, what differs from the defaults alone, so that a
-    setting that is added later changes no name.
+    The planner's settings, `minimise`, `remembers` and `adapter` count only if they differ from
+    their defaults, so a setting that is added later changes no hash.
     """
     search = way.search(settings[0].planner)
     planner = find_differences(dataclasses.asdict(search), dataclasses.asdict(type(search)()))
@@ -352,33 +385,33 @@ def describe_function(what: Any) -> Any:
 
 
 def load_models(work: Work, case: Case, method: str, seed: int) -> list[Pretrained]:
-    """The models of a case, of one method, trained where they are not there yet."""
+    """Loads the models of a case, with one method; trains missing models."""
     wanted = make_configs(work.analysis, case, method, seed, work.options)
     return [load_or_train(work, config, seed) for config in wanted]
 
 
 def make_experiment(config: AnyConfig) -> Experiment:
-    """The program whose runs are used, or made."""
+    """Returns the program that would train with a configuration."""
     return Experiment(config.domain, config.domain)
 
 
 def find_run_folder(config: AnyConfig, seed: int) -> Path:
-    """Where a model is, or will be."""
+    """Returns the folder of a model, which may not exist yet."""
     return find_folder(make_experiment(config), config, seed)
 
 
 def read_training_seconds(folder: Path) -> float:
-    """How long the training of a run has taken, stops and continuations included."""
+    """Reads how many seconds the training of a run took, over all its continuations."""
     metrics = read_metrics(folder)
     return metrics[-1]["seconds"] if metrics else 0.0
 
 
 def load_or_train(work: Work, config: AnyConfig, seed: int) -> Pretrained:
-    """A model, trained where it is not there yet."""
+    """Loads a model, or trains it if it is missing."""
     training, folder = make_experiment(config), find_run_folder(config, seed)
-    # Metrics are written before the checkpoint that belongs to them: a kill may be in between.
+    # Looks for the checkpoint, not for metrics, which a killed run may have without it.
     if (folder / pretrained.CHECKPOINTS / str(config.training.steps)).is_dir():
-        with contextlib.suppress(checkpoints.Unfinished):  # damaged: the end is learned again
+        with contextlib.suppress(checkpoints.Unfinished):  # damaged: trains its last steps again
             return pretrained.load(folder, chunk_sizes=(PLANS_TOGETHER,), finished=True)
     work.console.print(f"training {folder}", highlight=False)
     opened = open_run(
@@ -389,7 +422,7 @@ def load_or_train(work: Work, config: AnyConfig, seed: int) -> Pretrained:
 
 
 def make_played_domain(level: str, models: Sequence[Pretrained]) -> Domain:
-    """A level that models are asked to plan on."""
+    """Makes the level that models plan on."""
     specification = models[0].specification
     return find_domain(specification.domain).make(level, specification.domain_settings)
 
@@ -397,7 +430,7 @@ def make_played_domain(level: str, models: Sequence[Pretrained]) -> Domain:
 def make_planner(
     domain: Domain, way: Way, models: Sequence[Pretrained], search: PlannerConfig
 ) -> Pretrained:
-    """The models of a case as one planner for a level, which minimises what a way says."""
+    """Makes one planner from the models of a case, with the energy of a way."""
     specification = models[0].specification
     energies = [model.energy for model in models]
     if way.remembers:
@@ -406,7 +439,7 @@ def make_planner(
         specification = dataclasses.replace(specification, context=domain.max_steps)
     energy = way.minimise(energies)
     params = models[0].params if len(models) == 1 else tuple(model.params for model in models)
-    # What weighs many plans of a context at once has a full batch with few contexts.
+    # A planner that scores many candidates per context fills a batch with few contexts.
     weighs_many = isinstance(search, ShootingConfig | CrossEntropyConfig)
     plan = compile_planner(energy, search, (1, 2) if weighs_many else (PLANS_TOGETHER,))
     return Pretrained(specification, energy, params, plan, domain)
@@ -420,7 +453,7 @@ def play(
     options: Options,
     interruption: Interruption,
 ) -> tuple[Row, Episodes]:
-    """What one way of asking gives, and its episodes."""
+    """Plays the episodes of one way; returns its measurements and the episodes."""
     specification = models[0].specification
     search = way.search(specification.planner)
     domain = make_played_domain(case.level, models)
@@ -482,7 +515,7 @@ def play(
 def select_rows(
     analysis: Analysis, rows: Sequence[Row], case: Case, way: Way, preset: str
 ) -> list[Row]:
-    """The rows of a way to plan as it is today, one for each training seed."""
+    """Selects the rows of a way with today's settings, one for each training seed."""
     found = []
     for row in rows:
         if (row["case"], row["way"], row["preset"]) != (case.name, way.name, preset):
@@ -495,7 +528,7 @@ def select_rows(
 
 
 def make_table(rows: Sequence[Row]) -> Table:
-    """The rows for a terminal; below, the mean over training seeds if there are several."""
+    """Tabulates rows for a terminal; below them, means over training seeds if there are several."""
     shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
 
     def named(row: Row) -> tuple[str, ...]:

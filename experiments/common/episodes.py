@@ -1,4 +1,4 @@
-"""One episode, watched: each plan before it is executed, and each step when it was taken."""
+"""Plays one episode and yields its events: each plan before execution, each step after it."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from leapjax.environments import Adapter, Transition
 from leapjax.pretrained import Pretrained
 from leapjax.types import Plan
 
-Step = tuple[int, Transition]  # an action, and what came of it
+Step = tuple[int, Transition]  # an action and its transition
 
 
 def watch_episode(
@@ -25,13 +25,13 @@ def watch_episode(
     """Plays as `leapjax.rollouts.evaluate` does, with the same plans.
 
     Args:
-        adapter: of the level; as it is between two events it can be drawn.
-        planner: that plans.
-        context: K.
-        level_seed: of the episode.
-        seed: of the planner's randomness.
-        executed: actions of each plan; None for all.
-        most: plans; an episode that needs more is cut off. None: as many as it takes.
+        adapter: adapter of the level, which a caller may draw after each event.
+        planner: planner.
+        context: K, past steps that the planner sees.
+        level_seed: seed of the level.
+        seed: seed of the planner's randomness.
+        executed: executed actions of each plan; `None` for all.
+        most: largest number of plans, after which the episode is cut off; `None` for no limit.
     """
     history = rollouts.History(adapter.reset(level_seed), context, adapter.num_actions, level_seed)
     replan, caches = 0, [None]
@@ -42,7 +42,7 @@ def watch_episode(
         )
         yield plans
         actions = np.asarray(plans.actions[0])[:executed]
-        if actions[0] >= adapter.num_actions - 1:  # the end action: it has given up
+        if actions[0] >= adapter.num_actions - 1:  # end comes first: the planner gives up
             return
         for action in actions:
             if action >= adapter.num_actions - 1:

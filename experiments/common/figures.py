@@ -18,22 +18,22 @@ from leapjax.running.results import Row
 
 
 def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
-    """Success rate against planning iterations, a panel for each level.
+    """Draws success rates against planning iterations, a panel for each level.
 
     Args:
-        rows: by level, label of the line, and number of iterations.
-        path: to write.
+        rows: rows by level, label of the line, and number of iterations.
+        path: file to write.
     """
     figure, axes = _make_panels(len(rows), columns=4, width=2.7 if len(rows) > 1 else 5)
     labels = list(dict.fromkeys(label for by_label in rows.values() for label in by_label))
-    drawn: dict[str, Line2D] = {}  # one of each label, for the legend
+    drawn: dict[str, Line2D] = {}  # a line for each label, for the legend
     for axis, (level, by_label) in zip(axes, rows.items(), strict=False):
         for label, by_count in by_label.items():
             rates = [100 * row["successes"] / row["episodes"] for row in by_count.values()]
             index = labels.index(label)
             (drawn[label],) = axis.plot(
                 list(by_count), rates, "o-", color=f"C{index}",
-                markersize=max(4.5, 10 - 0.7 * index),  # so that none hides another
+                markersize=max(4.5, 10 - 0.7 * index),  # later lines do not hide earlier ones
             )  # fmt: skip
         axis.set_title(level, fontsize=9)
         axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
@@ -52,12 +52,12 @@ def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: P
 def draw_methods(
     rates: Mapping[str, Mapping[str, Mapping[str, float]]], names: Sequence[str], path: Path
 ) -> None:
-    """Success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
+    """Draws success rates as bars, a panel for each level (paper, figure 'Quantitative Results').
 
     Args:
-        rates: in percent by level, whose numbers they are (the same everywhere), and method.
-        names: of all methods, in order.
-        path: to write.
+        rates: success rates in percent by level, source and method; all levels have equal sources.
+        names: names of all methods, in order.
+        path: file to write.
     """
     figure, axes = _make_panels(len(rates), columns=3, width=4.5)
     for axis, (level, by_whom) in zip(axes, rates.items(), strict=False):
@@ -75,11 +75,11 @@ def draw_methods(
 
 
 def draw_intervals(found: dict[str, tuple[float, float, float]], path: Path) -> None:
-    """Aggregate scores with their intervals, one below the other (Agarwal et al., 2021).
+    """Draws aggregate scores with their intervals (Agarwal et al., 2021).
 
     Args:
-        found: by label: in percent the score, and the bounds of its interval.
-        path: to write.
+        found: score and bounds of its interval in percent, by label.
+        path: file to write.
     """
     figure, axis = plt.subplots(figsize=(6, 0.8 + 0.35 * len(found)), layout="constrained")
     for place, (score, low, high) in enumerate(reversed(found.values())):
@@ -93,11 +93,11 @@ def draw_intervals(found: dict[str, tuple[float, float, float]], path: Path) -> 
 
 
 def draw_landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Energies of good and bad plans over training, and of plans over iterations.
+    """Draws energies of good and bad plans over training, and of plans over iterations.
 
     Args:
-        found: of each preset, as `experiments.landscape` has it.
-        path: to write.
+        found: measurements of `experiments.landscape`, one for each preset.
+        path: file to write.
     """
     figure, axes = plt.subplots(
         len(found), 2, figsize=(9, 3 * len(found)), layout="constrained", squeeze=False
@@ -125,11 +125,11 @@ def draw_landscape(found: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_energies(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """The mean energy of each trajectory against its return, both from 0 to 1.
+    """Draws the mean energy of each trajectory against its return, both scaled to 0 .. 1.
 
     Args:
-        found: by game, as `experiments.atari_energy` has it.
-        path: to write.
+        found: measurements of `experiments.atari_energy` by game.
+        path: file to write.
     """
     figure, axes = plt.subplots(
         1, len(found), figsize=(3 * len(found), 2.8), layout="constrained", squeeze=False
@@ -148,7 +148,7 @@ def draw_energies(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
 
 
 def _make_panels(count: int, columns: int, width: float) -> tuple[Figure, Sequence[Axes]]:
-    """A figure of so many panels of success, at most `columns` side by side, one for each level."""
+    """Makes a figure of `count` panels of success rates, at most `columns` side by side."""
     columns = min(columns, max(1, count))
     lines = max(1, -(-count // columns))
     figure, axes = plt.subplots(

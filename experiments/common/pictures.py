@@ -1,4 +1,4 @@
-"""Pictures: animations, and sheets of several."""
+"""Writes pictures: animations, and sheets of several."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from PIL import Image
 from leapjax import files
 from leapjax.errors import UserError
 
-Frame = tuple[Image.Image, int]  # a picture, and for how many milliseconds it is shown
+Frame = tuple[Image.Image, int]  # a picture and its duration in milliseconds
 
 
 def save_animation(frames: Sequence[Frame], path: Path) -> None:
@@ -33,10 +33,10 @@ def save_sheet(pictures: Sequence[Image.Image], columns: int, path: Path) -> Non
 
 
 def check_picture(path: Path) -> None:
-    """Refuses, before long work, a file that no picture can be written to.
+    """Checks, before long work, that a picture can be written.
 
     Raises:
-        UserError: it is of an unknown kind, or its folder cannot be written to.
+        UserError: the file's suffix is unknown, or its folder is not writable.
     """
     if path.suffix.lower() not in Image.registered_extensions():
         raise UserError(f"{path}: a picture can be .png or .gif, among others")

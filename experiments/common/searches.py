@@ -1,4 +1,4 @@
-"""Every way to search with one trained energy over plans that are executed whole."""
+"""The ways to search with one trained energy, for plans that are executed whole."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -8,20 +8,26 @@ from leapjax.planners import GibbsConfig
 
 
 class Search(NamedTuple):
-    """A way to plan."""
+    """A way to search.
+
+    Attributes:
+        name: title in tables.
+        passes: passes of the model in units of the horizon T; 0 for a single pass.
+        options: fields of `GibbsConfig`, without the number of iterations.
+    """
 
     name: str
-    passes: int  # of the model, in units of the horizon T; 0: a single one
-    options: Mapping[str, Any]  # of `GibbsConfig`, but for the number of iterations
+    passes: int
+    options: Mapping[str, Any]
 
     @property
     def cost(self) -> str:
-        """Passes in all, in words."""
+        """All passes of the model, restarts included: "1", "T" or "n T"."""
         passes = self.passes * self.options.get("restarts", 1)
         return {0: "1", 1: "T"}.get(passes, f"{passes} T")
 
     def of(self, horizon: int) -> dict[str, Any]:
-        """Options for plans of T actions."""
+        """Returns the fields of `GibbsConfig` for plans of `horizon` actions."""
         plain = {"fill": "together", "order": "random"}
         return {**plain, **self.options, "iterations": max(1, self.passes * horizon)}
 
@@ -37,7 +43,7 @@ SEARCHES = (
     Search("most certain first, by margin", 1, {"fill": "margin"}),
     Search("most certain first, then Gibbs", 2, {"fill": "confident", "order": "uncertain"}),
 )
-# To score a learned energy takes T more passes: only for rules, whose total is one.
+# Only for rules, which score a plan in one pass. A learned energy needs T passes more.
 BEST_OF_MANY = Search(
     "most certain first, best of 16", 1,
     {"fill": "confident", "temperature": 0.2, "restarts": 16},
@@ -45,10 +51,13 @@ BEST_OF_MANY = Search(
 
 
 def list_searches(config: AnyConfig) -> list[AnyConfig]:
-    """Every way to plan that a method can; those of one action at a time have none."""
+    """Returns a configuration for each search that a method can make.
+
+    The list is empty for methods that plan one action.
+    """
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
     every = (*SEARCHES, BEST_OF_MANY) if config.method == "rules" else SEARCHES
-    if config.method == "classifier":  # judges no plan in which actions are open
+    if config.method == "classifier":  # scores only complete plans
         every = tuple(search for search in every if "fill" not in search.options)
     return [change(config, planner=search.of(config.planner.horizon)) for search in every]

@@ -1,1 +1,1 @@
-"""What the documents' tables hold, made from rows; `experiments.report` puts them there."""
+"""Makes the documents' tables from rows; `experiments.report` puts them into the documents."""

@@ -12,7 +12,7 @@ ANALYSES = {
     for program in (properties, stochastic, suboptimal, ablation)
 }
 PRESETS = ("paper", "leapjax")
-# One fixed way a method: LEAP executes whole plans, DT and IQL choose single actions.
+# One way for each method: LEAP executes whole plans, DT and IQL choose single actions.
 AS_THE_PAPER = ("whole plan", "leap", "sum", "dt", "iql")
 OF_THE_PAPER = ("adaptation", "generalization", "composition")
 EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))
@@ -20,7 +20,7 @@ ERRANDS = ("constraints-errand", "constraints-detour")
 
 
 def is_used(row: Row) -> bool:
-    """Tells whether today's code makes such a row, of any way of a case; tables show some ways."""
+    """Tells whether today's code makes such a row; tables do not show every way."""
     of = ANALYSES[row["experiment"]]
     return any(
         select_rows(of, [row], case, way, row["preset"]) for case in of.cases for way in case.ways
@@ -30,13 +30,13 @@ def is_used(row: Row) -> bool:
 def compare_ways(
     of: Analysis, rows: Sequence[Row], ways: Sequence[str] = (), cases: Sequence[str] = ()
 ) -> str:
-    """Success of some ways to plan, of both presets, beside the paper's number.
+    """Tabulates the success of some ways, with both presets, beside the paper's number.
 
     Args:
-        of: the analysis.
-        rows: its rows.
+        of: analysis.
+        rows: rows of the analysis.
         ways: names of ways; all if empty.
-        cases: beginnings of the names of cases; all if empty.
+        cases: prefixes of the names of cases; all if empty.
     """
     lines = []
     for case in of.cases:
@@ -58,7 +58,7 @@ def compare_ways(
 
 
 def _format_cell(of: Analysis, rows: Sequence[Row]) -> str:
-    """Success of rows, one for each seed; what a plan costs, and violations if there are any."""
+    """Formats the success of rows, one for each seed, with time and violations if there are any."""
     cell = format_rate(rows)
     if rows and of.timed:
         cell += f", {compute_milliseconds(rows):.1f} ms"
@@ -69,7 +69,7 @@ def _format_cell(of: Analysis, rows: Sequence[Row]) -> str:
 
 
 def compare_energies(found: Sequence[Row]) -> str:
-    """Energies of good and bad plans at the end of training, and of plans being refined."""
+    """Tabulates energies of good and bad plans after training, and of the planner's plans."""
     shares = [name for each in found[:1] for name in each["training"][-1] if name != "step"]
     lines = []
     for each in found:

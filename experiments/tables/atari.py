@@ -1,4 +1,4 @@
-"""The Atari tables: scores, the data, energies against rewards, the price of a decision."""
+"""The Atari tables: scores, data, energies against rewards, the time of a decision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -25,7 +25,7 @@ COLUMNS = {
     "REM": Setting("leapjax", "rem"),
     "random": Setting("leapjax", "random"),
 }
-# At the paper's scale, in what has been run of it; and with the temperature of preset `leapjax`.
+# The runs at the paper's scale; `COLD` has the temperature of preset `leapjax`.
 CONSECUTIVE = {"training": {"consecutive": 16}, "domain_settings": {"max_steps": LONGEST}}
 LARGE = {
     "LEAP": Setting("paper", changes=CONSECUTIVE),
@@ -38,14 +38,15 @@ USED = (*COLUMNS.values(), *LARGE.values(), *COLD.values())
 
 
 def is_used(row: Row) -> bool:
-    """Whether a row is in a table."""
+    """Tells whether a row is in a table."""
     return any(setting.has(row) for setting in USED)
 
 
 def compare_scores(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
-    """Scores of every method and game, 0 as random actions' and 100 as a gamer's; and as they are.
+    """Tabulates scores by method and game, with their standard errors.
 
-    With the standard error, and the mean score of the games that were learned from.
+    Scores are normalised (0: random actions, 100: a gamer) and raw. The last column is the mean
+    score of the games that the methods learned from.
     """
     columns = [*COLUMNS, "the data"]
     lines = []
@@ -76,7 +77,7 @@ def _format_scores(
     settings: Mapping[str, Setting],
     games: Sequence[Mapping[str, Any]],
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """By column: normalised scores, and as they are, of settings and of the games learned from."""
+    """Formats normalised and raw scores by column, for the settings and for the data."""
     found = select(rows, [level], settings)
     cells = {title: _compute_mean_score(of) for (_, title), of in found.items() if of}
     game = GAMES[level]
@@ -94,15 +95,17 @@ def _format_scores(
 
 
 def _compute_mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
-    """The mean score of rows, one for each seed, and its standard error.
+    """Computes the mean score of rows, one for each seed, and its standard error.
 
-    Of several seeds the larger of two: from the spread of their means, which a few seeds may
-    happen to hide, and from that of the games alone. None where the best action is always taken:
-    a game without sticky actions then depends on its no-ops modulo the frame skip alone, so that
-    there are four, however many are played; and where a row is of one game.
+    The error is the larger of two: from the spread of the seeds' means, and from the spread of the
+    games alone. A few seeds may agree by chance, so the second is a floor.
+
+    The error is `None` at temperature 0. Without sticky actions, a greedy game depends only on its
+    no-ops modulo the frame skip, so at most four games differ. It is also `None` if a row has a
+    single game.
     """
     means = np.array([row["mean_return"] for row in rows])
-    errors = np.array([row.get("return_error") for row in rows], float)  # NaN of one game
+    errors = np.array([row.get("return_error") for row in rows], float)  # NaN for a single game
     greedy = any(row["configuration"]["planner"].get("temperature") == 0 for row in rows)
     if greedy or np.isnan(errors).any():
         return float(means.mean()), None
@@ -115,7 +118,7 @@ def _format_with_error(mean: float, error: float | None) -> str:
 
 
 def describe_data(found: Mapping[str, Any]) -> str:
-    """What the demonstrators reached, whose games are learned from."""
+    """Tabulates the scores of the demonstrators."""
     lines = []
     for game in GAMES:
         for name in sorted(each for each in found if parse_game(each) == game):
@@ -124,7 +127,7 @@ def describe_data(found: Mapping[str, Any]) -> str:
 
 
 def _describe_reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many there are, and their scores."""
+    """Formats the numbers of games and transitions, and the scores."""
     reached = np.array([game["score"] for game in games])
     by_noise = {
         noise: np.mean([game["score"] for game in games if game["noise"] == noise])
@@ -140,7 +143,7 @@ def _describe_reached(games: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def compare_energies(found: Mapping[str, Any]) -> str:
-    """How energies of trajectories and their rewards are correlated."""
+    """Tabulates the rank correlation of energy and reward, by game."""
     lines = [
         [name, str(len(of["energies"])), f"{of['correlation']:.2f}", f"{of['p_value']:.1g}"]
         for name in GAMES
@@ -149,21 +152,21 @@ def compare_energies(found: Mapping[str, Any]) -> str:
     return make_table("game | trajectories | rank correlation of energy and reward | p", lines)
 
 
-# States that are encoded for a decision while playing. Of 26, preset `paper` reads the new one and
-# those that see black frames before the context now; the tokens of the others it knows.
+# States that the encoder reads for each decision. Preset `paper` sees 26 states. It caches their
+# tokens, except for the new state and the states whose stack now has black frames.
 ENCODED = {"leapjax": 1, "paper": STACK}
 
 
 def describe_encoding(row: Row) -> list[str]:
-    """What is encoded while playing: states a second, GFLOP/s, their fraction of the peak."""
+    """Formats the encoder's speed: states a second, GFLOP/s, and the fraction of the peak."""
     states = row["batch"] * ENCODED[row["preset"]] / row["encoding_seconds"]
     gflops = row["encoding_flops"] / row["encoding_seconds"] / 1e9
-    peak = row.get("peak_gflops")  # older rows have none
+    peak = row.get("peak_gflops")  # missing in older rows
     return [f"{states:,.0f}", f"{gflops:.0f}", "-" if peak is None else f"{gflops / peak:.0%}"]
 
 
 def compare_decisions(rows: Sequence[Row]) -> str:
-    """What decisions are made of in games that are played together, in milliseconds."""
+    """Tabulates the parts of a decision in milliseconds, for games that are played together."""
 
     def milliseconds(part: str) -> Callable[[Row], str]:
         return lambda row: f"{1e3 * row[f'{part}_seconds']:.1f}"

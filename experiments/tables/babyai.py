@@ -25,10 +25,10 @@ SETTINGS = {
     # Chosen on validation levels: docs/lessons.md.
     "`leapjax`, `--executed 3`": Setting("leapjax", changes={"executed": 3}),
 }
-# The methods of the paper's table, beside the floor, with both presets.
+# The paper's methods, and random actions as the floor.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
-# Noise of methods with preset `paper`, chosen on validation levels. LEAP gains nothing by it.
+# Noise for methods with preset `paper`, chosen on validation levels. It does not help LEAP.
 NOISE = {
     **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
     "plate": {"beams": 1, "temperature": 4.0},
@@ -40,7 +40,7 @@ BY_METHOD = {
     },
     "preset leapjax": {method: Setting("leapjax", method) for method in COMPARED},
 }
-ITERATIONS = (1, 2, 5, 10, 15, 30)  # T and N of every level, and fewer
+ITERATIONS = (1, 2, 5, 10, 15, 30)  # includes T and N of every level
 ITERATED = {
     "preset `paper`": PAPER,
     "`leapjax`, `--fields 0`": Setting("leapjax", changes={"domain_settings": {"fields": 0}}),
@@ -64,13 +64,14 @@ def is_used(row: Row) -> bool:
 
 
 def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting]) -> str:
-    """Success of the paper's LEAP and of some settings, by level, and the interquartile mean.
+    """Tabulates the success of the paper's LEAP and of some settings, by level.
 
-    A cell is the mean over seeds, its 95% interval, and the number of seeds.
+    A cell holds the mean over seeds, its 95% interval, and the number of seeds. The last line is
+    the interquartile mean.
 
     Args:
-        rows: of BabyAI.
-        settings: a column for each, by title.
+        rows: rows of BabyAI.
+        settings: settings by title, a column for each.
     """
     found = select(rows, LEVELS, settings)
     lines = [
@@ -88,7 +89,10 @@ def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting]) -> st
 
 
 def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
-    """The interquartile means of the paper's LEAP, and of what has rows on every level."""
+    """Computes interquartile means with intervals, in percent, by title.
+
+    Includes the paper's LEAP, and each setting that has rows on every level.
+    """
     paper = compute_paper_middle()
     executed = "`leapjax`, `--executed 3`"
     named = {"random": SETTINGS["random"]} | {
@@ -104,13 +108,16 @@ def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, flo
 
 
 def compute_paper_middle() -> float:
-    """The interquartile mean of the paper's LEAP, in percent."""
+    """Computes the interquartile mean of the paper's LEAP, in percent."""
     papers = np.array([list_success(level)["leap"] for level in LEVELS])
     return float(scores.interquartile_mean(papers))
 
 
 def compute_middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float, float] | None:
-    """The interquartile mean of a setting over all levels, and its interval, in percent."""
+    """Computes a setting's interquartile mean over all levels and its interval, in percent.
+
+    Returns `None` if a level has no rows.
+    """
     levels = select(rows, LEVELS, {"": setting}).values()
     if not all(levels):
         return None
@@ -119,7 +126,7 @@ def compute_middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float,
 
 
 def compare_iterations(rows: Sequence[Row]) -> str:
-    """Success rates against the number of iterations, of training seed 0."""
+    """Tabulates success rates against the number of iterations, for training seed 0."""
     lines = [
         [
             level,
@@ -133,19 +140,19 @@ def compare_iterations(rows: Sequence[Row]) -> str:
 
 
 def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
-    """Rows of training seed 0 by level, title of the setting, and N."""
+    """Groups the rows of training seed 0 by level, title of the setting, and N."""
     first = select([row for row in rows if row["seed"] == 0], LEVELS, BY_ITERATIONS)
     found: dict[str, dict[str, dict[int, Row]]] = {}
     for level in LEVELS:
         for title in ITERATED:
             by_count = {n: of[0] for n in ITERATIONS if (of := first[level, (title, n)])}
-            if len(by_count) > 1:  # one alone says nothing of iterating
+            if len(by_count) > 1:  # a single N does not show the effect of iterations
                 found.setdefault(level, {})[title] = by_count
     return found
 
 
 def compare_methods(rows: Sequence[Row]) -> str:
-    """Success rates of every method: the paper's, and those of both presets; the best in bold."""
+    """Tabulates success rates of every method, for the paper and both presets; best in bold."""
     lines = []
     for level, by_preset in group_by_method(rows).items():
         theirs = list_success(level)
@@ -160,14 +167,14 @@ def compare_methods(rows: Sequence[Row]) -> str:
 
 
 def _mark_best(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
-    """The cell of every method, those of the best rate in bold."""
+    """Returns the cell of every method, with the best rates in bold."""
     best = max(rates.values(), default=None)
     bold = {name: f"**{cell}**" for name, cell in cells.items() if rates[name] == best}
     return [{**cells, **bold}.get(name, "-") for name in COMPARED]
 
 
 def group_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
-    """Rows by level, preset and method, of levels where there are some of a baseline."""
+    """Groups rows by level, preset and method, for levels with rows of a baseline."""
     found: dict[str, dict[str, dict[str, list[Row]]]] = {}
     for level in LEVELS:
         by_preset = {
@@ -180,7 +187,7 @@ def group_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[R
 
 
 def compute_success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Success in percent by level, whose numbers they are, and method."""
+    """Computes success in percent by level, source (the paper or a preset) and method."""
     return {
         level: {"the paper": list_success(level)}
         | {
@@ -192,11 +199,11 @@ def compute_success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[s
 
 
 def compare_prices(rows: Sequence[Row], measured: Sequence[Row]) -> str:
-    """Milliseconds of planning for each action, with preset `leapjax`.
+    """Tabulates the milliseconds of planning for each action, with preset `leapjax`.
 
     Args:
-        rows: of episodes, for the plans that an action takes (seed 0).
-        measured: plans per second, those of `benchmarks.methods`.
+        rows: rows of BabyAI; training seed 0 gives the number of plans for each action.
+        measured: measurements of `benchmarks.methods`, in plans per second.
     """
     speeds = {(row["level"], row["method"]): row["plans_per_second"] for row in measured}
 

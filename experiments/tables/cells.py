@@ -1,4 +1,4 @@
-"""What tables are made of: rates with their intervals, means, Markdown."""
+"""Parts of tables: rates with their intervals, means, Markdown."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -11,20 +11,21 @@ Columns = Mapping[str, str | Callable[[Row], str]]
 
 
 def format_rate(rows: Sequence[Row]) -> str:
-    """Mean success of some rows, one for each seed, with its interval and how many there are."""
+    """Formats the mean success of rows, one for each seed, with its interval and their number."""
     if not rows:
         return "-"
     _, (low, high) = scores.aggregate([collect_outcomes(rows)])
     said = format_with_interval(compute_mean_rate(rows), 100 * low, 100 * high)
-    if rows[0]["method"] == "rules":  # nothing was trained
+    if rows[0]["method"] == "rules":  # has no training seeds
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
 
 
 def collect_outcomes(rows: Sequence[Row]) -> scores.Outcomes:
-    """Returns the outcomes of some rows, one for each seed: of every episode if all are recorded.
+    """Returns the outcomes of rows, one for each seed.
 
-    They must be of the same levels, too; otherwise only the counts are used.
+    Returns every episode's outcome if all rows have episodes recorded on equal levels, and the
+    counts of successes and episodes otherwise.
     """
     recorded = [row["recorded"] for row in rows if row.get("recorded") is not None]
     levels = {each["seed"].tobytes() for each in recorded}
@@ -34,27 +35,27 @@ def collect_outcomes(rows: Sequence[Row]) -> scores.Outcomes:
 
 
 def format_with_interval(mean: float, low: float, high: float) -> str:
-    """A mean and its interval, in percent."""
+    """Formats a mean and its interval, in percent."""
     return f"{mean:.1f}% [{low:.1f}, {high:.1f}]"
 
 
 def compute_mean_rate(rows: Sequence[Row]) -> float:
-    """Mean success of some rows, in percent."""
+    """Computes the mean success of rows, in percent."""
     return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
 
 
 def compute_milliseconds(rows: Sequence[Row]) -> float:
-    """What a plan costs, hundreds at once."""
+    """Computes the milliseconds of a plan, when hundreds are made at once."""
     plans = sum(row["plans"] for row in rows)
     return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
 
 
 def list_rows(rows: Sequence[Row], columns: Columns) -> str:
-    """A table in Markdown with a line for each row.
+    """Makes a Markdown table with a line for each row.
 
     Args:
-        rows: in order.
-        columns: by title, a cell: a format of the row's fields, or a function of the row.
+        rows: rows, in order.
+        columns: cells by title: a format string of the row's fields, or a function of the row.
     """
     lines = [
         [cell.format(**row) if isinstance(cell, str) else cell(row) for cell in columns.values()]
@@ -64,7 +65,7 @@ def list_rows(rows: Sequence[Row], columns: Columns) -> str:
 
 
 def make_table(header: str, lines: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; the titles of its columns are separated by bars."""
+    """Makes a Markdown table; bars separate the titles in `header`."""
     columns = header.count("|") + 1
     rows = [f"| {header} |", "| " + " | ".join(["---"] * columns) + " |"]
     return "\n".join([*rows, *(f"| {' | '.join(cells)} |" for cells in lines)])

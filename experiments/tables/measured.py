@@ -1,4 +1,4 @@
-"""What files of measurements hold, those that tables and figures are made from beside rows."""
+"""The schemas of the measurements, from which tables and figures are made, as from rows."""
 
 from pathlib import Path
 from typing import Any
@@ -67,10 +67,10 @@ MEASURED: dict[str, Schema] = {
 
 
 def read_measured(path: Path) -> Any:
-    """The measurements in a file, which its name says the kind of.
+    """Reads the measurements in a file, whose name tells their schema.
 
     Raises:
-        UserError: it cannot be read, or tables could not be made from it; names the field.
+        UserError: the file cannot be read, or a field is invalid; names the field.
     """
     try:
         found = parse_json(read_text(path))
@@ -85,7 +85,7 @@ def read_measured(path: Path) -> Any:
 
 
 def _find_contradiction(name: str, found: Any) -> str | None:
-    """What parts say against each other."""
+    """Finds fields that contradict each other; returns a message, or `None`."""
     if name == "quality":
         for row in found:
             if row["successes"] > row["episodes"]:

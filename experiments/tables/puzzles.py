@@ -1,4 +1,4 @@
-"""The tables of stars and Sudoku, whose plans are executed whole: every way to search."""
+"""The tables of stars and Sudoku, whose plans are executed whole, by search."""
 
 from collections.abc import Sequence
 
@@ -20,18 +20,18 @@ PAYING = (
     ("all at once", "1"), ("left to right", "T"), ("Gibbs sampling, random order", "2 T"),
     ("most certain first", "T"), ("most certain first, best of 16", "16 T"),
 )  # fmt: skip
-ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # what was learned, and what it is played on
+ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
 
 
 def is_used(row: Row) -> bool:
-    """Tells whether a row is of a search or of other arms; tables and figures show some."""
+    """Tells whether today's code makes such a row; tables and figures do not show every row."""
     return bool(group_by_search([row])) or any(
         of for _, by_count in group_by_arms([row]) for of in by_count
     )
 
 
 def compare_searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> str:
-    """Success of a few ways to search with one energy, by level and energy."""
+    """Tabulates the success of a few searches, by level and energy."""
     found = group_by_search(rows)
     lines = []
     for each in zip(*(found[column] for column in columns), strict=True):
@@ -42,9 +42,9 @@ def compare_searches(rows: Sequence[Row], columns: Sequence[str] = PAYS_ON) -> s
 
 
 def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[Row]]]]:
-    """By level and what is minimised: name, passes and rows of each way.
+    """Groups rows by level and energy: name, passes and rows of each search.
 
-    Each has the same ways to search, whether there are rows or not.
+    Every group lists the same searches, also searches without rows.
     """
     found = {}
     for domain, level in dict.fromkeys((row["domain"], row["level"]) for row in rows):
@@ -54,7 +54,7 @@ def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[
                 (search.name, search.cost): setting.searching(**search.of(horizon))
                 for search in (*SEARCHES, BEST_OF_MANY)
             }
-            # Methods of one action stand beside what was learned alone.
+            # Methods of one action stand beside the learned energy, without rules.
             beside = rows if suffix == LEARNED else []
             ways = select(rows, [level], settings) | select(beside, [level], ONE_ACTION)
             if any(ways.values()):
@@ -63,7 +63,7 @@ def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[
 
 
 def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
-    """By level, name of the search, and number of passes: rows of what was learned, added up."""
+    """Adds up the rows with a learned energy, by level, name of the search and passes."""
     added: dict[str, dict[str, dict[int, Row]]] = {}
     planned = [row for row in rows if row["method"] == "leap"]
     for level, ways in group_by_search(planned).items():
@@ -75,7 +75,7 @@ def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]
 
 
 def compare_arms(rows: Sequence[Row]) -> str:
-    """Success on star graphs of other numbers of arms than were learned."""
+    """Tabulates success on star graphs with other numbers of arms than in training."""
     lines = [
         [name, *map(format_rate, by_count)]
         for name, by_count in group_by_arms(rows)
@@ -85,7 +85,7 @@ def compare_arms(rows: Sequence[Row]) -> str:
 
 
 def group_by_arms(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
-    """By search: rows of what learned graphs of three arms, for each of `ARMS` it was played on."""
+    """Groups rows by search and by number of arms in play (`ARMS`); training had three arms."""
     horizon = find_preset("stars", ARMS_LEVEL, "leap", "leapjax").planner.horizon
     levels = [f"Star{count}x{horizon}" for count in ARMS]
     found = []

@@ -1,4 +1,4 @@
-"""Which rows a table wants: a method with a preset, as it is today."""
+"""Selects the rows of a table: a method with a preset, with today's settings."""
 
 import dataclasses
 import functools
@@ -16,12 +16,12 @@ Key = TypeVar("Key")
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A method with a preset, and what differs from it: a column of a table.
+    """A method with a preset and changes of it: a column of a table.
 
     Attributes:
-        preset: by name.
-        method: by name.
-        changes: of the preset's configuration, see `leapjax.configuration.change`.
+        preset: name of the preset.
+        method: name of the method.
+        changes: changes of the preset's configuration, see `leapjax.configuration.change`.
     """
 
     preset: str
@@ -34,7 +34,7 @@ class Setting:
         return dataclasses.replace(self, changes={**self.changes, "planner": planner})
 
     def has(self, row: Row) -> bool:
-        """Tells whether a row is of this setting as it is today, trained or played again."""
+        """Tells whether a row has this setting's hash today, from training or from a checkpoint."""
         if (row["method"], row["preset"]) != (self.method, self.preset):
             return False
         of = row["domain"], row["level"], self.method, self.preset
@@ -43,13 +43,13 @@ class Setting:
         )
 
 
-@functools.cache  # many rows are asked whether they are of the same settings
+@functools.cache  # called once for each row and setting
 def _hash_setting(
     domain: str, level: str, method: str, preset: str, changes: str, seed: int
 ) -> tuple[str, str]:
-    """Returns the hashes of a configuration: of its training, and of its checkpoint played again.
+    """Returns two hashes of a configuration: for its training, and for its checkpoint played again.
 
-    `changes` is JSON: a key of the cache must be hashable.
+    `changes` is JSON, because the cache needs a hashable key.
     """
     config = change(find_preset(domain, level, method, preset), **json.loads(changes))
     again = dataclasses.replace(config, checkpoint=Path())
@@ -61,8 +61,8 @@ def select(
 ) -> dict[tuple[str, Key], list[Row]]:
     """Groups rows by level and setting, one for each seed.
 
-    Of two rows of one seed it takes the one of the training, not the one of its checkpoint played
-    again. Every level and setting has a group, which may be empty.
+    If a seed has a row of the training and a row of its checkpoint played again, takes the row of
+    the training. Every level and setting has a group, which may be empty.
     """
     ordered = sorted(rows, key=lambda row: row["train_steps"] > 0)
     by_level = {level: [row for row in ordered if row["level"] == level] for level in levels}

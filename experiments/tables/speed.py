@@ -1,4 +1,4 @@
-"""The tables of measurements: plans and training steps per second, and what searches cost."""
+"""The tables of measurements: plans and training steps per second, and the time of searches."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from leapjax.running.results import Row
 
 
 def compare_speed(rows: Sequence[Row]) -> str:
-    """Plans per second at batch 256 and alone."""
+    """Tabulates plans per second at batch 256, and the time of a single plan."""
 
     def plan(row: Row) -> tuple:
         return row["preset"], row["horizon"], row["iterations"]
@@ -24,7 +24,7 @@ def compare_speed(rows: Sequence[Row]) -> str:
 
 
 def list_planning(rows: Sequence[Row]) -> str:
-    """Every measurement of planning."""
+    """Tabulates the measurements of planning."""
     columns: Columns = {
         "preset": "`{preset}`", "T, N": "{horizon}, {iterations}", "batch": "{batch}",
         "plans/s": "{plans_per_second:,.0f}", "GFLOP/s": "{gflops:.0f}",
@@ -34,7 +34,7 @@ def list_planning(rows: Sequence[Row]) -> str:
 
 
 def compare_quality(rows: Sequence[Row]) -> str:
-    """What each way to search gives and costs, for each planner: success, steps, ms per plan."""
+    """Tabulates success, steps and milliseconds per plan of each search, for each planner."""
 
     def cell(row: Row) -> str:
         rate, milliseconds = row["successes"] / row["episodes"], 1e3 / row["plans_per_second"]
@@ -47,7 +47,7 @@ def compare_quality(rows: Sequence[Row]) -> str:
 
 
 def list_training(rows: Sequence[Row]) -> str:
-    """Every measurement of training."""
+    """Tabulates the measurements of training."""
     columns: Columns = {
         "level": "{level}",
         "preset": lambda row: (
@@ -64,7 +64,7 @@ def list_training(rows: Sequence[Row]) -> str:
 
 
 def list_parts(rows: Sequence[Row]) -> str:
-    """Where the time of a step goes, of every measurement of training."""
+    """Tabulates the parts of a training step in milliseconds, with their GFLOP/s."""
 
     def cell(part: Row) -> str:
         rate = f" ({part['gflop'] / part['ms'] * 1e3:.0f})" if part["gflop"] else ""

@@ -35,7 +35,7 @@ def make_encode_next(
 ) -> EncodeNext | None:
     """Makes an agent's `encode_next`. Its cache holds the tokens `[K, D]` of the last K states.
 
-    Returns None if the encoder has no token for each state, or if contexts hold no past.
+    Returns `None` if the encoder makes no token for each state, or if contexts hold no past.
 
     Args:
         setup: arguments of `make_agent`.

@@ -1,4 +1,4 @@
-"""What every method is made from: `Setup` and `TrainingConfig`; and the table's entry, `Method`."""
+"""The types that every method shares: `TrainingConfig`, `Setup` and `Method`."""
 
 import dataclasses
 from collections.abc import Callable
@@ -38,11 +38,11 @@ class TrainingConfig:
         betas: Decay rates of AdamW's two moments.
         weight_decay: Weight decay of all parameters but embeddings, norms and biases.
         clip: Largest global norm of the gradient; inf for no clipping.
-        windows: How training windows are drawn: by "episode", each equally often, by "step", each
-            equally often, or at the "start" of episodes.
+        windows: Where training windows start. "episode": a random step of a random episode. "step":
+            a random step of all episodes. "start": the first step of a random episode.
         microbatch: Windows whose loss a device computes at a time; 0 for all of its share.
-        consecutive: Consecutive windows in one training example, in which each state is encoded
-            once; 1 draws windows alone.
+        consecutive: Consecutive windows in a training example, which encodes each of their states
+            once; 1 draws each window by itself.
     """
 
     steps: int = 1600
@@ -149,10 +149,10 @@ class Method(NamedTuple):
 
     Attributes:
         settings: frozen dataclass of the options that only this method has.
-        make_agent: (setup, mesh of devices to train on) -> agent; mesh None: one device.
-        rewards: whether it learns from rewards; data without rewards are then refused.
+        make_agent: (setup, mesh of devices to train on) -> agent; `None` for one device.
+        rewards: whether the method learns from rewards, and so rejects data without them.
         planner: frozen dataclass of the planner's settings.
-        everywhere: whether every domain can have it, so that `--method all` includes it.
+        everywhere: whether the method works in every domain, so that `--method all` includes it.
     """
 
     settings: type
@@ -163,7 +163,7 @@ class Method(NamedTuple):
 
 
 def make_untrained_agent(energy: Energy) -> Agent:
-    """Makes an agent with an energy without parameters: they are `()`, and training keeps them."""
+    """Makes an agent from an energy with parameters `()`; training changes only the step count."""
 
     def init(key: jax.Array) -> TrainState:
         del key

@@ -14,7 +14,7 @@ BatchLoss = Callable[
     [Params, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]
 ]  # (params, extra, batch [B, ...], keys [B]) -> loss [] and metrics, means over the batch
 EncodeExamples = Callable[[Params, PyTree, PyTree], PyTree]
-# (params, extra, batch [B, ...]) -> tokens [B, ...] of the contexts of the examples
+# (params, extra, batch [B, ...]) -> tokens [B, ...] of the examples' contexts
 ExampleLoss = Callable[
     [Params, PyTree, PyTree, PyTree, jax.Array], tuple[jax.Array, dict[str, jax.Array]]
 ]  # (params, extra, example, its tokens, key) -> loss [] and metrics
@@ -23,8 +23,8 @@ ExampleLoss = Callable[
 def average_loss(setup: Setup, example_loss: ExampleLoss, encode: EncodeExamples) -> BatchLoss:
     """Makes the loss of a batch from the loss of one example.
 
-    The encoder sees all contexts of a device at once, because products of few rows are slow
-    (docs/performance.md). The loss then takes `TrainingConfig.microbatch` examples at a time.
+    The encoder reads all contexts of a device at once, because matrix products with few rows are
+    slow (docs/performance.md). The loss then takes `TrainingConfig.microbatch` examples at a time.
 
     Args:
         setup: arguments of `make_agent`.
@@ -52,11 +52,11 @@ def average_loss(setup: Setup, example_loss: ExampleLoss, encode: EncodeExamples
 def _split_into_microbatches(loss: Callable[..., Any], most: int) -> Callable[..., Any]:
     """Makes a function with the values and gradients of `loss` that needs less memory.
 
-    It computes the gradient of each microbatch together with its value, and stores the sums only.
+    It computes the value and the gradient of a microbatch before the next one, and adds them up.
 
     Args:
         loss: (params, tokens `[B, ...]`, extra, rows `[B, ...]`) -> loss `[]` and metrics, means
-            over the B examples. It is differentiated by params and tokens.
+            over the B examples. The gradients are with respect to params and tokens.
         most: largest number of examples in a microbatch; 0 for all B.
     """
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)

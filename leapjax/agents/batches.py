@@ -1,4 +1,4 @@
-"""How agents draw training batches from demonstrations, augmented as the domain says."""
+"""Draws training batches from demonstrations, and applies the domain's augmentations."""
 
 from collections.abc import Callable, Sequence
 
@@ -39,8 +39,8 @@ def window_batches(
 def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
     """Makes an agent's `batch`: (key, steps) -> runs of S consecutive windows `[B / S, S, ...]`.
 
-    All windows of a run are augmented alike. A run that reaches the end of its demonstration
-    repeats the last window.
+    All windows of a run get the same random augmentation. A run that reaches the end of its
+    demonstration repeats the last window.
     """
     domain, training = setup.domain, setup.training
 
@@ -84,7 +84,7 @@ def make_blank_steps(domain: Domain) -> Steps:
 
 
 def _check_no_runs(setup: Setup) -> None:
-    """Checks that windows are drawn alone: other methods gain nothing from runs."""
+    """Checks that windows are drawn one by one: only `run_batches` draws runs of windows."""
     if setup.training.consecutive > 1:
         raise UserError(
             f"{setup.training.consecutive} consecutive windows: only LEAP with architecture paper "
@@ -113,10 +113,10 @@ def _augment(
     """Augments a batch, with the domain's last augmentation first.
 
     Args:
-        domain: has the augmentations.
+        domain: domain whose augmentations to apply.
         keys: key of each augmentation.
         examples: windows or runs of windows, `[B, ...]`.
-        lift: turns an augmentation of a window into one of an example.
+        lift: turns an augmentation of a window into an augmentation of an example.
     """
     count = examples.actions.shape[0]
     for augment, key in reversed(list(zip(domain.augmentations.functions, keys, strict=True))):

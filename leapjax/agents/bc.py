@@ -1,4 +1,4 @@
-"""Behaviour cloning: the action that the demonstrator would take next.
+"""Behaviour cloning: predicts the demonstrator's next action.
 
 The paper's baseline is a causal transformer over the context (section 5, appendix). It learns to
 predict every action of the context from the states and actions before it.

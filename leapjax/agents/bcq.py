@@ -1,7 +1,8 @@
 """Batch-constrained Q-learning for discrete actions (Fujimoto et al., 2019).
 
-It learns a Q-function from transitions, with a model of the data's behaviour. The best next action
-must be likely in the data, because the Q-values of other actions are unknown. It acts the same way.
+It learns a Q-function and a model of the data's behaviour. The Bellman targets take the best of the
+actions that are likely in the data, because the Q-values of other actions are unknown. The agent
+acts by the same rule.
 """
 
 import dataclasses
@@ -26,10 +27,10 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options of BCQ alone. The defaults are the original's, but for the target network.
+    """The options of BCQ alone. The defaults are the original's, except the target network's.
 
     Attributes:
-        threshold: Actions less likely than this share of the likeliest are excluded.
+        threshold: Smallest probability of an allowed action, as a share of the likeliest action's.
         discount: Discount of rewards per step.
         target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
         logit_penalty: Weight of the squares of the behaviour model's logits in the loss.
@@ -65,7 +66,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         tokens: PyTree,
         key: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns the temporal difference of Q, and the cross-entropy of the behaviour."""
+        """Sums the losses of the temporal difference and of the behaviour model."""
         context = transition.context
         before, after, target_after = apply_to_transition(
             module, params, target, context, tokens, key
@@ -94,8 +95,8 @@ def mask_unlikely_values(outputs: Outputs, threshold: float) -> jax.Array:
     """Sets the Q-values `[P, A - 1]` of unlikely actions to -inf.
 
     Args:
-        outputs: Q-values and behaviour logits.
-        threshold: smallest likelihood, as a share of the likeliest action's.
+        outputs: Q-values and behaviour logits, `[P, A - 1]` each.
+        threshold: smallest probability, as a share of the likeliest action's.
     """
     likelihoods = jax.nn.softmax(outputs["behaviour"])
     likely = likelihoods >= threshold * likelihoods.max(axis=1, keepdims=True)

@@ -1,7 +1,7 @@
 """The paper's other energy: an LSTM that estimates how corrupted a plan is (appendix, ablation).
 
-It trains on plans with some actions replaced; a plan without replaced actions has the least energy.
-It plans worse than the masked language model.
+It trains on plans in which some actions are replaced; a plan without replaced actions has the least
+energy. Its plans are worse than the masked language model's.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ class Settings:
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
-    """Makes a classifier agent; of the model's settings it uses the width only."""
+    """Makes a classifier agent; it uses only the width of the model's settings."""
     sizes = setup.sizes
     module = SequenceClassifier(setup.model, sizes, setup.make_encoder())
     optimizer = make_optimizer(setup.training)
@@ -65,13 +65,13 @@ def corrupt(
 ) -> tuple[jax.Array, jax.Array]:
     """Replaces n actions of a plan by others, with n uniform in 0 .. T.
 
-    The degree of corruption is the share of actions that are not the demonstrator's. (The paper:
-    "depending on the degree of randomness".)
+    The degree of corruption is the share of actions that are not the demonstrator's. (The paper
+    says "depending on the degree of randomness".)
 
     Args:
         key: random key.
         actions: plan `[T]`.
-        imitated: booleans `[T]`: which actions are the demonstrator's.
+        imitated: booleans `[T]`, True where the action is the demonstrator's.
         num_actions: A.
 
     Returns:
@@ -91,7 +91,7 @@ def corrupt(
 def _encode_and_judge(
     module: SequenceClassifier, context: Context, actions: jax.Array
 ) -> jax.Array:
-    """Uses every parameter, to initialise them."""
+    """Uses every parameter, so that `make_init` initialises all of them."""
     return module.degree(module.encode(context), actions)
 
 

@@ -20,13 +20,13 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of CQL. The defaults are the original's, but for the target network.
+    """The options of CQL. The defaults are the original's, except the target network's.
 
-    In the authors' code, and in d3rlpy, Q-values are means of 200 quantiles, whose losses are
-    summed. An `alpha` of 4 there equals 0.04 here, where the loss is a single one.
+    In the authors' code and in d3rlpy, a Q-value is the mean of 200 quantiles, and their losses are
+    summed. Here a Q-value has a single loss, so an `alpha` of 4 there equals 0.04 here.
 
     Attributes:
-        alpha: Weight of the conservative term; 0 leaves double Q-learning.
+        alpha: Weight of the conservative term; 0 gives double Q-learning.
     """
 
     alpha: float = 0.04
@@ -40,7 +40,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     """Makes a CQL agent; its energy is minus the Q-values."""
 
     def loss(steps: TransitionOutputs, make_targets: MakeTargets, key: jax.Array) -> jax.Array:
-        """Equation 4."""
+        """Returns the losses `[P]` (Kumar et al., equation 4)."""
         del key
         # Double Q-learning: the network chooses, the target network evaluates.
         best = jnp.argmax(steps.after, axis=1)

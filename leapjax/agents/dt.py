@@ -1,7 +1,7 @@
-"""Decision Transformer (Chen et al., 2021): the action that leads to a return.
+"""Decision Transformer (Chen et al., 2021): behaviour cloning, conditioned on a return.
 
-It trains like behaviour cloning, conditioned on the return to go at each state. While acting, the
-return to go is a target return minus the return so far.
+The network reads the return to go at each state. While acting, the return to go is a target return
+minus the return so far.
 """
 
 import dataclasses

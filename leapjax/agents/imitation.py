@@ -26,9 +26,9 @@ def make_imitator(
 
     Args:
         setup: arguments of `make_agent`.
-        mesh: devices to train on; None for one device.
-        compute_returns: returns to go that the network is conditioned on; None: it has no such
-            input.
+        mesh: devices to train on; `None` for one device.
+        compute_returns: computes the returns to go that condition the network; `None` for a network
+            without this input.
     """
     choices = setup.domain.num_actions - 1  # all but the end action
     module = setup.make_policy(("logits", choices), conditioned=compute_returns is not None)
@@ -41,7 +41,7 @@ def make_imitator(
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns the cross-entropy of a context's actions and of the next action."""
+        """Returns the mean cross-entropy of a context's actions and the next action."""
         del extra
         outputs: Any = module.apply(
             params, window.context, deterministic=False, rngs={"dropout": key},

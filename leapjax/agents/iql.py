@@ -30,8 +30,8 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 class Settings:
     """The options of IQL alone.
 
-    The expectile is the IQL paper's for mazes of ants, the temperature is its value for locomotion.
-    LEAP's paper gives neither.
+    The IQL paper uses this expectile for ant mazes, and this inverse temperature for locomotion.
+    LEAP's paper gives neither value.
 
     Attributes:
         expectile: Expectile of the Q-values that the value network learns.
@@ -55,11 +55,11 @@ class Settings:
 
 
 class Networks(nn.Module):
-    """A policy and its critic: two networks without common parameters.
+    """A policy and its critic: two networks without shared parameters.
 
     Attributes:
-        policy: has the head "logits".
-        critic: has the heads "value", "q1" and "q2".
+        policy: network with the head "logits".
+        critic: network with the heads "value", "q1" and "q2".
     """
 
     policy: PolicyModel
@@ -76,7 +76,7 @@ class Networks(nn.Module):
 
         Args:
             context: context to act from.
-            tokens: encoder's tokens; None: encode the context.
+            tokens: encoder's tokens; if `None`, the policy encodes the context.
             deterministic: whether to leave out dropout.
         """
         return self.policy(context, deterministic, tokens=tokens)
@@ -110,7 +110,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.apply(params, context, tokens, method="act")
 
     def encode(params: Params, target: Params, batch: TransitionWindow) -> PyTree:
-        """Encodes with policy and critic, and with the target network before the steps."""
+        """Encodes transitions with both networks, and the states before with the target critic."""
         earlier = jax.vmap(windows.before)(batch.context)
         return (
             module.apply(params, batch.context, method="encode_transitions"),
@@ -178,7 +178,7 @@ def compute_losses(
         settings: expectile, and weights of advantages.
         value: values `[P]` of the states.
         qs: Q-values `[P, A - 1]` of each Q-function.
-        least: smallest Q-values `[P]` of the actions, over the target network's functions.
+        least: smallest Q-values `[P]` of the actions over the target network's Q-functions.
         logits: logits `[P, A - 1]` of the policy.
         taken: actions `[P]`.
         returns: Bellman targets `[P]` of the actions.

@@ -29,9 +29,10 @@ class Settings:
     Attributes:
         masking: Actions to mask in training: "one", "each", "all", "random" or "stratified". The
             function `leapjax.schedules.sample_masks` explains them.
-        end: A plan may end early. If not, padding follows the end, and the loss skips it.
-        repeat_state: Every position sees the whole state (eq. 4). If not, later ones see it without
-            the agent's pose.
+        end: Let plans end early. Otherwise padding follows a demonstration's last action, and the
+            loss skips it.
+        repeat_state: Show the whole state to every position (eq. 4). Otherwise later positions see
+            the state without the agent's pose.
         returns: Condition plans on the return to go, as Decision Transformer does.
         target_return: Return of an episode to aim for while acting. It needs `returns`.
     """
@@ -55,7 +56,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
     Args:
         setup: domain, sizes and settings.
-        mesh: devices to train on (see `leapjax.sharding`); None for one device.
+        mesh: devices to train on (see `leapjax.sharding`); `None` for one device.
     """
     sizes, masking = setup.sizes, setup.settings.masking
     conditioned = setup.settings.returns
@@ -98,11 +99,11 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         )  # fmt: skip
 
         def score(masked: jax.Array, drop_key: jax.Array) -> tuple[jax.Array, ...]:
-            # The network predicts masked actions only. With one of them it computes one position.
+            # The network predicts masked actions only: one masked action needs one position.
             single = masking in schedules.SINGLE
             positions = jnp.argmax(masked)[None] if single else jnp.arange(sizes.horizon)
             beyond = (window.actions == last) & (not setup.settings.end)
-            masked &= window.imitated  # other actions always stay visible
+            masked &= window.imitated  # actions that are not imitated always stay visible
             tokens = jnp.where(masked, mask, jnp.where(beyond, pad, window.actions))
             logits = module.apply(
                 params, memory, tokens, positions, deterministic=False, method="logits",
@@ -125,8 +126,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Averages the losses of S consecutive windows, whose states were encoded once.
 
-        So the first states of a window see the frames before the window, which encoding the window
-        alone would not show them (Atari's first three frames).
+        In Atari the first three states of a later window then contain frames from before that
+        window. Encoding the window by itself would replace these frames with black ones.
 
         Args:
             params: parameters of the network.
@@ -149,7 +150,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         del extra
         return module.apply(params, jax.vmap(windows.joined)(runs), method="encode_batch")
 
-    # The other architecture's tokens depend on the whole context, so windows cannot share them.
+    # Tokens of architecture `leapjax` depend on the whole context, so windows cannot share them.
     in_runs = setup.training.consecutive > 1 and setup.model.architecture == "paper"
     if in_runs and not setup.settings.repeat_state:
         raise UserError(

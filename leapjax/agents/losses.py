@@ -17,7 +17,7 @@ def find_actions_taken(
         context: context of the current state.
         action: action `[]` taken at the current state.
         count: P, number of states.
-        choices: number of actions that can be chosen.
+        choices: A - 1, number of actions without the end.
 
     Returns:
         Actions `[P]`, 0 before the episode began, and booleans `[P]`.
@@ -30,12 +30,12 @@ def find_actions_taken(
 def find_transition_actions(
     context: Context, count: int, choices: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Does the same as `find_actions_taken` for a transition, whose last action is in its context.
+    """Applies `find_actions_taken` to a transition, whose context holds the last action.
 
     Args:
         context: context of a `TransitionWindow`.
         count: P, number of states.
-        choices: number of actions that can be chosen.
+        choices: A - 1, number of actions without the end.
     """
     return find_actions_taken(
         context._replace(actions=context.actions[:-1]), context.actions[-1], count, choices
@@ -43,11 +43,11 @@ def find_transition_actions(
 
 
 def bellman_targets(transition: TransitionWindow, values: jax.Array, discount: float) -> jax.Array:
-    """Adds each reward and the discounted value of the next state. It passes no gradient.
+    """Adds each reward and the discounted value of the next state, without a gradient.
 
     Args:
-        transition: has the rewards. The episode can terminate at its last step only.
-        values: values of the next states, `[P]`, or N of each, `[P, N]`.
+        transition: transition with the rewards; only its last step can terminate the episode.
+        values: values `[P]` of the next states, or N values of each, `[P, N]`.
         discount: discount per step.
 
     Returns:
@@ -59,12 +59,12 @@ def bellman_targets(transition: TransitionWindow, values: jax.Array, discount: f
 
 
 def average_where(values: jax.Array, known: jax.Array) -> jax.Array:
-    """Averages values `[P]` where `known [P]` is True, which it is at least once."""
+    """Averages values `[P]` where `known [P]` is True; at least one element must be."""
     return jnp.where(known, values, 0).sum() / known.sum()
 
 
 def select_values(values: jax.Array, actions: jax.Array) -> jax.Array:
-    """Selects the values of actions: `[P, choices, ...]` and `[P]` to `[P, ...]`."""
+    """Selects from values `[P, choices, ...]` the values `[P, ...]` of actions `[P]`."""
     chosen = jnp.expand_dims(actions, range(1, values.ndim))
     return jnp.take_along_axis(values, chosen, axis=1)[:, 0]
 
@@ -77,7 +77,7 @@ def imitation_loss(
     Args:
         logits: logits `[P, choices]`.
         actions: actions `[P]`.
-        known: booleans `[P]`: which actions count.
+        known: booleans `[P]`, True where an action counts.
     """
     likelihoods = select_values(jax.nn.log_softmax(logits), actions)
     hits = jnp.argmax(logits, axis=1) == actions
@@ -85,7 +85,7 @@ def imitation_loss(
 
 
 def expectile_loss(differences: jax.Array, share: float) -> jax.Array:
-    """Returns the asymmetric squares whose mean is least at an expectile.
+    """Returns asymmetrically weighted squares; an expectile minimises their mean.
 
     Source: Kostrikov et al., Implicit Q-Learning, equation 5.
 
@@ -99,13 +99,13 @@ def expectile_loss(differences: jax.Array, share: float) -> jax.Array:
 def quantile_huber_loss(estimates: jax.Array, targets: jax.Array, kappa: float = 1.0) -> jax.Array:
     """Returns the loss `[P]` that is least where the estimates are quantiles of the targets.
 
-    It is the sum over estimates of the mean over targets. Source: Dabney et al., Distributional
+    It averages over the targets and sums over the estimates. Source: Dabney et al., Distributional
     Reinforcement Learning with Quantile Regression, equation 10 and algorithm 1.
 
     Args:
         estimates: estimates `[P, N]` of the N quantiles.
         targets: samples `[P, M]`.
-        kappa: the loss is quadratic where estimate and target differ by less.
+        kappa: difference of estimate and target below which the loss is quadratic.
     """
     count = estimates.shape[1]
     shares = (jnp.arange(count) + 0.5) / count  # lemma 2
@@ -116,7 +116,7 @@ def quantile_huber_loss(estimates: jax.Array, targets: jax.Array, kappa: float =
         weights = jnp.abs(shares - (errors < 0))
         return total + weights * optax.losses.huber_loss(errors, delta=kappa), None
 
-    # The scan takes one target at a time, and recomputes it for the gradient: XLA on a CPU takes
-    # twenty times as long for a sum over [P, N, M].
+    # The scan takes a target at a time, and computes its loss again for the gradient. On a CPU, XLA
+    # takes twenty times as long for a sum over [P, N, M].
     total, _ = jax.lax.scan(add, jnp.zeros_like(estimates), targets.T)
     return total.sum(axis=1) / targets.shape[1]

@@ -4,10 +4,10 @@ An ensemble learns to predict steps. A policy, here IQL's as in the paper (appen
 the data and from imagined steps. The ensemble's disagreement lowers the reward of an imagined step,
 so the policy stays near the data.
 
-Imagined states are features of the network, not observations, so every domain works. The ensemble
-predicts the features of the next state in a slowly moving target network. The losses of values and
-of imitation shape the features. The policy only reads them, because its weighted gradients are so
-much larger.
+The ensemble predicts features of the network instead of observations, so it works in every domain.
+Its targets are the features of the next state in a slowly moving target network. The losses of
+values and of imitation train the features. The policy's loss does not train them, because its
+weighted gradients are much larger.
 """
 
 import dataclasses
@@ -33,13 +33,13 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings(iql.Settings):
-    """The options of MOPO, beside the options of its IQL.
+    """The options of MOPO, in addition to the options of IQL.
 
     Attributes:
         members: Dynamics models in the ensemble.
         rollout: Steps to imagine from the current state of each context.
         penalty: Weight of the ensemble's disagreement, subtracted from imagined rewards.
-        real_share: Weight of the data's loss; imagined steps have the rest.
+        real_share: Weight of the loss on data, in 0 .. 1; imagined steps have the other weight.
     """
 
     members: int = 5
@@ -56,12 +56,12 @@ class Settings(iql.Settings):
 
 
 class Predicted(NamedTuple):
-    """The predictions of M members for steps from P states.
+    """The predictions of M ensemble members for one step from each of P states.
 
     Attributes:
         features: features `[M, P, D]` of the next states.
         reward: rewards `[M, P]`.
-        ending: logits `[M, P]` of the end of the episode.
+        ending: logits `[M, P]` that the episode ends with the step.
     """
 
     features: jax.Array
@@ -74,7 +74,7 @@ class Networks(nn.Module):
 
     Attributes:
         trunk: network with the head "features".
-        choices: number of actions that can be chosen.
+        choices: A - 1, number of actions without the end.
         members: M, number of dynamics models.
     """
 
@@ -96,7 +96,7 @@ class Networks(nn.Module):
         self.dynamics = ensemble(width + 2, 2 * width)
 
     def __call__(self, context: Context) -> PyTree:
-        """Uses every parameter, to initialise them."""
+        """Uses every parameter, so that `make_init` initialises all of them."""
         features = self.features(context)
         actions = jnp.zeros(features.shape[0], jnp.int32)
         logits = self.logits(features), self.behaviour(features)
@@ -111,7 +111,7 @@ class Networks(nn.Module):
 
         Args:
             context: context to act from.
-            tokens: encoder's tokens; None: encode the context.
+            tokens: encoder's tokens; if `None`, the network encodes the context.
         """
         return {"logits": self.logits(self.norm(self.trunk(context, tokens=tokens)["features"]))}
 
@@ -144,14 +144,14 @@ class Networks(nn.Module):
         return self.value(features)[:, 0], first, second
 
     def predict(self, features: jax.Array, actions: jax.Array) -> Predicted:
-        """Predicts the steps of actions `[P]` with each member."""
+        """Predicts with each member the steps that actions `[P]` take from P states."""
         chosen = jax.nn.one_hot(actions, self.choices)
         steps = self.dynamics(jnp.concatenate([features, chosen], axis=1))  # [M, P, D + 2]
         return Predicted(features + steps[..., :-2], steps[..., -2], steps[..., -1])
 
 
 class _Perceptron(nn.Module):
-    """Two layers."""
+    """A perceptron with one hidden layer."""
 
     features: int
     hidden: int
@@ -194,8 +194,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         Args:
             params: parameters of the network.
             target: parameters of the target network.
-            features: features `[P, D]` of the states in the network.
-            target_features: features `[P, D]` of the states in the target network.
+            features: the network's features `[P, D]` of the states.
+            target_features: the target network's features `[P, D]` of the states.
             taken: actions `[P]`.
             returns: Bellman targets `[P]` of the actions.
         """
@@ -208,7 +208,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     def imagine(
         params: Params, target: Params, features: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Imagines a rollout from features `[P, D]`: its mean loss and mean disagreement."""
+        """Imagines a rollout from features `[P, D]`; returns its mean loss and disagreement."""
 
         def step(
             carry: tuple[jax.Array, jax.Array], step_key: jax.Array
@@ -247,7 +247,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         tokens: PyTree,
         key: jax.Array,
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Sums the losses of the policy, on data and imagined steps, and of the ensemble."""
+        """Sums IQL's losses on data and imagined steps, the ensemble's loss, and imitation's."""
         context = transition.context
         drop_key, rollout_key = jax.random.split(key)
         options = {"deterministic": False, "rngs": {"dropout": drop_key}}

@@ -28,5 +28,5 @@ def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
 
 
 def mask_decayed_parameters(params: Params) -> Params:
-    """Marks the parameters that decay with True: all but embeddings, norms and biases."""
+    """Returns True for parameters with weight decay: all but embeddings, norms and biases."""
     return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key not in UNDECAYED, params)

@@ -59,7 +59,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     ) -> jax.Array:
         result = module.apply(params, memory, actions, positions, method="logits")
         assert isinstance(result, jax.Array)
-        # After an end only the end can follow; training skips these positions.
+        # Only the end can follow an end; training skips these positions.
         ended = jnp.cumsum(actions == last) - (actions == last) > 0
         goes_on = jnp.where(jnp.arange(sizes.num_actions) == last, 0.0, -jnp.inf)
         return jnp.where(ended[positions, None], goes_on, result)
@@ -97,7 +97,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
 
 
 def _encode_and_score(module: AlternatingModel, context: Context, actions: jax.Array) -> PyTree:
-    """Uses every parameter, to initialise them."""
+    """Uses every parameter, so that `make_init` initialises all of them."""
     states, before = module.encode(context)
     plan = jnp.concatenate([states, jnp.zeros((actions.shape[0] - 1, states.shape[1]))])
     return module.read(plan, jnp.concatenate([before, actions[:-1]]))

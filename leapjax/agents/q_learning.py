@@ -1,4 +1,4 @@
-"""The agent that CQL, QR-DQN and REM share: it learns Q-values, and acts by the highest."""
+"""The agent that CQL, QR-DQN and REM share: it learns Q-values, and chooses the highest."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,10 +23,10 @@ from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """The options that every such method has.
+    """The options that CQL, QR-DQN and REM share.
 
-    The originals copy the network to the target network every few thousand steps: 8,000 in Agarwal
-    et al., 2,000 in d3rlpy.
+    The target network moves a little at every step. The originals copy the network to it instead,
+    every 8,000 steps (Agarwal et al.) or every 2,000 steps (d3rlpy).
 
     Attributes:
         discount: Discount of rewards per step.
@@ -46,8 +46,8 @@ class TransitionOutputs(NamedTuple):
 
     Attributes:
         before: outputs `[P, W]` at the P states before the steps.
-        after: outputs `[P, W]` at the states after them.
-        target_after: outputs `[P, W]` of the target network at the states after them.
+        after: outputs `[P, W]` at the states after the steps.
+        target_after: outputs `[P, W]` of the target network at the states after the steps.
         actions: actions `[P]` of the steps, int32.
     """
 
@@ -104,7 +104,7 @@ def apply_to_transition(
 MakeTargets = Callable[[jax.Array], jax.Array]
 # values of the states after the steps, [P] or [P, N] -> Bellman targets of the same shape
 Loss = Callable[[TransitionOutputs, MakeTargets, jax.Array], jax.Array]
-# (outputs, make_targets, key) -> [P]
+# (outputs, make_targets, key) -> losses [P]
 
 
 def make_agent(
@@ -118,9 +118,9 @@ def make_agent(
 
     Args:
         setup: arguments of a method's `make_agent`.
-        mesh: devices to train on; None for one device.
+        mesh: devices to train on; `None` for one device.
         width: W, number of outputs of the network at a state.
-        loss: loss `[P]` of the steps of a transition.
+        loss: computes the losses `[P]` of a transition's steps.
         read_values: outputs `[P, W]` -> Q-values `[P, A - 1]`.
     """
     settings, choices = setup.settings, setup.domain.num_actions - 1  # all but the end action

@@ -1,6 +1,6 @@
 """Distributional Q-learning by quantile regression (Dabney et al., 2018).
 
-It learns quantiles of the return of each action, and acts by their mean.
+It learns quantiles of the return of each action, and chooses the action with the highest mean.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of QR-DQN. The defaults are the paper's, but for the target network.
+    """The options of QR-DQN. The defaults are the original's, except the target network's.
 
     Attributes:
         quantiles: Number of quantiles of each action's return.
@@ -28,7 +28,7 @@ class Settings(q_learning.Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # The loss compares all pairs of them.
+        # The loss compares all pairs of quantiles.
         check_at_least(self, 1, "quantiles", most=1000)
 
 
@@ -43,7 +43,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return read_quantiles(outputs).mean(axis=2)
 
     def loss(steps: TransitionOutputs, make_targets: MakeTargets, key: jax.Array) -> jax.Array:
-        """Algorithm 1."""
+        """Returns the losses `[P]` (Dabney et al., algorithm 1)."""
         del key
         best = jnp.argmax(read_values(steps.target_after), axis=1)
         targets = make_targets(

@@ -1,4 +1,4 @@
-"""Uniform random actions: the floor of every table."""
+"""Uniform random actions: the lowest baseline of every table."""
 
 import dataclasses
 

@@ -1,7 +1,7 @@
 """Random ensemble mixture (Agarwal et al., 2020).
 
-One network has many Q-functions. In every step a new random mixture of them must satisfy the
-Bellman equation. It acts by their mean.
+One network has many Q-functions. Each training step minimises the Bellman error of a random mixture
+of them. The agent chooses the action with the highest mean.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from leapjax.types import Agent
 
 @dataclasses.dataclass(frozen=True)
 class Settings(q_learning.Settings):
-    """The options of REM. The defaults are the original's, but for the target network.
+    """The options of REM. The defaults are the original's, except the target network's.
 
     Attributes:
         q_heads: Number of Q-functions.
@@ -41,9 +41,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return outputs.reshape(-1, choices, count) @ weights  # [P, A - 1]
 
     def loss(steps: TransitionOutputs, make_targets: MakeTargets, key: jax.Array) -> jax.Array:
-        """Returns the Bellman error of one mixture, which stands on both sides of the equation."""
-        # Each example draws its own mixture; the original draws one for a batch. The expected loss
-        # is equal, and its variance is smaller.
+        """Returns the losses `[P]` of a mixture that gives both the estimates and the targets."""
+        # Each example draws its own mixture; the original draws a single mixture for a batch. The
+        # expected loss is equal, and its variance is smaller.
         weights = draw_mixture(key, count)
         targets = make_targets(mix(steps.target_after, weights).max(axis=1))
         estimates = losses.select_values(mix(steps.before, weights), steps.actions)

@@ -9,14 +9,15 @@ from leapjax.agents.base import Setup
 from leapjax.types import Context
 
 ComputeReturns = Callable[..., jax.Array | None]
-# (context, return to go of the demonstration's current state; None while acting) -> the returns
-# to go [K + 1] that the network is conditioned on, or None
+# (context, return to go at a demonstration's current state) -> returns to go [K + 1] for the
+# network, or `None` if it has no such input. While acting, the second argument is `None`.
 
 
 def condition_on_target(setup: Setup) -> ComputeReturns:
-    """Makes the returns to go of a conditioned network, at the past states and the current one.
+    """Makes a function that computes the returns to go at the past states and the current one.
 
-    While acting, the current return to go is the target return minus the return so far.
+    While acting, the current return to go is the target return minus the return so far. The
+    function divides all returns by `Domain.scaling.returns`.
     """
 
     def compute(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
@@ -28,7 +29,7 @@ def condition_on_target(setup: Setup) -> ComputeReturns:
 
 
 def omit_returns(context: Context, return_to_go: jax.Array | None = None) -> None:
-    """Returns None, for a network that is not conditioned on returns."""
+    """Returns `None`, for a network that is not conditioned on returns."""
     del context, return_to_go
 
 

@@ -1,4 +1,4 @@
-"""Planning by the rules of a domain, written as an energy; it learns from no data."""
+"""Plans by a domain's rules, which are written as an energy; needs no training data."""
 
 import dataclasses
 

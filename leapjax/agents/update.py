@@ -18,7 +18,7 @@ Update = Callable[[TrainState, PyTree, jax.Array], tuple[TrainState, dict[str, j
 
 
 def apply_to_context(module: nn.Module, context: Context, actions: jax.Array) -> PyTree:
-    """Uses every parameter of a network that reads a context only: a `touch` of `make_init`."""
+    """Applies a network to a context, which uses every parameter: a `touch` of `make_init`."""
     del actions
     return module(context)
 
@@ -35,9 +35,9 @@ def make_init(
     Args:
         setup: arguments of `make_agent`.
         module: network.
-        touch: (module, context, actions `[T]`) -> anything; uses every parameter.
+        touch: (module, context, actions `[T]`) -> anything; must use every parameter.
         optimizer: optimizer of the parameters.
-        target: (params) -> the parameters of the target network, the state's `extra`.
+        target: (params) -> parameters of the target network, which become the state's `extra`.
     """
 
     def init(key: jax.Array) -> TrainState:
@@ -62,8 +62,8 @@ def make_update(
     Args:
         batch_loss: loss of the examples of one device.
         optimizer: optimizer of the parameters.
-        mesh: devices that share the batch, and the state as `sharding.parameter_specs` splits it;
-            None for one device.
+        mesh: devices that split the batch, and the state by `sharding.parameter_specs`; `None` for
+            one device.
         next_extra: (extra, new parameters) -> the state's `extra` after the step.
     """
 
@@ -118,8 +118,8 @@ def follow_parameters(
     """Makes the `next_extra` of a slowly moving target network (Lillicrap et al., 2016).
 
     Args:
-        rate: share of the way to the network's parameters that a step goes, in 0 .. 1.
-        select: (params) -> the parameters that the target network has.
+        rate: share of the distance to the network's parameters that a step covers, in 0 .. 1.
+        select: (params) -> the parameters to follow.
     """
 
     def step(target: PyTree, params: Params) -> PyTree:

@@ -1,8 +1,14 @@
-"""Checkpoints: Orbax stores the arrays, a seal says whose they are. Nothing is ever unpickled.
+"""Checkpoints: Orbax stores the arrays, and a seal ties them to their configuration.
 
-`states` saves and restores the training states of a run, `parameters` those of a model alone.
-`sealing` checks that the numbers are intact and belong to the configuration, `contents` reads
-shapes without arrays, `damage` sets damaged checkpoints aside, `paths` names folders and steps.
+Reading a checkpoint unpickles no object. The modules:
+
+- `states` saves and restores the training states of a run.
+- `parameters` saves and restores the parameters of a model alone.
+- `sealing` checks that the numbers are intact and belong to the configuration.
+- `contents` reads shapes without arrays.
+- `damage` sets damaged checkpoints aside.
+- `paths` checks the names of folders and lists their steps.
+- `logs` drops the warnings of Orbax.
 """
 
 from leapjax.checkpoints.logs import hush_orbax

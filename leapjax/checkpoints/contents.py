@@ -1,4 +1,4 @@
-"""The arrays of a checkpoint on disk: their paths and shapes, without their numbers."""
+"""Reads the paths and shapes of the arrays in a checkpoint, without their numbers."""
 
 import json
 from pathlib import Path
@@ -16,12 +16,12 @@ Shapes = dict[str, tuple[int, ...]]  # by the path of an array in its tree, such
 
 
 def read_shapes(checkpoint: Path) -> Shapes:
-    """Reads the shapes of the arrays in a checkpoint, and not the arrays.
+    """Reads the shapes of the arrays in a checkpoint, without the arrays.
 
-    (Orbax's `metadata` does the same, but leaks a megabyte each time.)
+    Orbax's `metadata` reads them too, but leaks a megabyte at every call.
 
     Raises:
-        ValueError: there are no arrays, or a chunk of one is larger than the array.
+        ValueError: there are no arrays, or an array has chunks larger than itself.
     """
     store = _open_store(checkpoint)
     shapes = {}
@@ -56,7 +56,7 @@ def _open_store(checkpoint: Path) -> tensorstore.KvStore:
 
 
 def check_shapes(found: Shapes, like: PyTree, checkpoint: Path) -> None:
-    """Checks that the arrays of a checkpoint have the paths and shapes of those of `like`.
+    """Checks that the arrays of a checkpoint have the paths and shapes of the arrays in `like`.
 
     Raises:
         UserError: names the first array that differs.

@@ -10,12 +10,15 @@ PASSING = {errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM}
 
 
 def is_damage(error: Exception) -> bool:
-    """Returns whether a failed read means damage, and not a lack of memory, files or permission."""
+    """Returns whether a failed read means damage, not a lack of memory, files or permission."""
     return not isinstance(error, MemoryError) and getattr(error, "errno", None) not in PASSING
 
 
 def set_aside(checkpoint: Path) -> Path:
-    """Renames a damaged checkpoint to `<step>.damaged`, replacing that; returns the new path."""
+    """Renames a damaged checkpoint to `<step>.damaged` and returns the new path.
+
+    Replaces an older folder of this name.
+    """
     aside = checkpoint.with_name(f"{checkpoint.name}.damaged")
     shutil.rmtree(aside, ignore_errors=True)
     checkpoint.rename(aside)

@@ -1,4 +1,4 @@
-"""What Orbax logs."""
+"""Filters the messages that Orbax logs."""
 
 import functools
 import logging

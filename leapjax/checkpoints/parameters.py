@@ -60,14 +60,14 @@ def restore_params(
     Warns of each damaged checkpoint that it skips.
 
     Args:
-        folder: of checkpoints.
+        folder: folder of checkpoints.
         like: parameters of the same structure and shapes.
-        identity: of their configuration.
-        step: of the checkpoint; None for the newest that can be read.
+        identity: identity of their configuration.
+        step: step of the checkpoint; `None` for the newest readable checkpoint.
 
     Raises:
-        UserError: there is no checkpoint, none can be read, or the arrays have other shapes or
-            another identity.
+        UserError: there is no readable checkpoint, or its arrays have other shapes or another
+            identity.
         Unfinished: the checkpoint of `step` does not exist, or cannot be read.
     """
     hush_orbax()
@@ -115,9 +115,9 @@ def save_params(folder: Path, params: PyTree, identity: str, step: int) -> None:
     """Writes parameters alone, for `restore_params`.
 
     Args:
-        folder: of checkpoints; the others in it are removed.
+        folder: folder of checkpoints; its other checkpoints are removed.
         params: parameters to write.
-        identity: of their configuration.
+        identity: identity of their configuration.
         step: number of training steps of the parameters.
 
     Raises:
@@ -131,7 +131,7 @@ def _find_steps(folder: Path) -> list[int]:
     """Returns the steps of the checkpoints in a folder, the newest first.
 
     Raises:
-        UserError: there are none.
+        UserError: the folder has no checkpoint.
     """
     steps = find_newest(folder)
     if not steps:

@@ -1,4 +1,4 @@
-"""Folders of checkpoints: which names work, and which steps are in them."""
+"""Checks the names of folders of checkpoints, and lists the steps in them."""
 
 import glob
 from pathlib import Path
@@ -10,10 +10,10 @@ from leapjax.errors import UserError, first_line
 
 
 def check_path(folder: Path) -> None:
-    """Checks that TensorStore and Orbax read the name of a folder as it is meant.
+    """Checks that TensorStore and Orbax read the name of a folder literally.
 
     Raises:
-        UserError: they do not, so they would not find the checkpoints; says how they read it.
+        UserError: they read another name, and so would not find the checkpoints; says how.
     """
     path = str(to_absolute(files.check_path(folder)))
     try:  # TensorStore turns a backslash into a slash
@@ -45,7 +45,7 @@ def find_newest(folder: Path) -> list[int]:
         names = [path.name for path in folder.iterdir()]
     except OSError as error:
         raise UserError(f"cannot read {folder}: {first_line(error)}") from None
-    # `isdecimal` alone would accept the digits of every script, and any number of them.
+    # `isdecimal` alone would accept digits of every script, and names of any length.
     steps = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) < 20]
     return sorted(steps, reverse=True)
 

@@ -1,4 +1,4 @@
-"""Seals: hashes that show whether a checkpoint is intact, and to which configuration it belongs."""
+"""Seals checkpoints: hashes show whether numbers are intact and belong to a configuration."""
 
 import hashlib
 from pathlib import Path
@@ -14,7 +14,7 @@ from leapjax.types import PyTree
 def seal(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
     """Adds the SHA-256 of the arrays of each part, and the digest of an identity.
 
-    The format of Orbax detects damage to its own structure, but not to the numbers.
+    Orbax's format detects damage to its structure, but not to the numbers.
     """
     return {
         **parts,
@@ -24,11 +24,11 @@ def seal(parts: dict[str, PyTree], identity: str) -> dict[str, PyTree]:
 
 
 def unseal(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, PyTree]:
-    """Checks what `seal` added and returns the parts alone.
+    """Checks the hashes that `seal` added, and returns the parts without them.
 
     Raises:
         ValueError: the numbers are damaged.
-        UserError: the numbers are intact, but the identity is another.
+        UserError: the numbers are intact, but belong to another identity.
     """
     parts = {name: part for name, part in saved.items() if name not in ("digests", IDENTITY)}
     for name, part in parts.items():
@@ -39,7 +39,7 @@ def unseal(saved: dict[str, PyTree], identity: str, path: Path) -> dict[str, PyT
 
 
 def check_same(saved: np.ndarray, identity: str, checkpoint: Path) -> None:
-    """Checks that the saved digest `[32]` is that of an identity.
+    """Checks that a saved digest `[32]` belongs to an identity.
 
     Raises:
         UserError: the checkpoint was saved with another identity.

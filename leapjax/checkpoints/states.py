@@ -30,10 +30,12 @@ class Checkpoints:
     Saving is asynchronous and atomic: a killed program loses only the steps since the last
     checkpoint. A checkpoint holds whole arrays, so a run can resume with another number of
     devices or processes. The first process reads and writes; all processes must call every
-    method but `close`.
+    method except `close`.
 
-    A checkpoint belongs to a configuration: restoring raises UserError if the `identity` is not
-    the one it was saved with.
+    Args:
+        folder: folder of the checkpoints.
+        identity: identity of the configuration; restoring with another identity raises UserError.
+        keep: number of checkpoints to keep, the newest.
     """
 
     def __init__(self, folder: Path, identity: str = "", keep: int = 2) -> None:
@@ -42,7 +44,7 @@ class Checkpoints:
         self._folder = to_absolute(folder)
         self._identity = identity
         self._keep = keep
-        self._saved: int | None = None  # the last step, until it is found on disk
+        self._saved: int | None = None  # the last step, until `_finish` finds it on disk
         if processes.is_first():
             self._manager = self._open()
 
@@ -61,7 +63,7 @@ class Checkpoints:
 
     @property
     def latest(self) -> int | None:
-        """Step of the newest checkpoint, or None."""
+        """Step of the newest checkpoint, or `None`."""
         return processes.run_on_first(lambda: self._manager.latest_step())
 
     def save(self, state: TrainState) -> None:
@@ -70,7 +72,7 @@ class Checkpoints:
         Raises:
             UserError: this state, or the one before it, cannot be written.
         """
-        # Copied: on a CPU they may be the device's own buffers, which training reuses.
+        # Copied: on a CPU the arrays may share the device's buffers, which training reuses.
         values = jax.tree.map(np.array, sharding.to_host(state))
 
         def write() -> None:
@@ -86,12 +88,12 @@ class Checkpoints:
     def restore(
         self, like: TrainState, skipped: Callable[[str], Any] = warnings.warn
     ) -> TrainState | None:
-        """Reads the newest intact state, or returns None if there is none.
+        """Reads the newest intact state; returns `None` if no state is intact.
 
-        Renames each damaged checkpoint to `<step>.damaged`, and tries the one before.
+        Renames each damaged checkpoint to `<step>.damaged`, and tries the previous checkpoint.
 
         Args:
-            like: a state of this configuration, for the structure and the placement on devices.
+            like: state of this configuration, for the structure and the placement on devices.
             skipped: called with one line for each damaged checkpoint.
 
         Raises:
@@ -110,7 +112,7 @@ class Checkpoints:
         return sharding.place(values, jax.tree.map(lambda leaf: leaf.sharding, like))
 
     def _read(self, like: TrainState, skipped: Callable[[str], Any]) -> list[TrainState]:
-        """Reads the newest intact state as NumPy arrays: a list of it, or an empty one."""
+        """Returns a list with the newest intact state, as NumPy arrays, or an empty list."""
         self._finish()  # the newest state may still be being written
         while (latest := self._manager.latest_step()) is not None:
             path = self._folder / str(latest)
@@ -138,8 +140,8 @@ class Checkpoints:
     def close(self) -> None:
         """Waits until all states are on disk, then closes the folder.
 
-        Only this method does not communicate with other processes, so it can also end a run that
-        failed in one of them.
+        This is the only method that does not communicate with other processes. So it can also end
+        a run that failed in a single process.
 
         Raises:
             UserError: a state cannot be written, or is not found after writing.

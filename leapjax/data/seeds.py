@@ -6,34 +6,34 @@ from collections.abc import Iterator
 from leapjax.checks import check_integer
 from leapjax.errors import UserError
 
-# Test levels come first, so that anyone's `--test-seed 1000` is a test episode. The first
-# thousands were played while methods were developed; results are measured from here on.
+# Test levels come first, so that `--test-seed 1000` names a test level. Development of the methods
+# used the first thousands; results are measured from `UNSEEN` on.
 UNSEEN = 10_000_000
 VALIDATION_START = 100_000_000
 TRAINING_START = 200_000_000
-TRAINING_STRIDE = 1_000_000  # level seeds of one training seed
+TRAINING_STRIDE = 1_000_000  # level seeds per training seed
 MAX_TRAINING_SEED = 1_000
 
 
 def test_seeds(first: int, episodes: int) -> range:
-    """Level seeds of the test episodes: the same for every method and training seed.
+    """Returns the level seeds of the test episodes, equal for every method and training seed.
 
     Raises:
-        UserError: none, or seeds that training or validation may use.
+        UserError: there are no episodes, or the seeds reach those for validation or training.
     """
     return _make_range(first, episodes, 0, VALIDATION_START, "test")
 
 
 def validation_seeds(first: int, episodes: int) -> range:
-    """Level seeds on which choices are made."""
+    """Returns level seeds of the validation episodes, on which settings are chosen."""
     return _make_range(first, episodes, VALIDATION_START, TRAINING_START, "validation")
 
 
 def training_seeds(seed: int) -> Iterator[int]:
-    """Level seeds for the demonstrations of one training seed.
+    """Returns the level seeds for the demonstrations of one training seed.
 
     Raises:
-        UserError: a training seed out of range.
+        UserError: the training seed is out of range.
     """
     seed = check_integer("a training seed", seed, 0, MAX_TRAINING_SEED - 1)
     start = TRAINING_START + seed * TRAINING_STRIDE
@@ -41,10 +41,10 @@ def training_seeds(seed: int) -> Iterator[int]:
 
 
 def check_disjoint(demonstrations: list[int], episodes: range) -> None:
-    """Refuses evaluation on a level that a demonstration came from.
+    """Checks that no demonstration comes from a level of the evaluation.
 
     Raises:
-        UserError: a shared seed.
+        UserError: a level seed is in both.
     """
     shared = [seed for seed in demonstrations if seed in episodes]
     if shared:
@@ -56,10 +56,10 @@ def check_disjoint(demonstrations: list[int], episodes: range) -> None:
 
 
 def _make_range(first: int, episodes: int, low: int, high: int, kind: str) -> range:
-    """So many level seeds from `low + first` on.
+    """Returns `episodes` level seeds, from `low + first` on.
 
     Raises:
-        UserError: not integers, none, or seeds that reach `high`.
+        UserError: a number is not an integer, there are no episodes, or the seeds reach `high`.
     """
     episodes = check_integer(f"the number of {kind} episodes", episodes, 1)
     first = check_integer(f"the first {kind} seed", first, 0, high - low - 1)

@@ -1,4 +1,4 @@
-"""Demonstrations of environments that know the solution of an episode when it begins."""
+"""Collects demonstrations of environments that know the solution of an episode at its start."""
 
 import itertools
 from collections.abc import Callable
@@ -29,7 +29,7 @@ def collect_solved(
         make_adapter: makes the environment.
         solve: returns the actions that solve an environment after its reset.
         count: number of demonstrations.
-        seed: of the training run; see `leapjax.data.seeds`.
+        seed: training seed; see `leapjax.data.seeds`.
         progress: called with the number of demonstrations so far.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Windows of demonstrations: what one training example is, and how a batch is drawn.
+"""Windows of demonstrations: the training examples, and how to draw a batch of them.
 
-A window starts at one step of one demonstration. It holds the K steps before it, the
-state there, and the T actions from there on; past the end of the demonstration the action
-is `end`, predicted like any other. States after the start never enter (paper, eq. 4).
+A window starts at one step of one demonstration. It holds the K steps before this step, the state
+at the step, and the next T actions. After the end of the demonstration every action is `end`; the
+model predicts it like other actions. States after the start never enter (paper, eq. 4).
 """
 
 import hashlib
@@ -21,32 +21,47 @@ SAMPLINGS = ("episode", "step", "start")
 
 
 class Steps(NamedTuple):
-    """All steps of all demonstrations, one after the other: M steps of E episodes.
+    """The steps of all demonstrations, one after the other: M steps of E episodes.
 
-    Behind them the arrays may be padded (see `concatenate`).
+    The arrays may have padding after the last step (see `concatenate`).
+
+    Attributes:
+        observations: `[M + E, ...]` the states of each episode, with its last state.
+        state: `[M]` int32, index in `observations` of the state before each action. The state after
+            the action comes next.
+        actions: `[M]` int32.
+        rewards: `[M]` float32.
+        return_so_far: `[M]` float32, sum of the episode's rewards before this step.
+        terminated: `[M]` bool, whether the episode came to its end with this step.
+        step: `[M]` int32, steps since the episode began.
+        remaining: `[M]` int32, number of the episode's actions from this step on.
+        starts: `[E]` int32, index of each episode's first step.
+        lengths: `[E]` int32, number of each episode's actions.
+        count: `[]` int32, M.
+        extras: `[M, ...]` arrays that the domain's augmentations need; no model sees them.
     """
 
-    observations: PyTree  # [M + E, ...] the states of each episode, its last one included
-    state: Array  # [M] int32: where in them the state before each action is; after it: + 1
-    actions: Array  # [M] int32
-    rewards: Array  # [M] float32
-    return_so_far: Array  # [M] float32: the sum of the episode's rewards before this step
-    terminated: Array  # [M] bool: the episode came to its end with this step
-    step: Array  # [M] int32: steps since the episode began
-    remaining: Array  # [M] int32: actions of the episode from here on, this one included
-    starts: Array  # [E] int32: the index of each episode's first step
-    lengths: Array  # [E] int32: its number of actions
-    count: Array  # [] int32: M
-    extras: PyTree  # [M, ...] what the domain's augmentation must know; no model sees it
+    observations: PyTree
+    state: Array
+    actions: Array
+    rewards: Array
+    return_so_far: Array
+    terminated: Array
+    step: Array
+    remaining: Array
+    starts: Array
+    lengths: Array
+    count: Array
+    extras: PyTree
 
 
 def fingerprint(steps: PyTree) -> str:
-    """A name for exactly this data: sixteen hexadecimal digits."""
+    """Returns sixteen hexadecimal digits that identify the data."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(steps):
         array = np.ascontiguousarray(leaf)
         digest.update(f"{array.dtype}{array.shape}".encode())
-        # Not `tobytes`, which copies: the frames of games are gigabytes.
+        # `tobytes` would copy the data, and frames of games are gigabytes.
         digest.update(array.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()[:16]
 
@@ -56,13 +71,13 @@ def concatenate(
     extras: Callable[[Demonstration], PyTree] = lambda demonstration: (),
     padded: bool = False,
 ) -> Steps:
-    """Lays demonstrations out for `window`.
+    """Joins demonstrations into one `Steps`, from which `window` reads.
 
     Args:
-        demonstrations: at least one.
-        extras: of a demonstration, `[n, ...]` (`Domain.extras`).
-        padded: to arrays whose lengths are powers of two. Programs are compiled for lengths: those
-            for one training seed then serve most others.
+        demonstrations: at least one demonstration.
+        extras: (demonstration) -> arrays `[n, ...]` for `Steps.extras` (see `Augmentations`).
+        padded: whether to pad arrays to lengths that are powers of two. Programs are compiled for
+            one length; with padding, the programs for one training seed serve most others.
     """
     lengths = np.array([len(d.actions) for d in demonstrations], np.int32)
     episode = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
@@ -93,7 +108,7 @@ def concatenate(
 
 
 def unpadded(steps: Steps) -> Steps:
-    """The same steps without what is behind them: views, nothing is copied."""
+    """Returns the steps without their padding, as views: it copies no array."""
     count, episodes = int(steps.count), len(steps.starts)
     whole = {name: getattr(steps, name) for name in ("starts", "lengths", "count")}
     observations = jax.tree.map(lambda leaf: leaf[: count + episodes], steps.observations)
@@ -103,7 +118,7 @@ def unpadded(steps: Steps) -> Steps:
 
 
 def _joined(parts: Sequence[Array], padded: bool) -> np.ndarray:
-    """Arrays one after the other, copied once: the frames of games are gigabytes, in a file."""
+    """Concatenates arrays, and copies them once: frames of games are gigabytes in a file."""
     if not padded:
         return np.concatenate(parts)
     arrays = [np.asarray(part) for part in parts]
@@ -114,7 +129,7 @@ def _joined(parts: Sequence[Array], padded: bool) -> np.ndarray:
 
 
 def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array that JAX's CPU devices can share: one that begins anywhere is copied to each."""
+    """Returns aligned zeros, which JAX's CPU devices share; JAX copies unaligned arrays to each."""
     size = math.prod(shape) * dtype.itemsize
     memory = np.zeros(size + ALIGNMENT, np.uint8)
     begin = -memory.ctypes.data % ALIGNMENT
@@ -122,11 +137,11 @@ def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 
 
 def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
-    """The window that starts at step `index []`.
+    """Returns the window that starts at step `index []`.
 
     Args:
         steps: the data.
-        index: of the current step, in 0 .. M - 1.
+        index: index of the current step, in 0 .. M - 1.
         context: K.
         horizon: T.
         end: the end action, `A - 1`.
@@ -145,30 +160,30 @@ def window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int)
 
 
 def transition_window(steps: Steps, index: jax.Array, context: int, end: int) -> Window:
-    """What is known after step `index []`, as a window of K + 1 past steps and no actions.
+    """Returns the context after step `index []`, in a window of K + 1 past steps and no actions.
 
-    So whatever can be done to a window can be done to a transition; see `TransitionWindow`.
+    Functions of windows, such as augmentations, then work on transitions; see `TransitionWindow`.
 
     Args:
         steps: the data.
-        index: of the step that is taken, in 0 .. M - 1.
+        index: index of the step that is taken, in 0 .. M - 1.
         context: K.
         end: the end action, `A - 1`.
     """
-    start = window(steps, index, context, 0, end)  # what augmentations must know is of its start
+    start = window(steps, index, context, 0, end)  # augmentations need the extras of its start
     return start._replace(context=_context(steps, index, context + 1, end, after=1))
 
 
 def unrolled_window(steps: Steps, index: jax.Array, context: int, horizon: int, end: int) -> Window:
-    """A window whose context goes on to the last state that its plan acts in.
+    """Returns a window whose context goes on to the last state in which its plan acts.
 
-    The context has K + T - 1 past steps: up to step `index []`, the K of a window, then those of
-    the plan but its last. Past the end of the demonstration there is its last state, and `end`.
-    So whatever can be done to a window can be done to its future; see `context_at`.
+    The context has K + T - 1 past steps: the K steps before step `index []`, then the steps of the
+    plan except the last. After the end of the demonstration its last state repeats, with action
+    `end`. Functions of windows, such as augmentations, then work on the future; see `context_at`.
 
     Args:
         steps: the data.
-        index: of the current step, in 0 .. M - 1.
+        index: index of the current step, in 0 .. M - 1.
         context: K.
         horizon: T.
         end: the end action, `A - 1`.
@@ -188,11 +203,11 @@ def unrolled_window(steps: Steps, index: jax.Array, context: int, horizon: int, 
 
 
 def context_at(unrolled: Context, place: int, context: int) -> Context:
-    """The context of an unrolled window as it is after `place` steps of its plan.
+    """Returns the context of an unrolled window after `place` steps of its plan.
 
     Args:
-        unrolled: K + T - 1 past steps.
-        place: 0 .. T - 1.
+        unrolled: context with K + T - 1 past steps; see `unrolled_window`.
+        place: number of steps, in 0 .. T - 1.
         context: K.
     """
     states = jax.tree.map(
@@ -209,9 +224,9 @@ def context_at(unrolled: Context, place: int, context: int) -> Context:
 
 
 def joined(run: Window) -> Context:
-    """The context `[K + S - 1]` that holds all states of S windows in a row, leaves `[S, ...]`.
+    """Joins S consecutive windows, leaves `[S, ...]`, into one context with K + S - 1 past steps.
 
-    It is that of the last of them, and goes back as far as that of the first.
+    The context begins with the past of the first window, and ends in the state of the last.
     """
     context = run.context
     first = jax.tree.map(lambda leaf: leaf[0], context)
@@ -230,7 +245,7 @@ def joined(run: Window) -> Context:
 
 
 def recent(context: Context, length: int) -> Context:
-    """The same context with only the last `length` of its past steps."""
+    """Returns a context with only the last `length` of its past steps."""
     first = context.actions.shape[0] - length
     return context._replace(
         past=jax.tree.map(lambda leaf: leaf[first:], context.past),
@@ -240,7 +255,7 @@ def recent(context: Context, length: int) -> Context:
 
 
 def before(context: Context) -> Context:
-    """The context of a transition (K + 1 past steps) as it was before its step (K of them)."""
+    """Returns the context before a transition's step: K of the K + 1 past steps."""
     reward = context.rewards[-1]
     return Context(
         observation=_at(context.past, -1),
@@ -253,7 +268,7 @@ def before(context: Context) -> Context:
 
 
 def after(context: Context) -> Context:
-    """The context of a transition (K + 1 past steps) as it is after its step (K of them)."""
+    """Returns the context after a transition's step: the last K of the K + 1 past steps."""
     return context._replace(
         past=jax.tree.map(lambda leaf: leaf[1:], context.past),
         actions=context.actions[1:],
@@ -266,7 +281,7 @@ def _at(tree: PyTree, index: jax.Array | int) -> PyTree:
 
 
 def _context(steps: Steps, index: jax.Array, length: int, end: int, after: int = 0) -> Context:
-    """What is known before step `index []`, or after it: `length` past steps."""
+    """Returns the context before step `index []`, or after it (`after=1`): `length` past steps."""
     back = jnp.arange(-length, 0) + after
     known = -back <= steps.step[index]
     earlier = jnp.where(known, index + back, 0)
@@ -288,14 +303,19 @@ def _context(steps: Steps, index: jax.Array, length: int, end: int, after: int =
 
 
 def sample_steps(key: jax.Array, steps: Steps, batch: int, by: str) -> jax.Array:
-    """Indices `[B]` of steps: a function of `key` and the data alone.
+    """Draws indices `[B]` of steps, as a function of the key and the data alone.
 
-    `by` is one of `SAMPLINGS`: "episode" (a uniform demonstration, then a uniform step of it, as
-    in the authors' code), "step" (a uniform step, so that long demonstrations count for more) or
-    "start" (the first step of a uniform demonstration, for what is planned once).
+    Args:
+        key: random key.
+        steps: the data.
+        batch: B.
+        by: a name in `SAMPLINGS`. "episode" draws a uniform demonstration, then a uniform step of
+            it, as the authors' code does. "step" draws a uniform step, so that long demonstrations
+            count for more. "start" draws the first step of a uniform demonstration, for methods
+            that plan once.
 
     Raises:
-        ValueError: another `by`.
+        ValueError: `by` is not in `SAMPLINGS`.
     """
     if by not in SAMPLINGS:
         raise ValueError(f"unknown sampling {by!r}: expected one of {', '.join(SAMPLINGS)}")

@@ -1,4 +1,4 @@
-"""The table of domains: what `leapjax.load` and the experiments find by name."""
+"""The table of domains, in which `leapjax.load` and the experiments look up names."""
 
 import importlib
 import sys
@@ -11,13 +11,13 @@ from leapjax.extras import report_missing
 
 
 class Place(NamedTuple):
-    """Where a domain is defined: it is imported when it is first used.
+    """Where a domain is defined; its module is imported at first use.
 
     Attributes:
-        module: that defines it.
-        name: of the `DomainType` in that module.
-        extra: of the package that the domain needs; see `leapjax.extras`.
-        about: what its levels are, in a line of help.
+        module: module that defines the domain.
+        name: name of the `DomainType` in that module.
+        extra: extra of this package that the domain needs; see `leapjax.extras`.
+        about: description of the levels, for a line of help.
     """
 
     module: str
@@ -67,13 +67,13 @@ def make_level(name: str, level: str, settings: Any) -> Domain:
     """Makes one level of a domain; sets its `made_from`.
 
     Args:
-        name: of the domain.
-        level: by name.
-        settings: of the domain: an instance of its `DomainType.settings`.
+        name: name of the domain.
+        level: name of the level.
+        settings: settings of the domain, an instance of its `DomainType.settings`.
 
     Raises:
-        UserError: an unknown domain or level, settings of another domain, or an environment that
-            cannot be made.
+        UserError: the domain or level is unknown, the settings are of another domain, or the
+            environment cannot be made.
     """
     kind = find_domain(name)
     check_kind(settings, kind.settings)
@@ -81,14 +81,14 @@ def make_level(name: str, level: str, settings: Any) -> Domain:
 
 
 def check_imported(level: str, named_by: str) -> None:
-    """Refuses to import a module because a file names it.
+    """Checks that a level's module was imported: a file that names it must not run its code.
 
-    A level `module:id` is an environment that a module registers: to make it is to run the
-    module's code. Whoever wants that imports the module, or names the level.
+    A level `module:id` is an environment that a module registers, and making it runs the module's
+    code. A user who trusts the module imports it first, or names the level.
 
     Args:
-        level: by name or id.
-        named_by: the file or folder that names it, for the message.
+        level: name or id of the level.
+        named_by: file or folder that names the level, for the message.
 
     Raises:
         UserError: the module has not been imported.

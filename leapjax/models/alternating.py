@@ -25,7 +25,8 @@ class Memory(NamedTuple):
     """The part of a pass that all plans from one context share.
 
     Attributes:
-        known: keys and values of the tokens up to the current state, per layer, with room for more.
+        known: keys and values per layer of the tokens up to the current state, with empty slots for
+            the tokens of a plan.
         first: logits `[A]` of the first action.
     """
 
@@ -36,9 +37,9 @@ class Memory(NamedTuple):
 class AlternatingModel(nn.Module):
     """Tokens s_1 a_1 s_2 a_2 ... s_T with causal attention.
 
-    The network reads an action off the token of its state, and the next state off the token of the
-    action. A predicted state is a vector: the network's own encoding of the observed state. With
-    architecture `paper` the past states and actions come first, in the same way; with architecture
+    The token of a state predicts the next action, and the token of an action predicts the next
+    state. A predicted state is a vector `[D]`: the network's own encoding of the observed state.
+    With architecture `paper` the tokens of past states and actions come first. With architecture
     `leapjax` the encoder summarises the past.
 
     Attributes:
@@ -58,7 +59,7 @@ class AlternatingModel(nn.Module):
         tokens = 2 * (self.past + sizes.horizon)
         self.position = nn.Embed(tokens, c.width, embedding_init=zeros)
         self.summary = dense(c.width, scale=0.1)
-        # Without weights: otherwise training would shrink the states, to predict them more easily.
+        # Without a learned scale: training would shrink the states, to predict them more easily.
         self.norm = nn.LayerNorm(use_scale=False, use_bias=False)
         self.transformer = Transformer(c.layers, c.width, c.heads, c.dropout, dtype=c.dtype)
         self.drop = nn.Dropout(c.dropout)
@@ -67,7 +68,7 @@ class AlternatingModel(nn.Module):
 
     @property
     def past(self) -> int:
-        """The number of past states with tokens of their own."""
+        """Number of past states that have a token each."""
         return self.sizes.context if self.config.architecture == "paper" else 0
 
     def encode(self, context: Context) -> tuple[jax.Array, jax.Array]:
@@ -79,8 +80,8 @@ class AlternatingModel(nn.Module):
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Returns the encoder's tokens of B unrolled windows.
 
-        They are `[B, K + T, D]` with architecture `paper`, a token for each state; and
-        `[B, T, C, D]` with `leapjax`, the tokens of T contexts, one at each state of the plan.
+        With architecture `paper` they are `[B, K + T, D]`, a token for each state. With `leapjax`
+        they are `[B, T, C, D]`, the C tokens of the context at each of the plan's T states.
         """
         if self.config.architecture == "paper":
             return self.encoder.encode_batch(contexts)
@@ -158,7 +159,7 @@ class AlternatingModel(nn.Module):
         def take_action(
             place: int | jax.Array, carry: tuple[list[KeysValues], jax.Array]
         ) -> tuple[list[KeysValues], jax.Array]:
-            """Appends one action and the predicted next state; reads off the next logits."""
+            """Appends an action and the predicted next state; stores the next logits."""
             known, logits = carry
             token = 2 * (self.past + place) + 1
             h, known = self.transformer.extend(
@@ -169,6 +170,6 @@ class AlternatingModel(nn.Module):
             return known, logits.at[place + 1].set(self.choose(h[0]))
 
         logits = jnp.zeros((self.sizes.horizon, self.sizes.num_actions)).at[0].set(memory.first)
-        # It stops at the last of the positions.
+        # The loop stops at the last queried position.
         _, logits = jax.lax.fori_loop(0, positions.max(), take_action, (memory.known, logits))
         return forbid_early_end(logits[positions], positions)

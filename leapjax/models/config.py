@@ -1,4 +1,4 @@
-"""The configuration of networks: `ModelConfig`, and the `Sizes` that a domain and a plan give."""
+"""The configuration of networks: `ModelConfig`, and the `Sizes` of contexts and plans."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from leapjax.checks import check_at_least, check_types
 ARCHITECTURES = ("paper", "leapjax")
 ATTENTIONS = ("full", "causal")
 DTYPES = ("float32", "bfloat16")
-MOST_LAYERS = 200  # XLA takes about a second to compile each
+MOST_LAYERS = 200  # XLA takes about a second to compile a layer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,14 +15,14 @@ class ModelConfig:
     """The network. The defaults are the paper's transformer.
 
     Attributes:
-        architecture: Network: "leapjax" for ours, "paper" for that of the appendix.
+        architecture: "leapjax" for our network, "paper" for the network of the appendix.
         layers: Transformer layers.
         heads: Attention heads.
         width: D, embedding dimension; a multiple of the heads.
         dropout: Dropout rate of embeddings, attention and residuals.
         dtype: Type of matrix products, "float32" or "bfloat16"; parameters are always float32.
-        attention: Attention between the actions of a plan: "full", or "causal", where no action
-            sees a later one.
+        attention: Attention between the actions of a plan: "full", or "causal", which hides later
+            actions.
     """
 
     architecture: str = "leapjax"
@@ -59,9 +59,9 @@ class Sizes:
     """The sizes of contexts, plans and episodes that a network is made for.
 
     Attributes:
-        num_actions: A, the end action included.
-        context: K, past steps.
-        horizon: T, planned actions.
+        num_actions: A, number of actions with the end action.
+        context: K, number of past steps.
+        horizon: T, number of planned actions.
         max_steps: length of the longest episode, for the embedding of time.
     """
 

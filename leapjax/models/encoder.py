@@ -11,7 +11,7 @@ class Encoder(nn.Module):
     """Turns a context into tokens. A subclass defines `__call__`; the rest has defaults.
 
     An encoder for architecture `paper` makes a token for each state of the context, C = K + 1; the
-    last one is the current state's. For `leapjax` C is any number.
+    last token is the current state's. For `leapjax` C is any number.
     """
 
     def __call__(self, context: Context) -> jax.Array:
@@ -21,7 +21,7 @@ class Encoder(nn.Module):
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Returns the tokens `[B, C, D]` of B contexts, for training.
 
-        An encoder overrides this if it can encode a batch faster than one context after the other.
+        An encoder overrides this if it can encode a batch faster than with `vmap`.
         """
         each = nn.vmap(
             lambda encoder, context: encoder(context),
@@ -37,8 +37,8 @@ class Encoder(nn.Module):
 
         Args:
             context: current context, K > 0.
-            known: tokens `[K, D]` of its past states, from the plan before; None when an episode
-                begins.
+            known: tokens `[K, D]` of its past states, from the previous plan; `None` when an
+                episode begins.
         """
         del known
         return self(context)
@@ -46,20 +46,20 @@ class Encoder(nn.Module):
     def encode_positions(self, context: Context, horizon: int) -> jax.Array | None:
         """Returns an embedding `[T, D]` of each position of a plan, such as a cell of a board.
 
-        It returns None by default; the network then learns an embedding of each position.
+        It returns `None` by default; the network then learns an embedding of each position.
         """
         del context, horizon
         return None
 
     def mix_actions(self, tokens: jax.Array) -> jax.Array:
-        """Returns the tokens `[T, D]` of a plan's actions, changed by each other; here unchanged.
+        """Mixes the tokens `[T, D]` of a plan's actions; by default it leaves them unchanged.
 
         An encoder overrides this if an action means little without its neighbours.
         """
         return tokens
 
     def add_later_state(self) -> "Encoder":
-        """Returns this encoder with one more token, for later states with unknown poses.
+        """Returns this encoder with an additional token for later states, whose pose is unknown.
 
         Raises:
             UserError: the encoder does not separate the pose from the rest of a state.

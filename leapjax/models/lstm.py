@@ -14,7 +14,7 @@ from leapjax.types import Context, PyTree
 class SequenceClassifier(nn.Module):
     """An LSTM that reads a whole plan and estimates how corrupted it is.
 
-    The tokens of the context give the LSTM's first carry.
+    The tokens of the context give the LSTM's initial carry.
 
     Attributes:
         config: size of the network; only its width is used.
@@ -38,17 +38,18 @@ class SequenceClassifier(nn.Module):
         return self.context.encode_batch(contexts)
 
     def encode(self, context: Context, tokens: jax.Array | None = None) -> PyTree:
-        """Returns the LSTM's first carry, `[D]` and `[D]`.
+        """Returns the LSTM's initial carry, `[D]` and `[D]`.
 
         Args:
             context: context to plan from.
-            tokens: encoder's tokens, from `encode_batch`; None: encode the context.
+            tokens: encoder's tokens, from `encode_batch`; if `None`, the network encodes the
+                context.
         """
         tokens = self.context(context) if tokens is None else tokens
         return tuple(jnp.split(self.begin(tokens.reshape(-1)), 2))
 
     def degree(self, memory: PyTree, actions: jax.Array) -> jax.Array:
-        """Estimates the degree of corruption `[]` of a plan: 0 for no action, 1 for all.
+        """Estimates the degree of corruption `[]` of a plan, from 0 (no action) to 1 (all).
 
         Args:
             memory: result of `encode`.

@@ -17,8 +17,8 @@ class Memory(NamedTuple):
     """The part of a pass that all plans from one context share.
 
     Attributes:
-        prefix: keys and values of the context's tokens, per layer; None: `tokens` holds them all.
-        tokens: embeddings `[tokens, D]` of all other tokens, without the plan's actions.
+        prefix: keys and values of the context's tokens, per layer; `None` if `tokens` holds all.
+        tokens: embeddings `[tokens, D]` of all other tokens; a pass adds the plan's actions.
     """
 
     prefix: list[KeysValues] | None
@@ -28,10 +28,10 @@ class Memory(NamedTuple):
 class PaperModel(nn.Module):
     """The network of the paper's appendix: state and action tokens, interleaved.
 
-    Tokens s_1 a_1 ... s_n a_n s_n a_n+1 ... with bidirectional attention (or causal attention, the
-    paper's choice in Atari). An action is read off its state token. All tokens share one embedding
-    of the time at the end of the plan, as in the authors' code. A network that is conditioned on
-    returns to go has a return token before each state's.
+    The tokens are s_1 a_1 ... s_n a_n s_n a_n+1 ... Attention is bidirectional, or causal (the
+    paper's choice in Atari). A state token predicts the action that follows it. All tokens share
+    an embedding of the time at the end of the plan, as in the authors' code. A network that is
+    conditioned on returns to go has a return token before each state token.
 
     With causal attention no token of the context depends on the plan. Then `encode` computes their
     keys and values once, and a pass runs over the plan's tokens only.
@@ -40,8 +40,8 @@ class PaperModel(nn.Module):
         config: size of the network.
         sizes: sizes of contexts and plans.
         states: encoder of the domain, with a token for each state of a context, `[K + 1, D]`. The
-            last one stands at all positions of a plan (equation 4). An encoder with one token more
-            puts this one at the later positions.
+            last token is repeated at all positions of a plan (equation 4). An encoder may add a
+            token, which then replaces the last one at all positions but the first.
         conditioned: whether the network is conditioned on returns to go.
     """
 
@@ -66,11 +66,11 @@ class PaperModel(nn.Module):
         self.head = dense(sizes.num_actions, use_bias=False)
 
     def encode_batch(self, contexts: Context) -> jax.Array:
-        """Returns the encoder's tokens `[B, K + 1, D]` of B contexts, or `[B, K + 2, D]`."""
+        """Returns the encoder's tokens of B contexts: `[B, K + 1, D]` or `[B, K + 2, D]`."""
         return self.states.encode_batch(contexts)
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Returns the encoder's tokens of a context, given those of its past states."""
+        """Returns the encoder's tokens of a context, given the tokens of its past states."""
         return self.states.encode_next(context, known)
 
     def encode(
@@ -89,9 +89,9 @@ class PaperModel(nn.Module):
         Args:
             context: context to plan from.
             deterministic: whether to leave out dropout.
-            returns: returns to go `[K + 1]` at each state; None if not conditioned.
-            tokens: encoder's tokens, from `encode_batch` or `encode_next`; None: encode the
-                context.
+            returns: returns to go `[K + 1]` at each state; `None` if not conditioned.
+            tokens: encoder's tokens, from `encode_batch` or `encode_next`; if `None`, the network
+                encodes the context.
         """
         horizon = self.sizes.horizon
         encoded = self.states(context) if tokens is None else tokens

@@ -1,4 +1,4 @@
-"""The rules of plans that every network over several actions shares."""
+"""Rules of plans that all networks over several actions share."""
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +29,10 @@ def forbid_early_end(logits: jax.Array, positions: jax.Array) -> jax.Array:
 
 
 def make_attention_mask(config: ModelConfig, tokens: int, prefix: int = 0) -> jax.Array | None:
-    """Makes the mask `[tokens, prefix + tokens]` of a plan's tokens; None: each attends to all.
+    """Makes the mask `[tokens, prefix + tokens]` of a plan's tokens; `None` for full attention.
 
     Args:
-        config: names the attention, "full" or "causal".
+        config: configuration that names the attention.
         tokens: number of tokens of the plan.
         prefix: number of cached tokens of the context.
     """

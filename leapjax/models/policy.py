@@ -18,8 +18,11 @@ class PolicyModel(nn.Module):
 
     Architecture `paper` reads every state, P = K + 1: tokens s_1 a_1 s_2 a_2 ... s_n with causal
     attention. Architecture `leapjax` reads the current state, P = 1: the encoder's few tokens, and
-    one query token. A network that is conditioned on returns to go has a return token before each
-    state's, or adds the return's embedding to the query (Chen et al., Decision Transformer).
+    a query token.
+
+    A network may be conditioned on returns to go (Chen et al., Decision Transformer). Architecture
+    `paper` then has a return token before each state token. Architecture `leapjax` adds the
+    return's embedding to the query.
 
     Attributes:
         config: architecture and size of the network.
@@ -58,14 +61,14 @@ class PolicyModel(nn.Module):
         returns: jax.Array | None = None,
         tokens: jax.Array | None = None,
     ) -> Outputs:
-        """Returns the outputs of each head at the last P states, the current one last.
+        """Returns the outputs of each head at the last P states, the current state last.
 
         Args:
             context: context to read.
             deterministic: whether to leave out dropout.
-            returns: returns to go `[K + 1]` at each state; None if not conditioned.
-            tokens: encoder's tokens, from `encode_batch` or `encode_next`; None: encode the
-                context.
+            returns: returns to go `[K + 1]` at each state; `None` if not conditioned.
+            tokens: encoder's tokens, from `encode_batch` or `encode_next`; if `None`, the network
+                encodes the context.
         """
         tokens = self.encoder(context) if tokens is None else tokens
         return self._apply_heads(tokens, context, deterministic, returns)
@@ -87,7 +90,7 @@ class PolicyModel(nn.Module):
         if self.config.architecture != "paper":
             earlier, later = (jax.vmap(f)(contexts) for f in (windows.before, windows.after))
             return self.encode_batch(earlier), self.encode_batch(later)
-        states = self.encode_batch(contexts)  # [B, K + 2, D]: encodes each state once
+        states = self.encode_batch(contexts)  # [B, K + 2, D]: each state is encoded once
         return states[:, :-1], states[:, 1:]
 
     def apply_transition(
@@ -140,7 +143,7 @@ class PolicyModel(nn.Module):
 
 
 def append_present(past: jax.Array, present: jax.Array, count: int) -> jax.Array:
-    """Appends the current state's value to the past ones, and keeps the last `count`.
+    """Appends the current state's value to the past values, and keeps the last `count`.
 
     Args:
         past: values `[K]` of the past states.

@@ -26,11 +26,11 @@ class Prefix(NamedTuple):
 
 
 class PrefixModel(nn.Module):
-    """Our network: the state once, and a cached context.
+    """Our network: it encodes the context once per plan, and reuses its keys and values.
 
     The tokens of the context are a prefix that never attends to the plan. So `encode` computes its
     keys and values once per plan, and a pass runs over T action tokens only. A network that is
-    conditioned on the return to go has one more token of the context.
+    conditioned on the return to go has an additional context token.
 
     The encoder may embed the positions of a plan (`encode_positions`); otherwise this network
     learns an embedding of each. It may also mix the tokens of a plan's actions (`mix_actions`).
@@ -38,7 +38,7 @@ class PrefixModel(nn.Module):
     Attributes:
         config: size of the network.
         sizes: sizes of contexts and plans.
-        context: encoder of the domain, with a few tokens of a context, `[C, D]`.
+        context: encoder of the domain, with a few tokens `[C, D]` of a context.
         conditioned: whether the network is conditioned on the return to go.
     """
 
@@ -73,8 +73,9 @@ class PrefixModel(nn.Module):
         Args:
             context: context to plan from.
             deterministic: whether to leave out dropout.
-            returns: returns to go `[K + 1]` at each state; None if not conditioned.
-            tokens: encoder's tokens, from `encode_batch`; None: encode the context.
+            returns: returns to go `[K + 1]` at each state; `None` if not conditioned.
+            tokens: encoder's tokens, from `encode_batch`; if `None`, the network encodes the
+                context.
         """
         tokens = self.context(context) if tokens is None else tokens
         if returns is not None:

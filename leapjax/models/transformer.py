@@ -1,4 +1,4 @@
-"""A pre-norm transformer whose keys and values of a fixed prefix are computed once.
+"""A pre-norm transformer that computes the keys and values of a fixed prefix once.
 
 `Transformer.prefix` runs the prefix tokens through all layers. `Transformer.__call__` runs the
 other tokens, which also attend to the prefix; it computes the last layer at the queried tokens
@@ -50,7 +50,7 @@ def _small(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float3
 
 
 def causal_mask(tokens: int, prefix: int = 0) -> jax.Array:
-    """Makes a mask `[tokens, prefix + tokens]`: tokens see the prefix and no later token."""
+    """Makes a mask `[tokens, prefix + tokens]` that hides later tokens, but not the prefix."""
     return jnp.tril(jnp.ones((tokens, prefix + tokens), bool), prefix)
 
 
@@ -58,7 +58,7 @@ def interleave(*sequences: jax.Array) -> jax.Array:
     """Takes one token of each sequence in turn, `[k n - 1, D]`.
 
     Args:
-        sequences: k sequences, `[n, D]` each but the last one, `[n - 1, D]`.
+        sequences: k - 1 sequences `[n, D]`, and a last sequence `[n - 1, D]`.
     """
     *whole, last = sequences
     last = jnp.concatenate([last, jnp.zeros_like(whole[0][:1])])
@@ -109,7 +109,8 @@ class Block(nn.Module):
         Args:
             x: tokens `[Q, D]`.
             memory: keys and values of the M tokens to attend to.
-            mask: booleans `[Q, M]`: which tokens (columns) each token (row) attends to; None: all.
+            mask: booleans `[Q, M]`, True where a token (row) attends to a token (column); `None`
+                for full attention.
             deterministic: whether to leave out dropout.
         """
         queries = self._heads(self.query(self.norm_attention(x)))
@@ -129,10 +130,15 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Layers of `Block` and a final norm. The attributes other than `layers` are `Block`'s.
+    """Layers of `Block` and a final norm.
 
     Attributes:
         layers: number of blocks.
+        width: D.
+        heads: number of attention heads; divides D.
+        dropout: dropout rate of attention and residuals.
+        activation: activation of the perceptrons.
+        dtype: type of matrix products, keys and values.
     """
 
     layers: int
@@ -156,7 +162,8 @@ class Transformer(nn.Module):
 
         Args:
             x: prefix tokens `[M, D]`.
-            mask: booleans `[M, M]`: which tokens (columns) each token (row) attends to; None: all.
+            mask: booleans `[M, M]`, True where a token (row) attends to a token (column); `None`
+                for full attention.
             deterministic: whether to leave out dropout.
         """
         memory = []
@@ -178,9 +185,9 @@ class Transformer(nn.Module):
         Args:
             x: tokens `[tokens, D]`.
             queried: indices `[Q]` of the tokens to return.
-            prefix: keys and values of the prefix, from `prefix`; None: there is no prefix.
-            mask: booleans `[tokens, prefix + tokens]`: which tokens (columns) each token (row)
-                attends to (see `causal_mask`); None: all.
+            prefix: keys and values of the prefix, from `prefix`; `None` without a prefix.
+            mask: booleans `[tokens, prefix + tokens]`, True where a token (row) attends to a token
+                (column), see `causal_mask`; `None` for full attention.
             deterministic: whether to leave out dropout.
         """
         for index, block in enumerate(self.blocks):
@@ -196,7 +203,7 @@ class Transformer(nn.Module):
         return self.norm(x)
 
     def make_empty_memory(self, tokens: int) -> list[KeysValues]:
-        """Makes room for the keys and values of a number of tokens, per layer, for `extend`."""
+        """Makes zeros, per layer, in which `extend` stores keys and values of `tokens` tokens."""
         empty = jnp.zeros((tokens, self.heads, self.width // self.heads), self.dtype)
         return [KeysValues(empty, empty)] * self.layers
 
@@ -207,8 +214,8 @@ class Transformer(nn.Module):
 
         Args:
             x: next n tokens, `[n, D]`.
-            memory: keys and values of the tokens before, per layer, with room for more.
-            start: number `[]` of tokens before.
+            memory: keys and values of the earlier tokens, per layer, with empty slots for the new.
+            start: number `[]` of earlier tokens.
 
         Returns:
             The outputs `[n, D]`, and the extended memory.

@@ -1,7 +1,7 @@
 """Presets: for each domain one module, with the configuration of every level and method.
 
-`paper` is the paper's network and training, `leapjax` is ours. A number of a preset stands in one
-place, with its reason; what a preset does not set is the default of the dataclass that has it.
+`paper` is the paper's network and training, `leapjax` is ours. Each number of a preset stands in
+one place, with its reason. Fields that a preset does not set keep the defaults of their dataclass.
 """
 
 import functools
@@ -18,11 +18,11 @@ Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
 # A module of presets is imported when it is first used: it imports its domain.
 MODULES = {name: f"leapjax.presets.{name}" for name in ("babyai", "atari", "stars", "sudoku")}
-PRESETS: dict[str, Mapping[str, Preset]] = {}  # by domain, those of a user's own
+PRESETS: dict[str, Mapping[str, Preset]] = {}  # presets of a user's own domains, by domain
 
 
 def find_presets(domain: str) -> Mapping[str, Preset]:
-    """Returns the presets of a domain by name; one without its own has those of any environment.
+    """Returns the presets of a domain by name; `environments` serves domains without their own.
 
     Raises:
         UserError: there is no such domain, or it needs an extra that is not installed.

@@ -10,24 +10,24 @@ from leapjax.domains.atari.games import find_game
 from leapjax.planners import PlannerConfig
 from leapjax.presets import common
 
-TEST_SEED = 20_000_000  # of the first game; some before it helped to choose the data
+TEST_SEED = 20_000_000  # of the first game; games before it helped to choose the data
 EPISODES = 20  # games
 ALL = 100_000  # demonstrations: more than the data of any game hold
-# By game: T, N and the batch.
+# (T, N, batch size) by game.
 PAPER = {
     "Breakout": (5, 10, 64), "Qbert": (5, 10, 64), "Pong": (5, 10, 256), "Seaquest": (10, 30, 128),
 }  # fmt: skip
 PAPER_TRANSITIONS = 500_000  # 1% of the data of DQN-Replay
 EPOCHS = 10
-PAST = 25  # states of the paper's contexts
-IMITATORS = ("leap", "bc", "dt")  # they draw actions: to ask for a ball can be improbable
+PAST = 25  # number of past states in the paper's contexts
+IMITATORS = ("leap", "bc", "dt")  # these draw actions: serving the ball can be improbable
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's network, data and training.
+    """Returns the paper's network, data and training.
 
     Raises:
-        UserError: an unknown game.
+        UserError: the game is unknown.
     """
     find_game(name)
     horizon, iterations, batch = PAPER[name]
@@ -49,18 +49,19 @@ def paper(name: str, method: str) -> AnyConfig:
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """A small network that ten minutes on one core train, on few transitions.
+    """Returns a small network, which trains in ten minutes on one core, on few transitions.
 
     Raises:
-        UserError: an unknown game.
+        UserError: the game is unknown.
     """
     find_game(name)
-    # Things in Seaquest look where they go. Imitators that see the past learn to go on as before.
+    # Sprites in Seaquest face the way they move, so imitators need no past there. Imitators that
+    # see the past learn to continue as before.
     blind = method in IMITATORS and name == "Seaquest"
-    # Reading the frames costs more than looking at a plan in T ways: so many copies share them.
+    # Encoding the frames costs more than masking a plan in T ways, so T copies share the frames.
     own = _settings(name, method, masking="stratified")
     if method == "cql":
-        own = cql.Settings(alpha=1.0)  # with less it learns nothing in so few steps
+        own = cql.Settings(alpha=1.0)  # with a smaller value it fails to learn in so few steps
     return _configure(
         name,
         method,
@@ -82,7 +83,7 @@ def transitions(name: str) -> int:
 
 
 def _configure(name: str, method: str, **fields: Any) -> AnyConfig:
-    """Makes a configuration whose data, games and rhythm are those of both presets."""
+    """Makes a configuration from the fields that both presets share and from `fields`."""
     return Config(
         domain="atari",
         level=name,
@@ -96,12 +97,12 @@ def _configure(name: str, method: str, **fields: Any) -> AnyConfig:
 
 
 def _search(method: str, horizon: int, iterations: int, temperature: float) -> PlannerConfig:
-    """Imitators draw their actions at a temperature."""
+    """Returns the search of a method; only imitators draw actions at the temperature."""
     return common.search(method, horizon, iterations, temperature if method in IMITATORS else 0.0)
 
 
 def _settings(name: str, method: str, masking: str) -> Any:
-    """LEAP and Decision Transformer ask for a return; games have no end action to learn."""
+    """Returns settings: LEAP and Decision Transformer get a target return, LEAP no end action."""
     target = find_game(name).target
     if method == "dt":
         return dt.Settings(target)

@@ -8,20 +8,20 @@ from leapjax.domains.babyai.settings import Settings
 from leapjax.planners import BeamConfig, PlannerConfig
 from leapjax.presets import common
 
-DEMONSTRATIONS = 500  # of a level: section 5
-_EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # tasks: one room, no words of place
+DEMONSTRATIONS = 500  # per level: section 5
+_EASY = ("GoToLocal", "GoToBehindObstacles", "PickUpLocal")  # one room, no words for places
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's network and training, as in the authors' code where the two differ.
+    """Returns the paper's network and training; follows the authors' code where they differ.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     level = find_level(name)
     horizon, iterations = level.horizon, level.iterations
     if method == "leap" and level.name.startswith("GoToObjMazeS7"):
-        horizon, iterations = 10, 30  # the appendix's 15 and 50 learn less
+        horizon, iterations = 10, 30  # the network learns less with the appendix's 15 and 50
     return Config(
         domain="babyai",
         level=name,
@@ -38,13 +38,13 @@ def paper(name: str, method: str) -> AnyConfig:
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """Our encoder, augmentation and training: all chosen on validation levels.
+    """Returns our encoder, augmentation and training, all chosen on validation levels.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     level = find_level(name)
-    # 3e-3 is too high for LEAP where ways are long.
+    # The usual 3e-3 is too high for LEAP in large levels.
     rate = {"learning_rate": 1.5e-3} if _is_large(level) and method == "leap" else {}
     return Config(
         domain="babyai",
@@ -52,7 +52,7 @@ def leapjax(name: str, method: str) -> AnyConfig:
         method=method,
         preset="leapjax",
         demos=common.demonstrations(method, DEMONSTRATIONS),
-        episodes=500,  # a rate near 100% wants more of them than the paper's 200
+        episodes=500,  # a success rate near 100% needs more than the paper's 200
         context=level.context,
         model=common.our_model(method),
         training=common.our_training(method, steps=_steps(level), **rate),
@@ -63,12 +63,12 @@ def leapjax(name: str, method: str) -> AnyConfig:
 
 
 def _paper_context(level: Level, method: str) -> int:
-    """K: methods of single actions see the appendix's past states."""
+    """Returns K; methods that choose single actions see the appendix's number of past states."""
     return level.context if method in (*common.SEQUENCE, "random") else level.states - 1
 
 
 def _paper_changes(level: Level, method: str) -> dict[str, Any]:
-    """The training of LEAP: a longer plan makes more copies of each window in the cache."""
+    """Returns the microbatch of LEAP: longer plans put more copies of each window in the cache."""
     if method != "leap":
         return {}
     if level.horizon > 5:
@@ -77,21 +77,22 @@ def _paper_changes(level: Level, method: str) -> dict[str, Any]:
 
 
 def _paper_settings(level: Level, method: str) -> Any:
-    """LEAP masks every action of a window in turn, as the authors' code does.
+    """Returns settings: LEAP masks every action of a window in turn, as the authors' code does.
 
-    PickUpLoc learns from the state alone: all actions are masked, one copy of each window.
+    In PickUpLoc it learns from the state alone: it masks all actions, in one copy of each window.
     """
     masking = "all" if level.name == "PickUpLoc" else "each"
     return common.settings(method, masking=masking, end=False, repeat_state=False)
 
 
 def _our_search(level: Level, method: str) -> PlannerConfig:
-    """N = T: more passes than there are positions give nothing. Noise leads out of dead ends.
+    """Returns a search with N = T: more passes than positions bring no gain.
 
-    Temperatures are in the units of a method's energies: nats, or Q-values.
+    Noise leads out of dead ends. Temperatures are in the units of a method's energies: nats, or
+    Q-values.
     """
     temperature = 0.5 if method == "leap" else 0.0
-    if level.sequence:  # there is much to do, so that dead ends are frequent
+    if level.sequence:  # the tasks are long, so dead ends are frequent
         noise = {"leap": 1.0, "bc": 1.0, "dt": 1.0, "iql": 1.0, "mopo": 1.0, "bcq": 0.1}
         temperature = {**noise, "plate": 2.0}.get(method, temperature)
     beams = 1 if level.sequence else BeamConfig.beams
@@ -99,10 +100,10 @@ def _our_search(level: Level, method: str) -> PlannerConfig:
 
 
 def _augmented(level: Level) -> Settings:
-    """The encoder and the augmentation of a level.
+    """Returns the options of encoder and augmentation for a level.
 
-    In the paper's levels keys open no doors, and an instruction names kind and colour, so that
-    it cannot mean clutter. Of other levels that is not known.
+    In the paper's levels keys open no doors, so objects can be exchanged. Their instructions name
+    kind and colour, so they cannot mean clutter. Other levels may break both rules.
     """
     familiar = bool(level.task)
     return Settings(
@@ -115,7 +116,7 @@ def _augmented(level: Level) -> Settings:
 
 
 def _steps(level: Level) -> int:
-    """Returns after how many steps validation levels gain no more."""
+    """Returns the training steps after which success on validation levels stops rising."""
     if _is_large(level):
         return 4000
     return 1000 if level.task in _EASY else 2000
@@ -127,13 +128,13 @@ def _side(level: Level) -> int:
 
 
 def _is_large(level: Level) -> bool:
-    """Whether ways through a level are so long that they are hard to learn."""
+    """Returns whether paths through a level are so long that they are hard to learn."""
     return bool(level.task) and _side(level) > 15
 
 
 def _sweeps(level: Level) -> int:
-    """Returns as many rounds of value iteration as a long way through the level has cells."""
+    """Returns the rounds of value iteration: the number of cells on a long path in the level."""
     if not level.task:
         return 48
     alone = level.rows * level.columns == 1
-    return (2 if alone else 4) * _side(level)  # ways wind from room to room
+    return (2 if alone else 4) * _side(level)  # paths wind from room to room

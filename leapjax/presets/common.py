@@ -1,4 +1,4 @@
-"""What the presets of all domains share: networks, training and search by method."""
+"""Networks, training and search by method, which the presets of all domains share."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,28 +10,28 @@ from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
 
-UNTRAINED = ("random", "rules")  # these methods learn nothing
+UNTRAINED = ("random", "rules")  # methods without training
 SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several actions, others choose one
 
 
 def paper_model(method: str, **changes: Any) -> ModelConfig:
-    """The network of the paper's appendix, table 5."""
+    """Returns the network of the paper's appendix, table 5."""
     if method in UNTRAINED:
         return ModelConfig(**changes)
     return ModelConfig(architecture="paper", dropout=0.1, **changes)
 
 
 def paper_training(method: str, **changes: Any) -> TrainingConfig:
-    """The training of the paper's appendix, table 5."""
+    """Returns the training of the paper's appendix, table 5."""
     if method in UNTRAINED:
         return TrainingConfig(**{**changes, "steps": 0})
-    # So many examples at a time fit into a core's cache; LEAP has a copy of each for every action.
+    # This many examples fit into a core's cache. LEAP makes a copy of each for every action.
     microbatch = {"leap": 4, "classifier": 0}.get(method, 8)
     return TrainingConfig(**{"windows": "episode", "microbatch": microbatch, **changes})
 
 
 def our_model(method: str, **changes: Any) -> ModelConfig:
-    """The network of preset `leapjax`."""
+    """Returns the network of preset `leapjax`."""
     if method in (*UNTRAINED, "classifier"):
         return ModelConfig(**changes)
     # Augmentation makes dropout useless: chosen on validation levels of BabyAI.
@@ -39,7 +39,7 @@ def our_model(method: str, **changes: Any) -> ModelConfig:
 
 
 def our_training(method: str, **changes: Any) -> TrainingConfig:
-    """The training of preset `leapjax`: its rates were chosen on validation levels of BabyAI."""
+    """Returns the training of preset `leapjax`, with rates chosen on BabyAI's validation levels."""
     if method in UNTRAINED:
         return TrainingConfig(**{**changes, "steps": 0})
     rate = 1.5e-3 if method == "classifier" else 3e-3
@@ -47,7 +47,7 @@ def our_training(method: str, **changes: Any) -> TrainingConfig:
 
 
 def demonstrations(method: str, count: int) -> int:
-    """Returns how many demonstrations a method takes: none where it learns nothing."""
+    """Returns the number of demonstrations for a method: 0 if the method does not learn."""
     return 0 if method in UNTRAINED else count
 
 
@@ -59,15 +59,15 @@ def search(
     fill: str = "together",
     beams: int = BeamConfig.beams,
 ) -> PlannerConfig:
-    """Returns how a method finds its plans.
+    """Returns the search with which a method finds its plans.
 
     Args:
-        method: by name.
-        horizon: T of methods that plan several actions; the others choose one.
+        method: name of the method.
+        horizon: T of methods that plan several actions; other methods choose a single action.
         iterations: N of Gibbs sampling.
-        temperature: of Gibbs sampling or beams.
+        temperature: temperature of Gibbs sampling or beams.
         fill: see `GibbsConfig`; the classifier judges complete plans only.
-        beams: W of PlaTe.
+        beams: W, the number of PlaTe's beams.
     """
     if method == "plate":
         return BeamConfig(horizon, beams, temperature)
@@ -81,7 +81,7 @@ def search(
 
 
 def settings(method: str, **of_leap: Any) -> Any:
-    """Returns the settings of a method: its defaults, and changes of LEAP's."""
+    """Returns the default settings of a method; `of_leap` changes LEAP's."""
     return leap.Settings(**of_leap) if method == "leap" else find_method(method).settings()
 
 
@@ -97,18 +97,18 @@ def configure(
     domain_settings: Any,
     **others: Any,
 ) -> AnyConfig:
-    """Makes the configuration of a preset that stands for a network and how it is trained alone.
+    """Makes a configuration; the preset decides only the network and its training.
 
     Args:
-        domain: its name.
-        level: its name.
-        method: its name.
-        preset: "leapjax", or "paper".
-        demos: to learn from, where the method learns.
+        domain: name of the domain.
+        level: name of the level.
+        method: name of the method.
+        preset: "leapjax" or "paper".
+        demos: number of demonstrations, if the method learns.
         training: changes of the preset's training.
-        planner: how plans are found.
-        domain_settings: of the domain.
-        others: fields of `Config`.
+        planner: how the method finds plans.
+        domain_settings: settings of the domain.
+        others: further fields of `Config`.
     """
     ours = preset == "leapjax"
     return Config(

@@ -7,16 +7,16 @@ from leapjax.presets import common
 DEMONSTRATIONS = 500  # as in BabyAI
 EPISODES = 100
 STEPS = 2000
-HORIZON = 5  # planned actions, of which one is executed; so many passes fill each position
+HORIZON = 5  # T = N: the planner makes 5 passes, and executes the first of 5 actions
 
 
 def paper(domain: str, name: str, method: str) -> AnyConfig:
-    """The paper's network."""
+    """Returns a configuration with the paper's network."""
     return _configure(domain, name, method, "paper", temperature=0.0)
 
 
 def leapjax(domain: str, name: str, method: str) -> AnyConfig:
-    """Our network."""
+    """Returns a configuration with our network."""
     temperature = 0.5 if method == "leap" else 0.0  # as in BabyAI
     return _configure(domain, name, method, "leapjax", temperature)
 

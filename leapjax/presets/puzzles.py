@@ -1,4 +1,4 @@
-"""Presets of puzzles: a plan is the whole solution, the most certain position first."""
+"""Presets of puzzles: a plan is the whole solution, filled from its most certain position on."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -13,12 +13,12 @@ class Puzzle(NamedTuple):
     """The numbers of one level.
 
     Attributes:
-        domain: its name.
-        level: its name.
-        length: actions of a solution.
-        demonstrations: to learn from.
-        settings: of the domain.
-        training: changes of the training.
+        domain: name of the domain.
+        level: name of the level.
+        length: number of actions of a solution.
+        demonstrations: number of demonstrations.
+        settings: settings of the domain.
+        training: changes of the preset's training.
     """
 
     domain: str
@@ -30,9 +30,10 @@ class Puzzle(NamedTuple):
 
 
 def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
-    """Makes the configuration of preset `leapjax`, our network, or `paper`, the paper's training.
+    """Makes the configuration of a level for preset `leapjax` or `paper`.
 
-    The paper's network has no encoder of puzzles.
+    `leapjax` is our network and training, `paper` the paper's. The paper's network has no encoder
+    of puzzles, so `paper` needs another `ModelConfig.architecture`.
     """
     training = dict(puzzle.training)
     if method == "leap":

@@ -7,25 +7,25 @@ from leapjax.presets.puzzles import Puzzle, configure
 
 
 def paper(name: str, method: str) -> AnyConfig:
-    """The paper's training; its network reads no boards.
+    """Returns the paper's training; the paper's network cannot read boards.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     return configure(_puzzle(name), method, "paper")
 
 
 def leapjax(name: str, method: str) -> AnyConfig:
-    """Our network.
+    """Returns our network and training.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     return configure(_puzzle(name), method, "leapjax")
 
 
 def _puzzle(name: str) -> Puzzle:
-    """Boards of 9 by 9 cells train for twelve minutes on one core."""
+    """Returns the numbers of a level; 9 by 9 boards train for twelve minutes on one core."""
     size = boards.find_level(name)
     small = size.side == 4
     training = {

@@ -22,10 +22,12 @@ from leapjax.running.limits import check
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """The options of a command line that decide the defaults of all others, and of --help.
+    """The options that decide the defaults of all other options, and the text of --help.
+
+    An option that the command line lacks is `None`.
 
     Attributes:
-        level: name or id of a level, or "all". A field is None if the command line lacks it.
+        level: name or id of a level, or "all".
         method: names of methods.
         preset: name of a preset.
         checkpoint: folder of a trained planner.
@@ -56,7 +58,7 @@ def parse(
         module: module of the program, for usage lines.
 
     Raises:
-        UserError: an unknown level, method or preset, or a configuration that cannot work.
+        UserError: a level, method or preset is unknown, or a configuration cannot work.
     """
     shell.check_values(arguments)
     choice, others = choose(kind, arguments)
@@ -82,14 +84,14 @@ def parse(
 
 
 def choose(kind: type[AnyConfig], arguments: Sequence[str]) -> tuple[Choice, list[str]]:
-    """Reads the choice from a command line; returns it with the arguments that are left.
+    """Reads the choice from a command line; returns it with the other arguments.
 
     Args:
         kind: `Config`, or a subclass with the program's own names of options.
         arguments: command line.
 
     Raises:
-        UserError: a checkpoint and a published planner are asked for.
+        UserError: the command line asks for both a checkpoint and a published planner.
     """
     fields = [
         (each.name, Annotated[each.type, tyro.conf.arg(name=kind.flag(each.name)[2:])], each)
@@ -117,7 +119,7 @@ def choose_levels(
         trained: specification of the checkpoint that the command line names.
 
     Raises:
-        UserError: an unknown domain, or a level whose module only a file names.
+        UserError: the domain is unknown, or only a file names the module of the level.
     """
     levels = find_domain(domain).levels
     if choice.level is not None:
@@ -128,12 +130,13 @@ def choose_levels(
 
 
 def choose_methods(choice: Choice) -> list[str] | None:
-    """Returns the methods that a command line names, each once; None without --method.
+    """Returns the methods that a command line names, each once; `None` without --method.
 
     "all" stands for the methods that fit every domain.
 
     Raises:
-        UserError: an unknown method, an empty list, or several methods for a trained planner.
+        UserError: a method is unknown, the list is empty, or it has several methods for a trained
+            planner.
     """
     if choice.method is None:
         return None
@@ -171,11 +174,10 @@ def make_default(
         method: name of the method.
         choice: options of the command line.
         data: metadata of the data set that the command line names.
-        trained: specification of the trained planner, if there is one: the defaults are its
-            settings.
+        trained: specification of the trained planner, or `None`; its settings become the defaults.
 
     Raises:
-        UserError: an unknown level, method or preset.
+        UserError: the level, method or preset is unknown.
     """
     name = choice.preset or (trained.origin.preset if trained else Config.preset)
     preset = find_preset(domain, level, method, name)
@@ -206,7 +208,7 @@ def override(default: AnyConfig, arguments: Sequence[str], module: str) -> AnyCo
 
     Args:
         default: configuration without these options.
-        arguments: command line without the choice.
+        arguments: command line without the options of `Choice`.
         module: module of the program, for usage lines.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The demonstrations that a run learns from: made where they are missing, read, and noted."""
+"""Makes, reads and notes the demonstrations that a run learns from."""
 
 import json
 import math
@@ -28,8 +28,8 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     """Reads the demonstrations to train on: the user's, or the domain's own.
 
     Raises:
-        UserError: they cannot be made or read, are fewer than asked for, hold no rewards where the
-            method learns from them, or are of levels that measure success.
+        UserError: the demonstrations cannot be made or read, are fewer than asked for, lack the
+            rewards that the method learns from, or come from levels that measure success.
     """
     config = run.config
     if not config.demos:
@@ -41,7 +41,7 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
         if run.domain.scaling.measure is None:  # the network does not depend on the data
             run.programs.begin(run)
         processes.run_on_first(lambda: _make(run, source, name))
-    # Each process reads for itself: the data need not be on one shared disk.
+    # Each process reads its own copy: the data need not be on a shared disk.
     loaded = processes.run_together(lambda: source.load(name, run.seed))
     data, dropped = loaded.demonstrations[: config.demos], describe_dropped(loaded)
     run.seconds["demos"] += time.perf_counter() - begun
@@ -67,7 +67,7 @@ def _make(run: Run, source: Source, name: str) -> None:
 def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] | None:
     """Returns success rate and mean return of demonstrations, by the criterion of the domain.
 
-    Returns None if the environment judges success itself: demonstrations do not store that.
+    Returns `None` if the environment judges success itself: demonstrations do not store that.
     """
     criterion = domain.demonstrations.criterion
     if criterion is None or not data:
@@ -81,7 +81,7 @@ def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] 
 
 
 def read_outcome(folder: Path) -> tuple[float, float] | None:
-    """Success rate and mean return of the data that a run learned from, where it noted them."""
+    """Returns success rate and mean return of a run's demonstrations; `None` without a note."""
     found = _read_note(folder).get("outcome") if (folder / DATA).exists() else None
     values = [found.get(name) for name in ("success", "return")] if isinstance(found, dict) else []
     numbers = [float(each) for each in values if isinstance(each, float) and math.isfinite(each)]
@@ -94,13 +94,14 @@ def check_data(
     level_seeds: Sequence[int],
     outcome: Mapping[str, Any] | None = None,
 ) -> None:
-    """Checks that a run continues on the demonstrations that it was begun on.
+    """Checks that a run continues on the demonstrations that it began with.
 
     The first call notes their fingerprint, their level seeds for `find_demonstrated`, and their
     outcome for `read_outcome`.
 
     Raises:
-        UserError: the run was begun on others, or processes have read different ones.
+        UserError: the run began with other demonstrations, or the processes have read different
+            demonstrations.
     """
     if len(set(processes.gather(fingerprint))) > 1:
         raise UserError(
@@ -125,12 +126,12 @@ def check_data(
 
 
 def find_demonstrated(folder: Path) -> list[int]:
-    """Level seeds of the demonstrations that a run learned from, where its folder says so."""
+    """Returns the level seeds of a run's demonstrations; [] if its folder has no note of them."""
     found = _read_note(folder).get("seeds") if (folder / DATA).exists() else None
     return [seed for seed in found if isinstance(seed, int)] if isinstance(found, list) else []
 
 
 def _read_note(folder: Path) -> dict[str, Any]:
-    """Reads what `check_data` noted about the demonstrations; {} if the note is damaged."""
+    """Reads the note of `check_data`; returns {} if the note is not an object."""
     values = read_json(folder / DATA)
     return values if isinstance(values, dict) else {}

@@ -15,11 +15,11 @@ from leapjax.running.run import Run
 
 
 def evaluate(run: Run, planner: Pretrained) -> Episodes:
-    """Plays the held-out episodes, each process its share; compilation is counted apart."""
+    """Plays the held-out episodes, a share in each process; times compilation separately."""
     episode_seeds = run.played
     play = make_player(run, planner)
     index, count = jax.process_index(), jax.process_count()
-    # Contiguous shares, so that the parts make the whole again, in order.
+    # Contiguous shares, so that joining them restores the order.
     bounds = [len(episode_seeds) * n // count for n in range(count + 1)]
     mine = episode_seeds[bounds[index] : bounds[index + 1]]
     begun = time.perf_counter()
@@ -43,7 +43,7 @@ def evaluate(run: Run, planner: Pretrained) -> Episodes:
 
 
 def make_player(run: Run, planner: Pretrained) -> Callable[..., Episodes]:
-    """Returns `rollouts.evaluate` with all that a run fixes."""
+    """Returns `rollouts.evaluate` with the arguments that a run fixes."""
 
     def play(episode_seeds: Sequence[int], **options: Any) -> Episodes:
         return rollouts.evaluate(

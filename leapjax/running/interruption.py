@@ -8,15 +8,18 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-GRACE = 1.0  # seconds in which a signal should have its effect
+GRACE = 1.0  # seconds within which a signal should have its effect
 
 
 class Interrupted(BaseException):
-    """A signal asked the program to stop. No `Exception`: `except Exception` must not catch it."""
+    """A signal asked the program to stop.
+
+    This is not an `Exception`, so that `except Exception` does not catch it.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
-        # Ctrl-C is a failure to whoever waits for the command; a polite SIGTERM is not.
+        # The caller of the program sees Ctrl-C as a failure, and SIGTERM as a normal end.
         self.exit_code = 130 if number == signal.SIGINT else 0
 
 
@@ -41,7 +44,7 @@ class Interruption:
 
     @property
     def requested(self) -> int | None:
-        """The number of the signal that arrived, or None."""
+        """The number of the signal that arrived, or `None`."""
         return self._number
 
     def adopt(self, number: int) -> None:
@@ -49,13 +52,16 @@ class Interruption:
         self._number = self._number or number
 
     def check(self) -> None:
-        """Raises `Interrupted` if a signal arrived; Python may drop the first one in a callback."""
+        """Raises `Interrupted` if a signal arrived.
+
+        Python may have dropped the exception that `handle` raised in a callback.
+        """
         if self._number is not None:
             raise Interrupted(self._number)
 
     @contextlib.contextmanager
     def defer_signals(self) -> Iterator[None]:
-        """Defers signals: `requested` shows them inside, and the end of the block raises them."""
+        """Defers signals inside the block, where `requested` shows them; its end raises them."""
         self.check()
         self._deferred = True
         try:

@@ -16,16 +16,22 @@ from leapjax.errors import UserError, first_line
 from leapjax.processes import Cluster
 from leapjax.running import startup
 
-MOST_CPU_DEVICES = 8  # of more, each would have too little of a batch to do
+MOST_CPU_DEVICES = 8  # with more devices, each would get too small a share of a batch
 MOST_ASKED_FOR = 1024  # CPU devices; JAX takes half a minute to make 4,000
 CONNECT_SECONDS = 120
-# How many processes srun or mpirun has started. (Not SLURM_NTASKS, which a batch script that
-# starts one process has too.)
+# Variables with the number of processes that srun or mpirun has started. A batch script that starts
+# a single process has SLURM_NTASKS too, so that variable would not do.
 LAUNCHED = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
 class Promise(NamedTuple):
-    """A setting of JAX that a promise of this library depends on."""
+    """A setting of JAX that a promise of this library depends on.
+
+    Attributes:
+        setting: name of the setting.
+        allowed: values that keep the promise.
+        why: the promise, or what other values would break.
+    """
 
     setting: str
     allowed: Sequence[Any]
@@ -71,11 +77,11 @@ def start(cluster: Cluster = ALONE, cache: bool = True) -> None:
 
     Args:
         cluster: the processes that share the run.
-        cache: whether to keep compiled programs on disk; False measures compilation.
+        cache: whether to keep compiled programs on disk; False to measure compilation.
 
     Raises:
         UserError: a setting of JAX breaks a promise, the other processes cannot be reached, or
-            JAX can use no device.
+            JAX has no usable device.
     """
     check_promises()
     use_every_core()
@@ -94,7 +100,7 @@ def check_promises() -> None:
         UserError: a setting breaks a promise.
     """
     for setting, allowed, why in PROMISES:
-        value = getattr(jax.config, setting, allowed[0])  # not every version has them all
+        value = getattr(jax.config, setting, allowed[0])  # some versions lack some settings
         value = value.name.lower() if isinstance(value, enum.Enum) else value
         if value not in allowed:
             raise UserError(
@@ -107,7 +113,7 @@ def check_devices() -> None:
     """Starts JAX, unless it has started.
 
     Raises:
-        UserError: it has no device, as with JAX_PLATFORMS=cuda where there is no GPU.
+        UserError: JAX has no device, for example because of JAX_PLATFORMS=cuda without a GPU.
     """
     try:
         jax.devices()
@@ -122,7 +128,7 @@ def connect(cluster: Cluster) -> None:
     """Joins the other processes of a run, if there are others.
 
     Raises:
-        UserError: they cannot be reached.
+        UserError: the other processes cannot be reached.
     """
     launched = any(_read_count(os.environ.get(name, "")) > 1 for name in LAUNCHED)
     if cluster.coordinator is None and not launched:
@@ -149,10 +155,10 @@ def _read_count(text: str) -> int:
 
 
 def leave_program(code: int) -> int:
-    """Returns the exit code of a program that ends early; with other processes, ends it here.
+    """Returns the exit code of a program that ends early; a run of several processes exits here.
 
-    JAX would wait minutes for the other processes, which wait for this one. Process 0 ends last:
-    JAX aborts the others without it, before they can print their errors.
+    JAX would wait minutes for the other processes, which wait for this process. Process 0 ends
+    last: without it JAX aborts the others before they can print their errors.
     """
     if jax.distributed.is_initialized():
         exit_at_once(code)
@@ -169,12 +175,12 @@ def exit_at_once(code: int) -> NoReturn:
 
 
 def use_every_core() -> None:
-    """Makes each core a JAX device of its own, as `leapjax.sharding` wants them.
+    """Makes each core a JAX device of its own, as `leapjax.sharding` expects.
 
-    `JAX_NUM_CPU_DEVICES`, if set, has the last word.
+    `JAX_NUM_CPU_DEVICES` overrides this, if it is set.
 
     Raises:
-        UserError: it is set to a number that JAX cannot make.
+        UserError: JAX cannot make that number of devices.
     """
     if "JAX_NUM_CPU_DEVICES" in os.environ:
         asked: int = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]

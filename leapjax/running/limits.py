@@ -18,7 +18,7 @@ from leapjax.rollouts import MOST_OPEN
 from leapjax.running import loggers, memory
 from leapjax.running.programs import PLANS_TOGETHER
 
-OUTCOME = 320  # bytes of an episode that is over, while all are gathered and written
+OUTCOME = 320  # bytes of a finished episode, while all episodes are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
 
 
@@ -26,7 +26,7 @@ def check(config: AnyConfig) -> None:
     """Checks that a run of a configuration can work.
 
     Raises:
-        UserError: names the option that cannot work.
+        UserError: an option cannot work; names it.
     """
     check_counts(config, "episodes")
     if config.training.steps and config.demos < 1:
@@ -39,7 +39,7 @@ def check(config: AnyConfig) -> None:
     if not 0 <= config.demos <= seeds.TRAINING_STRIDE:
         raise UserError(f"--demos {config.demos}: at most {seeds.TRAINING_STRIDE} are possible")
     loggers.check(config.loggers)
-    if config.checkpoint_seconds != math.inf:  # never before the end
+    if config.checkpoint_seconds != math.inf:  # infinity: only at the end
         check_number("--checkpoint-seconds", config.checkpoint_seconds, 0)
     check_integer("--context", config.context)
     check_number("--rules", config.rules, 0)
@@ -51,7 +51,7 @@ def check(config: AnyConfig) -> None:
     recorded = (
         storage.describe_dataset(config.demonstrations).level if config.demonstrations else None
     )
-    # `module:id` is an environment that a module registers; data know it by its id.
+    # `module:id` is an environment that a module registers; data sets name only the id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
         raise UserError(
             f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
@@ -76,7 +76,7 @@ def check(config: AnyConfig) -> None:
             f"{domain.max_steps} steps come before a state"
         )
     check_memory(config, domain)
-    # Making an agent is cheap, and raises what its method cannot do.
+    # Making an agent is cheap, and raises an error for options that its method lacks.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
     fill = getattr(config.planner, "fill", "together")
     if not agent.energy.accepts_mask and fill != "together":
@@ -118,13 +118,12 @@ def check_target_return(config: AnyConfig) -> None:
 
 
 def check_memory(config: AnyConfig, domain: Domain) -> None:
-    """Checks that the machine has the least memory that a configuration needs.
+    """Compares the machine's memory with a lower bound on the need of a configuration.
 
-    The estimate is arithmetic on the options. `memory.check_program` measures exactly, after
-    compilation.
+    The bound comes from the options. `memory.check_program` measures exactly, after compilation.
 
     Raises:
-        UserError: names the options that need too much.
+        UserError: the memory is too small; names the options that need too much.
     """
     model, search, training = config.model, config.planner, config.training
     horizon, paper = search.horizon, model.architecture == "paper"
@@ -132,7 +131,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
     context = (observation + 8) * (config.context + 1)
     tokens = 2 * (horizon + config.context) if paper else horizon
     layer = count_layer_bytes(model, tokens)
-    times = domain.max_steps if paper else 0  # each has an embedding
+    times = domain.max_steps if paper else 0  # each time step has an embedding
     embeddings = times + tokens + domain.num_actions
     needs = {
         # Parameters, their gradients and Adam's two moments.
@@ -149,10 +148,10 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         activations = together * copies * model.layers * layer
         needs["--batch, --context, --horizon"] = training.batch * context + activations
         source = domain.demonstrations.source
-        # A demonstration has two states at least.
+        # A demonstration has at least two states.
         states = 2 * config.demos if source is None else source.amount
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation
-    # Plans are made together. Each restart is scored, as are candidates: with T passes.
+    # The planner makes plans in one batch. Scoring a restart or a candidate takes T passes.
     many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
     scored = (many > 1 and not hasattr(search, "beams")) or search.score
     passes = many * (horizon if scored else 1)
@@ -166,8 +165,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
 
 
 def count_layer_bytes(model: ModelConfig, tokens: int) -> int:
-    """Returns the least number of bytes of activations of a layer for a number of tokens."""
-    # Queries, keys, values and so on; and the weights of attention.
+    """Returns a lower bound on the bytes of a layer's activations for a number of tokens."""
+    # Queries, keys, values and so on; then the weights of attention.
     return 4 * (12 * model.width * tokens + model.heads * tokens**2)
 
 
@@ -175,17 +174,17 @@ def check_counts(options: object, *names: str) -> None:
     """Checks that options which count something are positive and not too large.
 
     Raises:
-        UserError: names the option.
+        UserError: an option is too small or too large; names it.
     """
     for name in names:
         check_integer(f"--{name.replace('_', '-')}", getattr(options, name), 1)
 
 
 def check_executed(executed: int | None, horizon: int, of: str = "") -> None:
-    """Checks that a plan has as many actions as are to be executed.
+    """Checks that a plan has at least as many actions as a run executes.
 
     Raises:
-        UserError: names the horizon.
+        UserError: the plan is too short; names its horizon.
     """
     if executed is not None and not 1 <= executed <= horizon:
         raise UserError(f"--executed {executed} is not in 1 .. {horizon}, the horizon{of}")

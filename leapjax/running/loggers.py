@@ -18,19 +18,31 @@ Log = Callable[[int, Mapping[str, float]], None]  # (training step, values by na
 
 
 class Logger(NamedTuple):
-    """The functions of an open logger."""
+    """The functions of an open logger.
+
+    Attributes:
+        log: (training step, values by name); logs measurements.
+        close: closes the logger.
+    """
 
     log: Log
     close: Callable[[], None]
 
 
 class About(NamedTuple):
-    """Description of a run for its loggers."""
+    """Description of a run for its loggers.
+
+    Attributes:
+        folder: folder of the run.
+        name: hash of its configuration, by which a resumed run finds its log.
+        configuration: settings of the run, as JSON values.
+        begin: number of training steps that were done and logged before.
+    """
 
     folder: Path
-    name: str  # of its configuration: a run that goes on has the same
+    name: str
     configuration: Mapping[str, Any]
-    begin: int  # training steps that were done, and logged, before
+    begin: int
 
 
 def log_nothing(step: int, values: Mapping[str, float]) -> None:

@@ -33,7 +33,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     """Runs every level, method and seed; raises the first failure after all others have run."""
     configs = parse(experiment.domain, arguments, experiment.config, experiment.module)
     jax_setup.start(configs[0].cluster)
-    versions = results.find_versions()  # of the code that runs, whatever is committed meanwhile
+    versions = results.find_versions()  # read now: later commits do not change this program
     console = Console(quiet=not processes.is_first(), markup=False)
     runs = [(config, seed) for config in configs for seed in config.seeds]
     rows, failure = [], None
@@ -43,7 +43,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
             for again in find_searches(experiment, config, seed):
                 rows.append(finish(experiment, again, seed, versions, console, interruption))
         except shell.FAILURES as error:
-            if len(runs) > 1:  # the others can still be run
+            if len(runs) > 1:  # the other runs go on
                 console.print(f"{config.level}, seed {seed}, failed: {shell.describe(error)}")
             failure = failure or error
     if rows:
@@ -60,7 +60,7 @@ def finish(
     console: Console,
     interruption: Interruption,
 ) -> results.Row:
-    """Returns the row of one level and one seed; runs it if it is not recorded."""
+    """Returns the row of a configuration and a seed; runs it unless the row is recorded."""
     rows, name = locate_rows(experiment, config), hash_config(config, seed)
     # Always read: a damaged file raises here, before hours of work.
     known = processes.run_on_first(lambda: results.find(rows, name))
@@ -77,10 +77,10 @@ def finish(
 
 
 def check_start(run: Run) -> None:
-    """Checks, before hours of work, what would fail after them.
+    """Checks conditions that would otherwise fail after hours of work.
 
     Raises:
-        UserError: fewer episodes than processes, or a folder that cannot be written to.
+        UserError: there are fewer episodes than processes, or a folder cannot be written to.
     """
     if run.config.episodes < jax.process_count():
         raise UserError(
@@ -106,7 +106,7 @@ def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[
     """Returns configurations that plan in other ways with the parameters of a run.
 
     Raises:
-        UserError: the folder of the run is missing, and one of these configurations has no row.
+        UserError: the folder of the run is missing, and some of these configurations have no row.
     """
     if config.checkpoint is not None or experiment.searches is None:
         return []

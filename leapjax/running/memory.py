@@ -1,4 +1,4 @@
-"""Checks before a run that memory suffices: a machine without memory kills the process."""
+"""Checks before a run that memory suffices: the system kills a process that exceeds it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,10 +14,10 @@ def check(needs: Mapping[str, int]) -> None:
     """Checks that the machine has enough memory.
 
     Args:
-        needs: bytes, by the options that ask for them.
+        needs: number of bytes, by the options that need them.
 
     Raises:
-        UserError: names the options.
+        UserError: the memory is too small; names the options.
     """
     for options, needed in needs.items():
         check_memory(needed, options)
@@ -27,10 +27,10 @@ def check_state(state: TrainState) -> None:
     """Checks that the network can be trained in this machine's memory.
 
     Args:
-        state: shapes of all that training changes. Gradients are as large as the parameters.
+        state: shapes of the training state. Gradients are as large as the parameters.
 
     Raises:
-        UserError: says how large it is.
+        UserError: the state is too large; says its size.
     """
     sizes = "--width, --layers, and sizes of the method and the domain"
     check({sizes: _count_bytes(state) + _count_bytes(state.params)})
@@ -40,10 +40,10 @@ def check_program(program: Any) -> None:
     """Checks that a compiled step of training fits into memory.
 
     Args:
-        program: compiled for the devices of this machine.
+        program: program compiled for the devices of this machine.
 
     Raises:
-        UserError: says how much it needs.
+        UserError: the step needs too much memory; says how much.
     """
     found = program.memory_analysis()
     if found is None or jax.default_backend() != "cpu":  # GPUs have memory of their own

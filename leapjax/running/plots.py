@@ -37,10 +37,10 @@ def draw_success_by_iteration(
     """Plots success against planning iterations (paper, figure 6, left).
 
     Args:
-        iterations: after how many iterations plans were executed.
-        outcomes: (successes, episodes) for each.
-        title: of the plot.
-        path: to write.
+        iterations: numbers of iterations after which plans were executed.
+        outcomes: (successes, episodes) for each number of iterations.
+        title: title of the plot.
+        path: file to write.
     """
     rates = [100 * good / count for good, count in outcomes]
     bounds = [scores.wilson_interval(good, count) for good, count in outcomes]

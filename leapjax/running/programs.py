@@ -1,4 +1,4 @@
-"""Compiles the programs of a run in the background, while its data are made."""
+"""Compiles the programs of a run in the background, while the run makes its data."""
 
 import concurrent.futures
 import time
@@ -21,8 +21,8 @@ from leapjax.types import Agent, TrainState
 if TYPE_CHECKING:
     from leapjax.running.run import Run
 
-# Plans that are made together in a run. One program is soon compiled. Larger chunks are a tenth
-# faster, and the last episodes of an evaluation would rather have smaller ones.
+# Number of plans in a chunk. A single chunk size needs a single program, which compiles soon.
+# Larger chunks are a tenth faster, but suit the last episodes of an evaluation less.
 PLANS_TOGETHER = 32
 
 
@@ -30,10 +30,10 @@ class Programs(NamedTuple):
     """The compiled programs of a run.
 
     Attributes:
-        agent: of its method.
+        agent: agent of the run's method.
         begin: (seed) -> the first training state, and the key of all batches.
-        step: one step of training.
-        plan: its planner.
+        step: performs one step of training.
+        plan: makes plans.
     """
 
     agent: Agent
@@ -43,27 +43,27 @@ class Programs(NamedTuple):
 
 
 class BackgroundPrograms:
-    """Compiles the programs of a run, once, in threads of its own."""
+    """Compiles the programs of a run, once, in background threads."""
 
     def __init__(self) -> None:
         self._wait: Callable[[], Programs] | None = None
 
     def begin(self, run: "Run") -> None:
-        """Begins to compile, unless that has begun."""
+        """Starts to compile, unless it has started."""
         if self._wait is None:
             self._wait = _compile(run)
 
     def take(self, run: "Run") -> Programs:
-        """Returns the programs, once they are compiled."""
+        """Waits for the compiled programs, and returns them."""
         self.begin(run)
         assert self._wait is not None
         return self._wait()
 
 
 def _compile(run: "Run") -> Callable[[], Programs]:
-    """Begins to compile in the background; returns a function that waits for the programs."""
+    """Starts to compile in the background; returns a function that waits for the programs."""
     config, domain = run.config, run.domain
-    plays = run.plays and not config.rules  # with rules another planner plays: see `add_rules`
+    plays = run.plays and not config.rules  # with rules, `add_rules` makes another planner
     mesh = make_mesh(config)
     agent = pretrained.make_agent(run.specification, domain, mesh)
     plan = compile_planner(
@@ -102,7 +102,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
 
 
 def choose_chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
-    """Returns the number of plans that are made together: at most `PLANS_TOGETHER`."""
+    """Returns the size of a run's chunks of plans, in a tuple: at most `PLANS_TOGETHER`."""
     return (min(PLANS_TOGETHER, 1 << (config.episodes - 1).bit_length()),)
 
 
@@ -110,7 +110,7 @@ def make_mesh(config: AnyConfig) -> Mesh:
     """Makes the mesh of the devices of all processes that a run trains on.
 
     Raises:
-        UserError: they cannot share the batch.
+        UserError: the devices cannot share the batch.
     """
     try:
         examples = config.training.batch // config.training.consecutive

@@ -7,11 +7,18 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-LOG_INTERVAL = 10.0  # seconds between lines where there is no terminal
+LOG_INTERVAL = 10.0  # seconds between lines without a terminal
 
 
 class Meter:
-    """Shows how far one piece of work is, how fast it goes and how long it will take."""
+    """Shows the progress of some work, its speed and the time left.
+
+    Args:
+        console: console to print on.
+        title: name of the work.
+        total: amount of all work, in steps or other units.
+        done: amount that was done before.
+    """
 
     def __init__(self, console: Console, title: str, total: int, done: int = 0) -> None:
         self._console, self._title, self._total = console, title, total

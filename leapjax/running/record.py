@@ -102,7 +102,7 @@ def describe_success(run: Run) -> dict[str, Any]:
 
 
 def draw(run: Run, planner: Pretrained) -> None:
-    """Draws the training curve, and success against iterations where the experiment asks for it."""
+    """Draws the training curve, and success against iterations if the experiment asks for it."""
     config, folder = run.config, run.folder
     folder.mkdir(parents=True, exist_ok=True)
     metrics = [] if config.checkpoint else read_metrics(folder)

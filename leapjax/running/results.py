@@ -39,7 +39,7 @@ from leapjax.version import find_version
 
 Row = dict[str, Any]
 EPISODE = np.dtype([("seed", "<i8"), ("success", "?"), ("return", "<f8"), ("length", "<i4")])
-# What every row has; a float may be written as an integer.
+# Fields of every row; a float may be written as an integer.
 FIELDS = {
     "experiment": str, "domain": str, "level": str, "method": str, "preset": str, "hash": str,
     "seed": int, "episodes": int, "successes": int, "mean_length": float,
@@ -56,14 +56,14 @@ ROW: dict[str, Schema] = {
     "train_seconds": AMOUNT,
     "eval_seconds": AMOUNT,
     "plans_per_second": POSITIVE,
-    # What only some rows have, and a terminal shows.
+    # Fields that only some rows have, and that a terminal shows.
     "success": Absent(Number(0, 1)),
     "demos_seconds": Absent(AMOUNT),
     "mean_return": Absent(float),
     "paper_success": Absent(Nullable(Number(0, 100))),
     "configuration": Absent({"planner": Absent(dict)}),
 }
-# Rows of an experiment, and of an analysis, with what tables read.
+# Rows of an experiment, and of an analysis, with the fields that tables read.
 OF_EXPERIMENT: dict[str, Schema] = {
     **ROW,
     "train_steps": COUNT,
@@ -93,14 +93,14 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
         schema: schema of each row.
 
     Raises:
-        UserError: a line is not a row, by its number; or two rows have one hash: a table would
-            count one seed twice.
+        UserError: a line is not a row, or two rows have the same hash, so that a table would count
+            a seed twice; names the line.
     """
     if not path.exists():
         return []
     rows = []
     line_of: dict[str, int] = {}  # by hash
-    # Split where JSON lines are: other kinds of line end may be inside of a text.
+    # `splitlines` would also split at other line ends, which a JSON text may contain.
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line.strip():
             continue
@@ -112,7 +112,7 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
         wrong = find_problem(row, schema) or _find_contradiction(row)
         if wrong:
             raise UserError(f"{path}, line {number}: {wrong}")
-        row["success"] = compute_success(row)  # rows of an earlier version have counts alone
+        row["success"] = compute_success(row)  # rows of an earlier version have only counts
         first = line_of.setdefault(row["hash"], number)
         if first != number:
             raise UserError(
@@ -124,7 +124,7 @@ def read(path: Path, schema: Schema = ROW) -> list[Row]:
 
 
 def _find_contradiction(row: Row) -> str | None:
-    """Returns how fields of a row contradict each other, or None."""
+    """Describes how fields of a row contradict each other; returns `None` if they agree."""
     for name in ("successes", "first_pass_successes"):
         if (row.get(name) or 0) > row["episodes"]:
             return f"{row[name]} {name} of {row['episodes']} episodes"
@@ -150,11 +150,11 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
 
     Args:
         path: file of rows.
-        row: to be added.
-        episodes: of the row; `read_episodes` returns them.
+        row: row to add.
+        episodes: episodes of the row; `read_episodes` returns them.
 
     Raises:
-        UserError: the row holds a number that is not finite, which JSON has no word for.
+        UserError: the row holds a number that is not finite, which JSON cannot represent.
     """
     for name, value in row.items():
         try:
@@ -163,8 +163,8 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
             raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
     with lock_folder(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
-        # First, so that a process killed in between leaves episodes without a row, which the next
-        # one drops, and no row without its episodes.
+        # Episodes first: a process that is killed in between leaves episodes without a row, which
+        # the next process drops.
         known, hashes = read_episodes(path), {other["hash"] for other in rows}
         tables = {name: each for name, each in known.items() if name in hashes}
         if episodes is not None:
@@ -176,7 +176,7 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
 
 
 def change(path: Path, changed: Callable[[Any], Any]) -> Any:
-    """Rewrites a JSON file atomically; `changed` maps its old value, or None, to the new one."""
+    """Rewrites a JSON file atomically; `changed` maps its value, or `None`, to the new value."""
     with lock_folder(path.parent, wait=True):
         found = changed(read_json(path) if path.exists() else None)
         write_text(path, json.dumps(found, indent=1) + "\n")
@@ -189,13 +189,13 @@ def add(path: Path, name: str, value: Any) -> dict[str, Any]:
 
 
 def as_table(episodes: Episodes) -> np.ndarray:
-    """Returns what became of each episode: an array `[E]` with the fields of `EPISODE`."""
+    """Returns the outcome of each episode: an array `[E]` with the fields of `EPISODE`."""
     columns = episodes.seeds, episodes.successes, episodes.returns, episodes.lengths
     return np.array(list(zip(*columns, strict=True)), EPISODE)
 
 
 def write_csv(path: Path, episodes: Episodes) -> None:
-    """Writes what became of each episode as text."""
+    """Writes the outcome of each episode as CSV."""
     lines = (f"{seed},{good:d},{total:.6g},{n}" for seed, good, total, n in as_table(episodes))
     write_text(path, "\n".join([",".join(EPISODE.names or ()), *lines]) + "\n")
 
@@ -206,7 +206,7 @@ def _locate_episodes(path: Path) -> Path:
 
 
 def read_episodes(path: Path) -> dict[str, np.ndarray]:
-    """Reads the episodes of rows, which not every row has.
+    """Reads the recorded episodes of rows; some rows have no episodes.
 
     Args:
         path: file of the rows.
@@ -232,14 +232,14 @@ def read_episodes(path: Path) -> dict[str, np.ndarray]:
 
 
 def _write_episodes(path: Path, tables: Mapping[str, np.ndarray]) -> None:
-    # An array a row: where a row is added, git stores the new one and shares the others.
+    # One array per row: when a row is added, git stores its array and shares the others.
     arrays: Any = tables  # NumPy's stubs take the arrays for its other arguments
     with write_whole(path) as scratch:
         np.savez_compressed(scratch, **arrays)
 
 
 def find(path: Path, configuration: str) -> Row | None:
-    """Returns the recorded row of a configuration, or None."""
+    """Returns the row with the hash of a configuration; `None` if no row has it."""
     return next((row for row in read(path) if row["hash"] == configuration), None)
 
 
@@ -260,8 +260,8 @@ def find_versions() -> dict[str, str]:
 def find_code_version(root: Path) -> str:
     """Returns the commit that last changed the code, as a local version: "+g1a2b3c4".
 
-    Adds ".dirty" if the code differs from that commit; returns "" without a repository. It need
-    not be the last commit: rows are committed too.
+    Adds ".dirty" if the code differs from that commit; returns "" without a repository. Later
+    commits may change other files, such as rows.
     """
     code = ("--", "leapjax", "experiments", "benchmarks")
 
@@ -279,7 +279,7 @@ def find_code_version(root: Path) -> str:
 
 
 def format_date() -> str:
-    """Returns the date of today as text."""
+    """Returns today's date as text."""
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
@@ -306,7 +306,7 @@ def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row
 
     Args:
         rows: rows of any seeds.
-        key: (row) -> everything that tells rows apart except the seed.
+        key: (row) -> a value that tells rows apart by everything except the seed.
     """
     groups: dict[Any, list[Row]] = {}
     for row in rows:
@@ -340,7 +340,7 @@ def format_return(row: Row) -> str:
 
 
 def _find_number(row: Row, name: str) -> float | None:
-    """A number that a row need not have."""
+    """Returns an optional number of a row; `None` if the row lacks it."""
     value = row.get(name)
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
@@ -359,9 +359,9 @@ def name_planner(row: Row) -> str:
 
 
 def make_success_table(rows: Sequence[Row]) -> Table:
-    """Success rates beside the paper's; below, the mean over training seeds if there are several.
+    """Makes a table of success rates beside the paper's, and of means over several training seeds.
 
-    The mean return comes first where a row's criterion of success was not given by the user.
+    The mean return comes first if the user did not give the criterion of success of some row.
     """
     measures = {
         "success [95%]": (format_success, format_rate_over_seeds),

@@ -28,18 +28,18 @@ from leapjax.running.programs import BackgroundPrograms
 
 
 class Experiment(NamedTuple):
-    """What one program adds to the steps that all programs share.
+    """The name and the functions of an experiment, by which its program differs from others.
 
     Attributes:
         name: name of its module and of its file of rows.
         domain: name of its domain.
         searches: (configuration) -> configurations that plan in other ways with the trained
-            parameters; each makes a row. None if there are no other ways.
-        animate: (planner, run, level seeds, path): draws plans that are refined and executed.
+            parameters; each makes a row. `None` if the experiment has a single way.
+        animate: (planner, run, level seeds, path); draws how plans are refined and executed.
         iterations: whether to draw success against the number of iterations.
         config: `Config`, or a subclass with the program's own names of options.
-        paper: (level, method) -> the paper's success, in percent, or None; None if the paper has
-            no such experiment.
+        paper: (level, method) -> the paper's success, in percent, or `None`. The field is `None` if
+            the paper has no such experiment.
         package: package of its module.
     """
 
@@ -71,8 +71,8 @@ class Run:
         played: level seeds of the episodes that measure success.
         console: prints progress.
         interruption: tells the run to stop.
-        opened: closes at the end of the run what its steps open.
-        plays: whether the planner will play; if not, the run compiles no plans.
+        opened: collects what the steps open, and closes it at the end of the run.
+        plays: whether the planner will play; if not, the run compiles no planner.
         log: receives measurements as they are made.
         programs: compiles the programs of the run in the background.
         seconds: seconds that each part of the run took; the steps fill it in.
@@ -120,7 +120,7 @@ def open_run(
     played: range | None = None,
     plays: bool = True,
 ) -> Iterator[Run]:
-    """Opens a run of one level and one seed, with its loggers; closes all that its steps open.
+    """Opens a run of one level and one seed, with its loggers; closes everything at the end.
 
     Args:
         experiment: the experiment that the run belongs to.
@@ -128,7 +128,8 @@ def open_run(
         seed: training seed.
         console: prints progress.
         interruption: tells the run to stop.
-        played: level seeds that the run may not learn from; None for the configuration's.
+        played: level seeds that the run may not learn from; `None` for the episodes that the
+            configuration plays.
         plays: whether the planner will play.
     """
     domain = make_domain(config)

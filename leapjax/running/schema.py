@@ -1,18 +1,25 @@
 """Checks JSON values against a schema.
 
-A schema is a type, one of the classes below, or a dictionary: an object with at least these
-fields. `int` and `float` are finite numbers, a float may be written as an integer.
+A schema is a type, an instance of a class below, or a dictionary. A dictionary describes an object
+with at least these fields. `int` and `float` describe finite numbers; a float may be written as an
+integer.
 """
 
 import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-LARGEST = 1e18  # of numbers that a run could give
+LARGEST = 1e18  # the largest number that a run could give
 
 
 class Number(NamedTuple):
-    """A number between two bounds, which it may reach."""
+    """A number in a range.
+
+    Attributes:
+        least: the smallest number allowed.
+        most: the largest number allowed.
+        whole: whether it must be an integer.
+    """
 
     least: float = -LARGEST
     most: float = LARGEST
@@ -20,33 +27,55 @@ class Number(NamedTuple):
 
 
 class OneOf(NamedTuple):
-    """One of some texts."""
+    """A text from a list.
+
+    Attributes:
+        texts: the allowed texts.
+    """
 
     texts: Sequence[str]
 
 
 class Each(NamedTuple):
-    """An array whose elements have one schema."""
+    """An array whose elements share a schema.
+
+    Attributes:
+        schema: schema of every element.
+        least: the smallest number of elements allowed.
+    """
 
     schema: Any
-    least: int = 0  # elements
+    least: int = 0
 
 
 class Named(NamedTuple):
-    """An object whose values have one schema, whatever their names."""
+    """An object of any names whose values share a schema.
+
+    Attributes:
+        schema: schema of every value.
+        least: the smallest number of values allowed.
+    """
 
     schema: Any
-    least: int = 0  # values
+    least: int = 0
 
 
 class Absent(NamedTuple):
-    """A field that may be missing."""
+    """A field that may be missing.
+
+    Attributes:
+        schema: schema of its value.
+    """
 
     schema: Any
 
 
 class Nullable(NamedTuple):
-    """A value that may be null."""
+    """A value that may be null.
+
+    Attributes:
+        schema: schema of any other value.
+    """
 
     schema: Any
 
@@ -63,8 +92,8 @@ def parse_json(text: str) -> Any:
     """Parses a JSON text.
 
     Raises:
-        ValueError: it is not JSON, or an object names a field twice.
-        RecursionError: it is nested too deeply.
+        ValueError: the text is not JSON, or an object names a field twice.
+        RecursionError: the text is nested too deeply.
     """
     return json.loads(text, object_pairs_hook=_make_object)
 
@@ -79,12 +108,12 @@ def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def find_problem(value: Any, schema: Schema, name: str = "") -> str | None:
-    """Describes the first error of a value, with the path of the field; None if it is valid.
+    """Describes the first error of a value, with the path of the field; `None` if it is valid.
 
     Args:
         value: parsed JSON.
         schema: schema of the value.
-        name: path of the value from the outermost one.
+        name: path from the outermost value to this value.
     """
     if isinstance(schema, Absent):
         schema = schema.schema

@@ -1,4 +1,4 @@
-"""Starts and ends programs: a user's mistake is one line and exit code 2."""
+"""Starts and ends programs: a user's mistake prints one line, with exit code 2."""
 
 import errno
 import shlex
@@ -20,7 +20,7 @@ FAILURES = (UserError, NotANumber, NonFiniteLoss)  # each ends one run, with an 
 
 
 def read_arguments(arguments: Sequence[str] | None) -> list[str]:
-    """Returns the given arguments, or those of the process.
+    """Returns the given arguments; by default the arguments of the process.
 
     Raises:
         SystemExit: a value is empty; prints an error of one line.
@@ -34,10 +34,10 @@ def read_arguments(arguments: Sequence[str] | None) -> list[str]:
 
 
 def check_values(arguments: Sequence[str]) -> None:
-    """Checks that no value is empty: a shell makes empty values of unset variables.
+    """Checks that no value is empty: a shell turns unset variables into empty values.
 
     Raises:
-        UserError: names the option.
+        UserError: a value is empty; names the option.
     """
     option = "an argument"
     for argument in arguments:
@@ -72,7 +72,7 @@ def run_program(module: str, arguments: Sequence[str], work: Callable[[], object
 
     Args:
         module: module of the program.
-        arguments: command line, which an interrupted program prints to continue with.
+        arguments: command line, which an interrupted program prints so that a user can continue.
         work: does the work.
     """
     try:
@@ -106,7 +106,7 @@ def run_program(module: str, arguments: Sequence[str], work: Callable[[], object
 
 
 def describe(error: Exception) -> str:
-    """Returns the message of an error with the options that it is about."""
+    """Returns the message of an error, with the options to change."""
     options = [f"--{name.replace('_', '-')}" for name in getattr(error, "fields", ())]
     return f"{error} ({', '.join(options)})" if options else str(error)
 
@@ -117,7 +117,7 @@ def run_interruptible_program(
     """Runs long work as `run_program` does; SIGINT and SIGTERM stop it after saving."""
 
     def give_up(stopped: Interrupted) -> None:
-        if not jax.distributed.is_initialized():  # the others would wait for this one
+        if not jax.distributed.is_initialized():  # the others would wait for this process
             stop(module, arguments, stopped)
 
     def interrupted_or_done() -> None:
@@ -131,7 +131,7 @@ def stop(module: str, arguments: Sequence[str], stopped: Interrupted) -> NoRetur
     """Ends an interrupted program and prints the command that continues it."""
     command = " ".join([startup.format_command(module), *map(shlex.quote, arguments)])
     print(f"stopped by {stopped}; continue with: {command}", file=sys.stderr)
-    # At once: threads that still compile or write would crash in the interpreter's own end.
+    # Exits at once: while the interpreter shuts down, threads that compile or write would crash.
     jax_setup.exit_at_once(stopped.exit_code)
 
 

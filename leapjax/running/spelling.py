@@ -17,8 +17,8 @@ class GymnasiumConfig(Config[M, D, P]):
         level: Id of a Gymnasium environment with discrete actions, or module:id to import the
             module first. Without it, the environment that the data set names.
         demonstrations: Id of a Minari data set of the environment to train on.
-        play: Environment to play instead of the one that the planner of a checkpoint was trained
-            on.
+        play: Environment to play instead of the environment that the checkpoint's planner was
+            trained on.
     """
 
     level: Annotated[str, tyro.conf.arg(name="env")]
@@ -32,12 +32,12 @@ class AtariConfig(Config[M, D, P]):
     Attributes:
         level: Game: Breakout, Qbert, Pong or Seaquest; "all" for all of them.
         demos: Games to learn from, at most; see `--transitions`.
-        demonstrations: Folder of DQN-Replay's files to train on, in place of data/atari, where
-            games of built-in demonstrators are made.
+        demonstrations: Folder of DQN-Replay's files to train on, instead of data/atari, where the
+            program stores games of built-in demonstrators.
         episodes: Held-out games to measure the score on.
         test_seed: Seed of the first of these games.
         validation: Measure the score on validation games instead, to choose settings.
-        play: Game to play instead of the one that the planner of a checkpoint was trained on.
+        play: Game to play instead of the game that the checkpoint's planner was trained on.
         pretrained: Evaluate the planner that comes with the library for the game, instead of
             training.
     """
@@ -45,5 +45,5 @@ class AtariConfig(Config[M, D, P]):
     level: Annotated[str, tyro.conf.arg(name="game")]
 
 
-# By domain; others have the names of `Config`.
+# By domain; other domains have the names of `Config`.
 SPELLINGS: Mapping[str, type[AnyConfig]] = {"gymnasium": GymnasiumConfig, "atari": AtariConfig}

@@ -20,10 +20,9 @@ UNREAD = 128 + signal.SIGPIPE  # exit code after the reader of the output has go
 
 
 def is_program() -> bool:
-    """Whether the interpreter is about to run a module of this package as a program.
+    """Returns whether the interpreter is about to run a module of this package as a program.
 
-    While `python -m` looks for a module, and imports the packages that hold it, its name for the
-    program is "-m".
+    The name of the program is "-m" while `python -m` looks for a module and imports its packages.
     """
     return str(find_program()) == "-m" or find_program().stem == COMMAND
 
@@ -37,7 +36,7 @@ def prepare() -> None:
     """Lets signals end the program at once, makes every text printable, and imports JAX.
 
     Exits with 0 after --version, which needs no JAX. Exits with 2, and one line, if JAX cannot be
-    imported: it reads its settings then.
+    imported, for example because a setting is wrong.
     """
     for number in SIGNALS:
         signal.signal(number, end_on_signal)
@@ -60,8 +59,8 @@ def prepare() -> None:
 class Output(io.TextIOWrapper):
     """A stream that ends the program when its reader has gone, as in `--help | head`.
 
-    Other programs are ended by SIGPIPE. That signal would also end this one where a worker process
-    or a logger has gone, which are failures that can be reported.
+    SIGPIPE ends other programs then. It would also end this program when a worker process or a
+    logger has gone, instead of letting it report the failure.
     """
 
     def write(self, text: str) -> int:
@@ -81,7 +80,7 @@ class Output(io.TextIOWrapper):
 
 def make_output(stream: TextIO) -> TextIO:
     """Wraps a standard stream in `Output`, which replaces unencodable characters."""
-    if not isinstance(stream, io.TextIOWrapper):  # None, or replaced by another library
+    if not isinstance(stream, io.TextIOWrapper):  # `None`, or replaced by another library
         return stream
     return Output(
         stream.buffer, stream.encoding, "replace",
@@ -111,7 +110,7 @@ def format_command(module: str) -> str:
 def find_modules_here() -> None:
     """Lets the installed command import from the working folder, as `python -m` does.
 
-    Called once `leapjax` is imported: it is the installed one, whatever is in that folder.
+    Call it after importing `leapjax`, so that the folder cannot replace the installed package.
     """
     if find_program().stem == COMMAND and not sys.flags.safe_path:
         with contextlib.suppress(OSError):  # the working folder was removed
@@ -119,7 +118,7 @@ def find_modules_here() -> None:
 
 
 def end_on_signal(number: int, _: FrameType | None = None) -> None:
-    """The signal handler until `catch_signals` has its own.
+    """Handles signals until `catch_signals` does: prints one line, and ends the program.
 
     It must not raise: imports and callbacks of the interpreter may drop exceptions.
     """
@@ -143,14 +142,14 @@ def print_unraisable(failure: "sys.UnraisableHookArgs") -> None:
 def print_uncaught(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    """The hook for exceptions that end the program.
+    """Prints an exception that ends the program; Python calls this hook.
 
-    A missing extra is one line and exit code 2: a program imports optional modules before its
-    `main` can handle errors. All other errors are printed as Python does.
+    For a missing extra it prints one line and exits with 2: a program imports optional modules
+    before its `main` can handle errors. It prints all other errors as Python does.
     """
     from leapjax.extras import explain_missing  # noqa: PLC0415  (imports JAX)
 
-    spec = sys.modules["__main__"].__spec__  # None for the installed script
+    spec = sys.modules["__main__"].__spec__  # `None` for the installed script
     explanation = explain_missing(error, find_extra(spec.name if spec else ""))
     if explanation is None:
         sys.__excepthook__(kind, error, trace)
@@ -162,7 +161,7 @@ def print_uncaught(
 def find_extra(module: str) -> str:
     """Returns the extra that a program needs, by its module, such as `experiments.atari`.
 
-    A program named after a domain needs the extra of that domain, all others need BabyAI's.
+    A program named after a domain needs the domain's extra; other programs need BabyAI's.
     """
     from leapjax.domains import DOMAINS, Place  # noqa: PLC0415  (imports JAX)
 

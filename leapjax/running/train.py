@@ -1,4 +1,4 @@
-"""Trains the network of a run, or goes on where it stopped."""
+"""Trains the network of a run, or resumes its training."""
 
 import contextlib
 import dataclasses
@@ -23,25 +23,26 @@ from leapjax.running.run import Run
 from leapjax.types import Demonstration, Energy, Params, TrainState
 
 Watch = Callable[[Energy, Params], dict[str, float]]
-REPORT_SECONDS = 5.0  # at most between reports, which save checkpoints and see signals
+REPORT_SECONDS = 5.0  # at most between reports, which save checkpoints and handle signals
 
 
 def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -> Pretrained:
-    """Trains, or goes on where the run stopped; the training curve is in its folder.
+    """Trains the network of a run, or resumes its training; writes the training curve.
 
     Args:
-        run: run to train; its folder is locked until it is closed.
+        run: run to train; its folder is locked until the run is closed.
         data: demonstrations to train on.
         watch: (energy, parameters) -> further measurements for each report of progress.
 
     Raises:
-        UserError: the folder is of another run or of other data, or another process works in it.
+        UserError: the folder belongs to another run or to other data, or another process works in
+            it.
         Interrupted: the run was asked to stop; its newest state is saved.
     """
     run = learn_statistics(run, data)
     processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
-    # Of Atari, as large as all frames: one copy on the host, until devices have theirs.
+    # In Atari these are all frames: the host keeps one copy until the devices have theirs.
     steps: Any = (
         windows.concatenate(data, run.domain.augmentations.extras, padded=True) if data else ()
     )
@@ -51,16 +52,17 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     state, key = begin(run.seed)
     steps = sharding.replicate(steps, make_mesh(config))
     compiling = time.perf_counter()
-    if total:  # the one program that depends on how many demonstrations there are
+    if total:  # the only program that depends on the number of demonstrations
         jax.block_until_ready(step.draw(key, state.step, steps))
     run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
-    processes.run_on_first(lambda: files.check_room(folder, 3 * size))  # two and the next
+    # Room for two checkpoints and the next.
+    processes.run_on_first(lambda: files.check_room(folder, 3 * size))
     saved = Checkpoints(
         folder / pretrained.CHECKPOINTS, pretrained.describe_identity(run.specification)
     )
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
-    # Not before: what does not fit the run that is there leaves it as it is.
+    # Only now: a run that does not fit the checkpoints in the folder must not change it.
     processes.run_on_first(lambda: pretrained.save_specification(folder, run.specification))
     metrics: Metrics = []
     if restored is not None:
@@ -86,7 +88,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
             run.log(done, {f"training/{name}": value for name, value in (means | seen).items()})
             meter.update(done, " ".join(f"{name} {mean:.3g}" for name, mean in means.items()))
             due = time.perf_counter() - last_saved > config.checkpoint_seconds
-            # Processes have their own clocks and signals, and must agree on what to do.
+            # Each process has its own clock and signals; all must agree whether to save and stop.
             signals, dues = zip(*processes.gather([run.interruption.requested, due]), strict=True)
             for number in filter(None, signals):
                 run.interruption.adopt(number)
@@ -99,7 +101,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
         often = REPORT_SECONDS if jax.process_count() == 1 else math.inf
         state = training.train(step, state, steps, key, total, report, report_seconds=often)
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
-    # Planning is each process's own business, on its own devices.
+    # Each process plans for itself, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
     return Pretrained(run.specification, agent.energy, params, plan, run.domain)
 

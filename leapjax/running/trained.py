@@ -18,12 +18,13 @@ def load_trained(run: Run) -> Pretrained:
     """Loads the planner of the checkpoint that a configuration names.
 
     Raises:
-        UserError: the configuration does not fit the trained planner, or a row would be recorded
-            of an unfinished run.
+        UserError: the configuration does not fit the trained planner, or the row of an unfinished
+            run would be recorded.
     """
     checkpoint = run.config.checkpoint
     assert checkpoint is not None
-    if run.config.play in (None, run.config.level):  # the seeds of another level are others
+    # On another level the same seeds give other episodes.
+    if run.config.play in (None, run.config.level):
         seeds.check_disjoint(find_demonstrated(checkpoint), run.played)
     trained = pretrained.read_specification(checkpoint)
     wanted, found = (_select_training_settings(s) for s in (run.specification, trained))
@@ -44,7 +45,7 @@ def load_trained(run: Run) -> Pretrained:
 
 
 def _select_training_settings(specification: Specification) -> dict[str, Any]:
-    """Returns the settings that a trained planner fixes: all except its search and target."""
+    """Returns the settings that a trained planner fixes: all except its search and its target."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}

@@ -1,9 +1,13 @@
-"""Demonstrations as Minari data sets: one path writes them, one path reads them.
+"""Stores demonstrations as Minari data sets: `save` writes them, `load` reads them.
 
-A user's own data set of the same observations is read in the same way. `datasets` names and finds
-data sets, `writing` and `reading` convert them to and from demonstrations, `inspection` protects
-from data of unknown origin, `episodes` checks each episode against its domain, `provenance` the
-environment of the data, and `sources` makes what does not exist yet.
+`load` also reads a user's own data sets of the same observations. The modules:
+
+- `datasets` names and finds data sets, and `spaces` describes their observations.
+- `writing` and `reading` convert demonstrations to data sets and back.
+- `inspection` protects from data of unknown origin.
+- `episodes` checks each episode against its domain.
+- `provenance` compares the environment of the data with the level.
+- `sources` makes missing data sets.
 """
 
 from leapjax.data.storage.datasets import (

@@ -12,7 +12,7 @@ from leapjax.domain import Described, Domain
 from leapjax.errors import UserError, first_line
 
 FORMAT = 2  # raise it whenever the content of a demonstration changes: old caches are then unused
-UNKNOWN_SEED = -1  # the seed of an episode whose data do not say it: no test level has it
+UNKNOWN_SEED = -1  # stands for the seed of an episode if unknown: no test level has this seed
 
 
 def name_dataset(domain: Domain, count: int, seed: int) -> str:
@@ -21,7 +21,7 @@ def name_dataset(domain: Domain, count: int, seed: int) -> str:
 
 
 def find_version(name: str) -> int | None:
-    """Returns the format of a data set that this library made, by its id; None for others."""
+    """Returns the format in the id of a data set that this library made; `None` for other ids."""
     found = re.fullmatch(r"leapjax/.*/bot-.*-v(\d+)", name)
     return int(found[1]) if found else None
 
@@ -48,7 +48,7 @@ def check_writable() -> None:
     """Checks that Minari's folder of data sets can be written to.
 
     Raises:
-        UserError: it cannot; names the folder.
+        UserError: the folder cannot be written to; names it.
     """
     root = find_datasets_folder()
     if not os.access(root, os.W_OK):
@@ -57,15 +57,15 @@ def check_writable() -> None:
 
 def has_dataset(name: str) -> bool:
     """Returns whether the local Minari folder has a data set with this id."""
-    # A folder without data is a namespace: others may be below it.
+    # A folder without `data` is a namespace, which may hold data sets.
     try:
         return (find_datasets_folder() / name / "data").exists()
-    except OSError:  # not a possible name of a file, or not readable
+    except OSError:  # an impossible file name, or an unreadable folder
         return False
 
 
 def describe_dataset(name: str) -> Described:
-    """Reads what the metadata of a data set say about its environment; unknown fields are None."""
+    """Reads the environment of a data set from its metadata; unknown fields are `None`."""
     path = find_datasets_folder() / name / "data" / "metadata.json"
     try:
         metadata = json.loads(files.read_text(path))

@@ -1,4 +1,4 @@
-"""Checks of one episode against a domain: its shapes, its types and the range of its numbers."""
+"""Checks an episode against a domain: shapes, types and ranges of numbers."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.types import Demonstration, PyTree
 
-STEPWISE = ("actions", "rewards", "terminations", "truncations")  # one element a step
+STEPWISE = ("actions", "rewards", "terminations", "truncations")  # one element per step
 
 
 def check_outline(outline: PyTree, domain: Domain, where: str) -> None:
@@ -34,14 +34,14 @@ def check_outline(outline: PyTree, domain: Domain, where: str) -> None:
                 f"{where}: {part} have shape {np.shape(outline[part])}, expected {steps}"
             )
     stored = outline["observations"]
-    # A domain with `replay` plays episodes with other observations again.
+    # A domain with `replay` replays episodes that have other observations.
     if domain.demonstrations.replay is None or _holds_fields(domain.blank, stored):
         observations = _arrange_like(domain.blank, stored, where)
         _check_shapes(observations, domain, steps[0] + 1, where)
 
 
 def _holds_fields(blank: PyTree, stored: Any) -> bool:
-    """Returns whether stored observations have all fields of a domain's."""
+    """Returns whether stored observations have all fields of a domain's observations."""
     dictionaries = isinstance(stored, dict) and not isinstance(blank, np.ndarray)
     return dictionaries and set(name_parts(blank)) <= set(stored)
 
@@ -55,8 +55,8 @@ def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Dem
         where: name of the episode in messages.
 
     Raises:
-        UserError: the domain does not have an action; observations or rewards have other shapes
-            or types; numbers are out of range.
+        UserError: the domain lacks an action; observations or rewards have other shapes or types;
+            or numbers are out of range.
     """
     actions, rewards = check_actions(given.actions, where), check_rewards(given.rewards, where)
     check_range(f"{where}: actions", actions, 0, domain.num_actions - 2)
@@ -81,7 +81,7 @@ def check_actions(values: Any, where: str) -> np.ndarray:
     """Returns the actions `[n]` of an episode in their stored type; n > 0.
 
     Raises:
-        UserError: they are not integers of at least 0, one per step.
+        UserError: the actions are not integers of at least 0, with one per step.
     """
     actions = _check_numbers(np.zeros((), np.int64), values, f"{where}: actions")
     if actions.ndim != 1 or not actions.size:
@@ -97,7 +97,7 @@ def check_rewards(values: Any, where: str) -> np.ndarray:
     """Returns the rewards of an episode as float32.
 
     Raises:
-        UserError: they are not numbers, or float32 cannot represent them.
+        UserError: the rewards are not numbers, or float32 cannot represent them.
     """
     rewards = _check_numbers(np.zeros((), np.float32), values, f"{where}: rewards")
     return check_fits(f"{where}: rewards", rewards, np.dtype(np.float32))
@@ -145,7 +145,7 @@ def _check_numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
     """Returns values as an array of the kind of `blank`: booleans, integers or real numbers.
 
     Raises:
-        UserError: they are of another kind.
+        UserError: the values are of another kind.
     """
     array = np.asarray(values)
     if blank.dtype == bool:
@@ -162,7 +162,7 @@ def _check_numbers(blank: np.ndarray, values: Any, what: str) -> np.ndarray:
 
 
 def _check_shapes(observations: PyTree, domain: Domain, states: int, where: str) -> None:
-    """Checks that observations have the shapes of a domain's, for `states` states.
+    """Checks that observations of `states` states have the shapes of a domain.
 
     Raises:
         UserError: names the field that has another shape.

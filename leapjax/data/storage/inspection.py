@@ -1,4 +1,4 @@
-"""Inspection of a data set of unknown origin, before Minari opens it and unpacks its arrays."""
+"""Inspects a data set of unknown origin before Minari opens it and unpacks its arrays."""
 
 import io
 import json
@@ -20,18 +20,18 @@ from leapjax.types import PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
 DEEPEST = 16  # levels of nested groups
-SLAB = 2**28  # bytes to read at once while the sizes are not known
+SLAB = 2**28  # bytes to read at once while sizes are unknown
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
     """Reads the metadata of a data set.
 
     Raises:
-        ValueError: they cannot be read.
+        ValueError: the metadata cannot be read.
     """
     try:
         text = files.read_text(folder / "metadata.json")
-    except UserError as error:  # the caller adds what to do
+    except UserError as error:  # the caller adds the remedy
         raise ValueError(str(error)) from None
     metadata = json.loads(text)
     if not isinstance(metadata, dict):
@@ -42,8 +42,9 @@ def read_metadata(folder: Path) -> dict[str, Any]:
 def inspect_dataset(folder: Path, metadata: dict[str, Any]) -> list[PyTree]:
     """Checks that Minari and HDF5 can open a data set safely; reads no array.
 
-    Without its spaces Minari makes the environment that the data name, which runs code that the
-    data choose. HDF5 would allocate sizes that are only claimed, and follow links to other files.
+    If the spaces are missing, Minari makes the environment that the data name, which runs code
+    that the data choose. HDF5 would allocate any size that a file claims, and follow links to
+    other files.
 
     Returns:
         An outline of each episode: see `_outline_file`.
@@ -100,12 +101,12 @@ def _check_sizes(space: Any) -> None:
 def _outline_file(file: h5py.File, file_size: int) -> dict[str, Any]:
     """Lists the arrays of a file without reading them.
 
-    The objects must form a tree, as in files that Minari writes. With two names for an object, a
-    walk through all names may never end.
+    The objects must form a tree, as in files that Minari writes. If an object has two names, a walk
+    through all names may never end.
 
     Returns:
-        A dictionary by name: an array of the same shape and type, which takes no memory, for each
-        array, and such a dictionary for each group.
+        A dictionary by name. A group becomes such a dictionary. An array becomes an array of the
+        same shape and type that takes no memory.
 
     Raises:
         ValueError: the file has links, an object with two names, groups nested too deep, or arrays
@@ -142,7 +143,7 @@ def _outline_file(file: h5py.File, file_size: int) -> dict[str, Any]:
 
 
 def _find_identity(item: Any) -> tuple[int, int]:
-    """Returns a key that an HDF5 object has under each of its names."""
+    """Returns a key of an HDF5 object that does not depend on its name."""
     info = h5py.h5o.get_info(item.id)
     return info.fileno, info.addr
 

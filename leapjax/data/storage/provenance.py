@@ -1,4 +1,4 @@
-"""Plays an episode of a data set again, to compare the environment with the recorded one."""
+"""Replays an episode of a data set, to compare the environment with the recorded environment."""
 
 import warnings
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ def compare_with_play(
 ) -> None:
     """Plays an episode of a data set again, and warns if the environment behaves differently.
 
-    A data set need not say how its environment was made: Minari leaves that out if a wrapper has
-    a function as argument. This plays `COMPARED` steps of the first episode with a known seed.
+    A data set may not say how its environment was made: Minari leaves that out if a wrapper has a
+    function as argument. This plays `COMPARED` steps of the first episode with a known seed.
     """
     made_here = find_version(name) is not None
     if made_here or domain.demonstrations.replay is not None:  # `replay` plays all episodes again

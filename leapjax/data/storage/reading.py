@@ -42,10 +42,9 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
 
     Args:
         name: id of the data set.
-        domain: the level that the data should come from. If it has `replay`, it plays again
-            the episodes that were recorded with other observations, and episodes that it cannot
-            use are dropped.
-        most: maximal number of demonstrations; None for all.
+        domain: the level that the data should come from. Its `replay`, if any, replays episodes
+            with other observations. `load` drops the episodes that it cannot use.
+        most: maximal number of demonstrations; `None` for all.
 
     Raises:
         UserError: the data set is missing, damaged or empty, or does not fit the domain.
@@ -154,10 +153,10 @@ def _make_demonstration(
 
 
 def _check_total(metadata: dict[str, Any], outlines: Sequence[PyTree]) -> None:
-    """Checks that the episodes have as many steps together as the metadata say.
+    """Checks that the episodes together have as many steps as the metadata say.
 
     Raises:
-        ValueError: they have another number of steps.
+        ValueError: the episodes have another number of steps.
     """
     steps = sum(len(outline["actions"]) for outline in outlines)
     announced = metadata.get("total_steps")
@@ -169,7 +168,7 @@ def _check_memory(name: str, outlines: Sequence[PyTree], domain: Domain) -> None
     """Checks, before anything is unpacked, that the demonstrations fit into memory.
 
     Raises:
-        UserError: they do not; says how much memory they need.
+        UserError: the demonstrations do not fit; says how much memory they need.
     """
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(domain.blank))
     needed = sum((len(outline["actions"]) + 1) * (state + 8) for outline in outlines)

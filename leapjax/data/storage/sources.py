@@ -1,4 +1,4 @@
-"""Finds the source of a domain's demonstrations, which makes the missing ones."""
+"""Finds the source of a domain's demonstrations, which makes missing demonstrations."""
 
 from collections.abc import Callable
 
@@ -12,12 +12,13 @@ from leapjax.errors import UserError
 def find_source(domain: Domain, count: int, seed: int) -> Source:
     """Returns the source of a domain's demonstrations.
 
-    A domain has its own, or its demonstrator makes them once and a Minari data set stores them.
+    This is the domain's own source, if it has one. Otherwise its demonstrator makes the
+    demonstrations once, and a Minari data set stores them.
 
     Args:
         domain: the level.
-        count: number of demonstrations; the settings of a source of the domain's own count more.
-        seed: of the training run.
+        count: number of demonstrations; the domain's own source ignores it.
+        seed: training seed.
     """
     if domain.demonstrations.source is not None:
         return domain.demonstrations.source

@@ -1,4 +1,4 @@
-"""Minari spaces of observations: a dictionary by field, or one box where they are an array."""
+"""Minari spaces of observations: a box for an array, a dictionary of spaces for several fields."""
 
 from typing import Any
 
@@ -29,8 +29,8 @@ def make_observation_space(blank: PyTree) -> gym.Space:
 def read_spaces(metadata: dict[str, Any], domain: Domain) -> dict[str, gym.Space]:
     """Reads the spaces of an inspected data set, by part: `observation` and `action`.
 
-    Leaves out the space of observations if `make_observation_space` made it: it says no more than
-    the shapes and types, which are checked anyway.
+    Leaves out the space of observations if `make_observation_space` made it: such a space only
+    repeats the shapes and types, which are checked anyway.
     """
     found = {name.removesuffix("_space"): deserialize_space(metadata[name]) for name in SPACES}
     if found["observation"] == make_observation_space(domain.blank):
@@ -39,5 +39,5 @@ def read_spaces(metadata: dict[str, Any], domain: Domain) -> dict[str, gym.Space
 
 
 def name_parts(observations: PyTree) -> dict[str, Any]:
-    """Returns the parts of observations by name; the observations are not one array."""
+    """Returns the parts of observations by name; the observations must not be a single array."""
     return observations._asdict() if hasattr(observations, "_asdict") else dict(observations)

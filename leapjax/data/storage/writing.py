@@ -32,10 +32,10 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
     The write is atomic: a killed program leaves the whole data set, or the one before it.
 
     Args:
-        name: id of the data set; an existing one is replaced.
+        name: id of the data set; replaces an existing data set with this id.
         collection: the demonstrations.
-        domain: the level that they come from.
-        description: a line for the metadata.
+        domain: the level of the demonstrations.
+        description: line for the metadata.
 
     Raises:
         UserError: the disk is full, the folder cannot be written to, or `name` is a folder of
@@ -64,7 +64,7 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
             for left_over in root.glob(f"{SCRATCH}*"):  # of killed programs
                 _put_back(left_over / BEFORE, root)
                 shutil.rmtree(left_over, ignore_errors=True)
-            # Minari lists no hidden folder: it sees the data set when all of it is written.
+            # Minari skips hidden folders, so it sees the data set only when it is complete.
             scratch = Path(tempfile.mkdtemp(prefix=SCRATCH, dir=root))
             whole = scratch / "whole"
             _write_folder(whole, buffers, domain, {"dataset_id": name, "description": description})
@@ -86,7 +86,7 @@ def save(name: str, collection: Collection, domain: Domain, description: str) ->
 
 
 def _estimate_bytes(demonstrations: Sequence[Demonstration]) -> int:
-    """Estimates from above how many bytes demonstrations take on the disk, uncompressed."""
+    """Estimates from above the bytes that uncompressed demonstrations take on the disk."""
     arrays = jax.tree.leaves([each[:5] for each in demonstrations])
     return sum(2 * np.asarray(each).nbytes + ARRAY_ROOM for each in arrays)
 
@@ -131,5 +131,5 @@ def _to_dictionaries(observations: PyTree) -> Any:
 
 
 def _mark_last(demonstration: Demonstration, value: bool) -> list[bool]:
-    """Makes a mark for each step: `value` for the last one, False for the others."""
+    """Makes a mark for each step: `value` for the last step, False for the others."""
     return [False] * (len(demonstration.actions) - 1) + [bool(value)]

@@ -1,4 +1,4 @@
-"""A game as the rollout sees it: ale-py's native environment, one frame a step."""
+"""Adapts ale-py's native environment to the rollout, with one frame a step."""
 
 import numpy as np
 from ale_py.vector_env import AtariVectorEnv
@@ -9,15 +9,15 @@ from leapjax.environments import Transition
 
 
 class AtariAdapter:
-    """One game: up to 30 no-ops at the start, over when the game is.
+    """A game as an environment: an episode is a whole game, after up to 30 no-ops.
 
-    A planner sees rewards clipped, as the data have them; the episode's score counts. It succeeds
-    with a gamer's score.
+    A planner sees rewards clipped to [-1, 1], as in the data. The score sums rewards that are not
+    clipped. An episode succeeds if its score reaches `Game.human`.
 
     Attributes:
-        num_actions: of the game, with the end action.
-        frame: the current frame `[84, 84]` uint8.
-        score: of the game so far.
+        num_actions: A, number of the game's actions with the end action.
+        frame: current frame `[84, 84]` uint8.
+        score: score of the game so far.
     """
 
     def __init__(self, game: Game, sticky: float, max_steps: int) -> None:
@@ -34,9 +34,9 @@ class AtariAdapter:
         self._begun: int | None = None  # the action that the game is busy with
 
     def reset(self, seed: int) -> np.ndarray:
-        """Starts the game of a seed: the frame `[84, 84]` uint8."""
-        check_integer("the seed of a game", seed)  # ALE's are int32
-        if self._begun is not None:  # it still takes an action of the game before
+        """Starts the game of a seed; returns its first frame `[84, 84]` uint8."""
+        check_integer("the seed of a game", seed)  # ALE's seeds are int32
+        if self._begun is not None:  # an action of the previous game is still running
             self._env.recv()
             self._begun = None
         observations, _ = self._env.reset(seed=seed)
@@ -44,17 +44,17 @@ class AtariAdapter:
         return self.frame
 
     def close(self) -> None:
-        """Ends the game; `frame` and `score` stay."""
+        """Ends the game; `frame` and `score` stay readable."""
         self._env.close()
         del self._env  # ale-py ends a game's thread when its last reference is gone
 
     def begin(self, action: int) -> None:
-        """Begins to take an action, in a thread of the game's own."""
+        """Begins to take an action, in the game's own thread."""
         self._env.send(np.array([action]))
         self._begun = action
 
     def step(self, action: int) -> Transition:
-        """Takes one action, for four frames of the game."""
+        """Takes an action for four frames of the game."""
         if self._begun is None:
             self.begin(action)
         if self._begun != action:

@@ -1,4 +1,4 @@
-"""More windows from the same games: in a mirror."""
+"""Augments windows of a game by reflection."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ def mirror_window(key: jax.Array, window: Window, mirror: Mirror, actions: Seque
     """Reflects a window with probability one half.
 
     Args:
-        key: of randomness.
-        window: to reflect.
+        key: random key.
+        window: window to reflect.
         mirror: reflection of the game.
         actions: names of the game's actions.
     """
     names = [mirror.actions.get(name, name) for name in actions]
-    # The end action, MASK and PAD follow the game's own actions, and stay.
+    # The end action, MASK and PAD follow the game's own actions, and do not change.
     become = jnp.array([*map(list(actions).index, names), *range(len(names), len(names) + 3)])
     reflection = window._replace(
         context=window.context._replace(

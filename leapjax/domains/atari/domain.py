@@ -28,10 +28,10 @@ from leapjax.extras import report_missing
 from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
 
-LONGEST = 5_000  # decisions of a game of preset `leapjax`, as in its demonstrations
-FOLDER = "data/atari"  # where demonstrations are, in the format of DQN-Replay
+LONGEST = 5_000  # most decisions of a game in the demonstrations and with preset `leapjax`
+FOLDER = "data/atari"  # folder of demonstrations in the format of DQN-Replay
 MOST_STEPS = (2**31 - 1) // FRAME_SKIP  # the emulator counts frames in 32 bits
-TOKENS = 4  # of a state, of our encoder
+TOKENS = 4  # tokens of a state in our encoder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Settings:
     """Atari: data, games and augmentation.
 
     Attributes:
-        transitions: Transitions to learn from; whole games are sampled until there are so many.
+        transitions: Transitions to learn from; whole games are sampled until there are enough.
         dqn_seed: Seed of the DQN whose games to learn from; DQN-Replay has 1 to 5 of each game.
         sticky: Probability that the game repeats the last action in place of the new one.
         max_steps: Decisions after which a game is cut off.
-        features: Features of the first convolution; the others have twice as many.
-        mirror: Mirror every other training window, left and right exchanged.
+        features: Features of the first convolution; later convolutions have twice as many.
+        mirror: Reflect half of the training windows at random, with their actions.
     """
 
     transitions: int = 50_000
@@ -57,7 +57,7 @@ class Settings:
     def __post_init__(self) -> None:
         check_types(self)
         check_at_least(self, 1, "transitions")
-        check_at_least(self, 1, "dqn_seed", most=MAX_TRAINING_SEED)  # each has games of its own
+        check_at_least(self, 1, "dqn_seed", most=MAX_TRAINING_SEED)  # each has its own games
         check_at_least(self, 1, "features", most=10_000)
         check_at_least(self, 1, "max_steps", most=MOST_STEPS)
         check_within(self, 0, 1, "sticky")
@@ -71,7 +71,7 @@ def make(name: str, settings: Settings) -> Domain:
     """
     game = find_game(name)
     with report_missing("atari"):
-        import ale_py  # noqa: F401, PLC0415  (to say so now if it is missing)
+        import ale_py  # noqa: F401, PLC0415  (reports now if it is missing)
 
     def make_adapter() -> Adapter:
         from leapjax.domains.atari.adapter import AtariAdapter  # noqa: PLC0415  (ale-py is optional)
@@ -120,13 +120,13 @@ def make_source(game: Game, settings: Settings) -> Source:
         return found
 
     def write(where: str, progress: Callable[[int], None]) -> str:
-        from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (so)
+        from leapjax.domains.atari.demonstrators.collect import collect  # noqa: PLC0415  (ale-py is optional)
 
         collect(Path(where), game, count, dqn_seed, LONGEST, progress=progress)
         return f"{count} transitions of {game.name} in {where}"
 
     def exists(where: str) -> bool:
-        from leapjax.domains.atari.demonstrators.collect import is_whole  # noqa: PLC0415  (so)
+        from leapjax.domains.atari.demonstrators.collect import is_whole  # noqa: PLC0415  (ale-py is optional)
 
         return is_whole(Path(where), game, count, dqn_seed, LONGEST)
 

@@ -1,8 +1,8 @@
 """Encoders of frames: a context becomes tokens, for both architectures.
 
-A state is a stack of the last four frames (Mnih et al., 2015). A context holds each frame once;
-the encoders stack them. `StateTokens` is the paper's, a token for each state of a context;
-`CurrentTokens` is ours.
+A state is a stack of the last four frames (Mnih et al., 2015). A context holds each frame once, and
+the encoders stack the frames. The paper's encoder, `StateTokens`, makes a token for each state of a
+context. Our encoder, `CurrentTokens`, makes a few tokens for the current state.
 """
 
 import flax.linen as nn
@@ -14,12 +14,13 @@ from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense
 from leapjax.types import Context
 
-STACK = 4  # frames that a state is made of
-# Side, stride and features of each layer; features in multiples of the first (paper, table 6).
+STACK = 4  # frames in a state
+# Kernel side, stride and features of each layer; features are multiples of the first layer's
+# (paper, table 6).
 Layers = tuple[tuple[int, int, int], ...]
 LAYERS: Layers = ((8, 4, 1), (4, 2, 2), (3, 1, 2))
-HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # for frames of half the side
-HIDDEN = 256  # units between features and tokens, of our encoder
+HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # for frames with sides of half the length
+HIDDEN = 256  # units between features and tokens in our encoder
 CHANGES = 10.0  # weight of changes between frames; the last frame has weight 1
 
 
@@ -33,11 +34,12 @@ def stack_frames(frames: jax.Array, count: int) -> jax.Array:
 def compute_changes(stacks: jax.Array) -> jax.Array:
     """Computes the last frame and the changes before it from stacks `[n, 84, 84, 4]`.
 
-    Moving objects are a few pixels of thousands: a network without the changes learns hardly
-    anything for a thousand steps (docs/lessons.md). Averages over two by two pixels.
+    Moving objects cover a few of thousands of pixels: a network that does not see changes learns
+    hardly anything for a thousand steps (docs/lessons.md). The result averages over two by two
+    pixels.
 
     Returns:
-        `[n, 42, 42, 4]`.
+        `[n, 42, 42, 4]`: the last frame, then the three changes, oldest first.
     """
     x = stacks.astype(jnp.float32) / 255
     x = jnp.concatenate([x[..., -1:], CHANGES * jnp.diff(x, axis=-1)], axis=-1)
@@ -54,9 +56,9 @@ class Features(nn.Module):
     """The convolutions of the appendix: `[n, 84, 84, 4]` to `[n, 7 * 7 * 2 * features]`.
 
     Attributes:
-        layers: side, stride and multiple of features of each.
-        features: of the first convolution.
-        dtype: of the computation.
+        layers: kernel side, stride and multiple of `features` of each layer.
+        features: features of the first convolution.
+        dtype: type of the computation.
     """
 
     layers: Layers
@@ -66,7 +68,7 @@ class Features(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:  # noqa: D102
         for index, (side, stride, times) in enumerate(self.layers):
-            # XLA's own is faster here than a product over shifted copies (docs/lessons.md).
+            # XLA's convolution is faster here than a product over shifted copies (docs/lessons.md).
             convolution = nn.Conv(
                 times * self.features, (side, side), stride, "VALID", dtype=self.dtype,
                 kernel_init=nn.initializers.he_normal(), name=f"convolution_{index}",
@@ -81,9 +83,9 @@ class StateTokens(Encoder):
     The first three states see black frames before the context, so `encode_next` encodes them again.
 
     Attributes:
-        width: D, of a token.
-        features: of the first convolution.
-        dtype: of the computation.
+        width: D, width of a token.
+        features: features of the first convolution.
+        dtype: type of the computation.
     """
 
     width: int
@@ -112,14 +114,14 @@ class StateTokens(Encoder):
 class CurrentTokens(Encoder):
     """A few tokens for the current state and the changes before it: `[tokens, D]`.
 
-    Frames before an episode equal its first one. Frames that a short context does not hold are
-    black: without a past the whole frame has changed.
+    Frames before an episode equal its first frame. Frames that a short context does not hold are
+    black: without a past, every pixel of the frame has changed.
 
     Attributes:
-        width: D, of a token.
-        features: of the first convolution.
+        width: D, width of a token.
+        features: features of the first convolution.
         tokens: number of tokens.
-        dtype: of the computation.
+        dtype: type of the computation.
     """
 
     width: int
@@ -134,7 +136,7 @@ class CurrentTokens(Encoder):
         known = jnp.maximum(jnp.arange(past + 1), past - context.step)
         read = Features(HALVED, self.features, self.dtype, name="features")
         features = read(compute_changes(stack_frames(frames[known], 1)))
-        # Wide and normalised: the transformer must be given positions already (docs/lessons.md).
+        # A wide and normalised layer: the transformer needs positions as inputs (docs/lessons.md).
         hidden = nn.Dense(
             HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
         )

@@ -1,22 +1,22 @@
-"""The games of the paper: their actions, and the scores that others have reached."""
+"""The games of the paper: their actions, and published scores."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from leapjax.errors import UserError, did_you_mean
 
-HEIGHT = WIDTH = 84  # of a frame, in pixels (Mnih et al., 2015)
-FRAME_SKIP = 4  # frames that an action is repeated for
-MAX_FRAMES = 108_000  # of a game: half an hour
-MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # decisions
+HEIGHT = WIDTH = 84  # size of a frame in pixels (Mnih et al., 2015)
+FRAME_SKIP = 4  # frames for which an action is repeated
+MAX_FRAMES = 108_000  # most frames of a game: half an hour
+MAX_STEPS = MAX_FRAMES // FRAME_SKIP  # most decisions of a game
 
 
 class Mirror(NamedTuple):
     """A reflection that keeps the rules of a game.
 
     Attributes:
-        axis: of frames that is reversed: 0 exchanges top and bottom, 1 the sides.
-        rows: first row of the reflected part, and the row after its last; scores stay outside.
+        axis: axis of frames to reverse: 0 exchanges top and bottom, 1 left and right.
+        rows: first row of the reflected part, and the row after its last; the part has no scores.
         columns: first column of the reflected part, and the column after its last.
         actions: new name of each action that changes.
     """
@@ -31,12 +31,12 @@ class Game(NamedTuple):
     """One game of the Arcade Learning Environment.
 
     Attributes:
-        name: in the paper and in DQN-Replay.
+        name: name in the paper and in DQN-Replay.
         rom: name in ale-py.
         actions: the game's own actions, in ale-py's order.
         random: score of random actions (Mnih et al., 2015).
         human: score of a professional tester of games.
-        target: return to ask for, of clipped rewards.
+        target: target return, a sum of clipped rewards.
         return_scale: divisor of returns before a network sees them.
         mirror: reflection that keeps the rules.
         paper: gamer-normalised scores by method (paper, table 2), in percent.
@@ -75,7 +75,7 @@ _SIDES = _exchange(
     ("right", "left"), ("upright", "upleft"), ("downright", "downleft"), ("rightfire", "leftfire"),
     ("uprightfire", "upleftfire"), ("downrightfire", "downleftfire"),
 )  # fmt: skip
-_HOPS = _exchange(("up", "left"), ("right", "down"))  # of Qbert, who hops along diagonals
+_HOPS = _exchange(("up", "left"), ("right", "down"))  # Qbert hops along diagonals
 
 
 def _paper(*scores: float) -> Mapping[str, float]:

@@ -1,4 +1,4 @@
-"""A BabyAI level as the rollout sees it."""
+"""Adapts BabyAI levels to the rollout."""
 
 import numpy as np
 
@@ -12,11 +12,20 @@ ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "end")
 NUM_ACTIONS = len(ACTIONS)
 END = ACTIONS.index("end")
 TURNS = (ACTIONS.index("left"), ACTIONS.index("right"))
-SLIPS = 1  # which of a level seed's streams of random numbers
+SLIPS = 1  # stream of a level seed's random numbers, for slips
 
 
 class BabyAIAdapter:
-    """A BabyAI level with the full observation and a goal fixed at reset."""
+    """A BabyAI level with the full observation and a goal fixed at reset.
+
+    Attributes:
+        num_actions: A, number of actions with the end action.
+        level: level to play.
+        env: MiniGrid's environment.
+        side: S, side of the grid.
+        goal: cell of the goal; `observations.NO_GOAL` if it is not observed.
+        taken: last executed action.
+    """
 
     num_actions = NUM_ACTIONS
 
@@ -24,16 +33,15 @@ class BabyAIAdapter:
         self.level = level
         self.env = levels.make_environment(level)
         self.side = max(self.env.width, self.env.height)
-        # MiniGrid would draw the agent's partial view at every step, which is not used here and
-        # costs more than the step itself.
+        # Skip the agent's partial view: it is not used here, and costs more than a step.
         self.env.gen_obs = lambda: {}  # type: ignore[method-assign]
         self.goal = observations.NO_GOAL
-        self.taken = END  # the last action as it was executed
+        self.taken = END
         self._instruction = np.zeros(level.words, np.int32)
         self._random = np.random.default_rng()
 
     def reset(self, seed: int) -> Observation:
-        """Starts the level of a seed."""
+        """Starts the level of a seed; returns its first state."""
         with levels.silenced():
             self.env.reset(seed=seed)
         self.goal = observations.nearest_goal(self.env)
@@ -42,21 +50,21 @@ class BabyAIAdapter:
         return self.observe()
 
     def close(self) -> None:
-        """Closes the environment; the state that it is in can still be looked at."""
+        """Closes the environment; its last state stays readable."""
         self.env.close()
 
     @property
     def misled(self) -> bool:
-        """Whether an episode ended in front of another match than the goal that was observed."""
+        """Whether a solved episode ended at another match of the instruction than the goal."""
         goal = self.goal
         return goal != observations.NO_GOAL and observations.front_cell(self.env) != goal
 
     def observe(self) -> Observation:
-        """The current state."""
+        """Returns the current state."""
         return observations.observe(self.env, self.side, self.goal, self._instruction)
 
     def step(self, action: int) -> Transition:
-        """Takes an action of MiniGrid's first six, or another if the level's turns slip."""
+        """Takes an action; in levels with slips, a turn may become another action at random."""
         self.taken = action
         if action in TURNS and self._random.random() < self.level.slip:
             self.taken = int(self._random.choice([a for a in range(END) if a != action]))

@@ -1,7 +1,8 @@
-"""Constraints on plans in a grid world, and views of contexts, for models that never learned them.
+"""Constraints on plans in a grid world, and views of contexts that hide unknown objects.
 
-Each penalty is `(context, actions [T]) -> []`, for `leapjax.constrain` with `partial`: the number
-of violations in the chosen actions of a plan, or its distance from a requirement.
+They adapt models that never saw these constraints or objects. A penalty is a function
+`(context, actions [T]) -> []`, for `leapjax.constrain` with `partial`. It counts violations among
+the chosen actions of a plan, or measures the plan's distance from a requirement.
 """
 
 from collections.abc import Callable
@@ -30,14 +31,14 @@ from leapjax.types import Array, Context
 def lava(context: Context, actions: jax.Array) -> jax.Array:
     """Counts the steps of a plan onto lava.
 
-    Only the agent moves (see `roll`): the count may be wrong if the plan moves objects or shuts
-    doors on its way.
+    It assumes that only the agent moves (see `roll`): the count may be wrong if the plan moves
+    objects or shuts doors.
     """
     return _count_lava_steps(context.observation, actions)
 
 
 def immediate_lava(context: Context, actions: jax.Array) -> jax.Array:
-    """Counts a step onto lava by the first action alone, as the paper does."""
+    """Counts a step onto lava by the first action only, as the paper does."""
     return _count_lava_steps(context.observation, actions[:1])
 
 
@@ -55,7 +56,7 @@ def left_turns(context: Context, actions: jax.Array) -> jax.Array:
 
 
 def turns_over(context: Context, actions: jax.Array, budget: int) -> jax.Array:
-    """Counts the turns in the context and in the plan beyond a budget."""
+    """Counts by how much the turns in the context and in the plan exceed a budget."""
     turns = jnp.array(TURNS)
     taken = jnp.isin(jnp.asarray(context.actions), turns).sum()
     planned = (jnp.isin(actions, turns) & _mark_executed(actions)).sum()
@@ -83,23 +84,23 @@ def steps_to_visit(context: Context, actions: jax.Array) -> jax.Array:
 
 
 def count_revisits(context: Context, actions: jax.Array, handling: bool = False) -> jax.Array:
-    """Counts how often the agent was before in each pose of a plan; returns the sum.
+    """Sums over the poses of a plan how often the agent was in each pose before.
 
-    Earlier poses are those of the context, the current one, and earlier ones of the plan. A dead
-    end costs more each time, until another way costs less (as in Korf's LRTA*, 1990). The end
-    action adds no pose.
+    Earlier poses are the past poses of the context, the current pose, and earlier poses of the
+    plan. A dead end costs more each time, until another path costs less (as in Korf's LRTA*, 1990).
+    The end action adds no pose.
 
     Args:
-        context: its past poses count.
-        actions: `[T]` a plan, which may hold MASK.
-        handling: whether to allow actions on the object in front, which leave the agent in its
-            pose but may be useful.
+        context: context with the past poses.
+        actions: plan `[T]`, which may hold MASK.
+        handling: whether to ignore actions on a door or object in front. They may be useful,
+            although the pose does not change.
     """
     steps = actions.shape[0]
     observation = context.observation
     poses = roll(observation, actions)
     earlier = jnp.concatenate([jnp.asarray(context.past.pose), poses])  # [K + T + 1, 3]
-    same = (poses[1:, None] == earlier).all(axis=-1)  # [T, K + T + 1]; a blank pose is in no cell
+    same = (poses[1:, None] == earlier).all(axis=-1)  # [T, K + T + 1]; blank poses never match
     now = len(earlier) - steps - 1
     before = jnp.arange(len(earlier)) <= now + jnp.arange(steps)[:, None]
     times = jnp.sum(same & before, axis=1) * _mark_executed(actions)
@@ -126,7 +127,7 @@ def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:
 def _find_goal_poses(observation: Observation, poses: jax.Array) -> jax.Array:
     """Marks the poses `[n, 3]` in which an agent faces the goal or an object like it: `[n]` bool.
 
-    Any object of the kind and colour in the instruction completes it, not only the nearest.
+    Any object with the target's kind and colour completes an instruction, not only the nearest.
     """
     grid, goal = jnp.asarray(observation.grid), jnp.asarray(observation.goal)
     alike = (grid[..., :2] == grid[goal[0], goal[1], :2]).all(axis=-1) & (goal[0] >= 0)
@@ -152,7 +153,7 @@ def hide_open_doors(context: Context) -> Context:
 def hide_half_of_obstacles(context: Context, part: int) -> Context:
     """Makes every second obstacle of a context look empty, and leaves part 0 or 1.
 
-    Obstacles are counted in reading order: if one is moved, later ones may change parts.
+    Parts alternate in reading order. If an obstacle moves, later obstacles may change parts.
     """
     return _hide_cells(context, lambda grid, goal: find_half(grid, goal, 1 - part))
 
@@ -173,8 +174,8 @@ def _hide_cells(context: Context, which: Callable[[jax.Array, jax.Array], jax.Ar
     """Makes some cells of a context look empty, now and in the past.
 
     Args:
-        context: of one trajectory.
-        which: (grid `[S, S, 3]`, goal `[2]`) -> `[S, S]` bool.
+        context: context of one trajectory.
+        which: (grid `[S, S, 3]`, goal `[2]`) -> cells to hide, `[S, S]` bool.
     """
 
     def hide(observation: Observation) -> Observation:

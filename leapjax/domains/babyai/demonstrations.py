@@ -17,8 +17,8 @@ from leapjax.environments import closing
 from leapjax.errors import UserError
 from leapjax.types import Demonstration
 
-MOST_LOOKS = 200  # at its subgoals, before a bot that has not chosen an action never will
-MISTAKES = 2  # which of a level seed's streams of random numbers; the adapter has another
+MOST_LOOKS = 200  # looks at its subgoals after which a bot without an action is stuck
+MISTAKES = 2  # stream of a level seed's random numbers, for mistakes
 FAILED = "failed"  # the bot gave up, crashed or ran out of time
 OTHER_GOAL = "ended at another match than the nearest"
 
@@ -28,7 +28,10 @@ class Undecided(Exception):
 
 
 class _Subgoals(list):
-    """A bot's stack of subgoals. MiniGrid's bot looks at its top until one gives an action."""
+    """A bot's stack of subgoals, which raises `Undecided` after too many looks.
+
+    MiniGrid's bot looks at the top of the stack until a subgoal gives an action.
+    """
 
     looks = 0
 
@@ -42,11 +45,10 @@ class _Subgoals(list):
 class FullViewBot(BabyAIBot):
     """MiniGrid's bot with the full view of the grid, which is the paper's demonstrator.
 
-    The bot of BabyAI explores: it knows only what its 7x7 view has shown it. The paper's
-    demonstrations are optimal, and its authors' code lets the bot see the whole grid and
-    plan through doors that are closed but not locked (`full_obs_replan` in their fork).
-    Demonstrations of GoToObjMazeS7 are then 19 steps long, not 48, and a function of what
-    the learner observes.
+    BabyAI's bot explores, because it sees the grid only through its 7x7 view. The paper's
+    demonstrations are optimal. Its authors' code lets the bot see the whole grid, and plan through
+    doors that are closed but not locked (`full_obs_replan` in their fork). Demonstrations of
+    GoToObjMazeS7 then have 19 steps instead of 48, and are a function of the learner's observation.
     """
 
     def __init__(self, env: RoomGridLevel) -> None:
@@ -54,14 +56,14 @@ class FullViewBot(BabyAIBot):
         self.vis_mask[:] = True
 
     def _process_obs(self) -> None:
-        """Adds no view to the explored cells: all are explored."""
+        """Leaves the explored cells unchanged, because all cells are explored."""
 
     def _breadth_first_search(self, initial_states, accept_fn, ignore_blockers):  # noqa: ANN001, ANN202
-        """The bot's search, in which a closed door is on the way like an open one."""
+        """Searches as the bot does, but passes closed doors like open doors."""
         grid = self.mission.unwrapped.grid
         closed = [cell for cell in grid.grid if isinstance(cell, Door) and not cell.is_open]
-        # The search only asks whether a door is open: all are while it runs. `accept` sees the
-        # doors as they are.
+        # The search only asks whether a door is open, so all doors are open while it runs. `accept`
+        # shows a door as it is.
         states = {id(door): False for door in closed}
 
         def accept(position, cell):  # noqa: ANN001, ANN202
@@ -85,7 +87,7 @@ class FullViewBot(BabyAIBot):
 def make_bot(env: RoomGridLevel) -> BabyAIBot:
     """Makes the demonstrator of a level that was reset.
 
-    If a door is locked, the bot explores to find its key: it then keeps its own partial view.
+    If a door is locked, the bot must explore to find the key, so it keeps its partial view.
     """
     locked = any(isinstance(cell, Door) and cell.is_locked for cell in env.grid.grid)
     return BabyAIBot(env) if locked else FullViewBot(env)
@@ -97,16 +99,16 @@ def collect(
     seed: int,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Collection:
-    """Collects `count` demonstrations of a level, drawn anew for each training seed.
+    """Collects `count` demonstrations of a level; each training seed has its own.
 
     Args:
-        level: what to demonstrate.
-        count: how many demonstrations to return, at least 1.
-        seed: of the training run; see `leapjax.data.seeds`.
-        progress: called with the number of demonstrations so far.
+        level: level to demonstrate.
+        count: number of demonstrations to return, at least 1.
+        seed: seed of the training run; see `leapjax.data.seeds`.
+        progress: function to call with the number of demonstrations so far.
 
     Raises:
-        UserError: no demonstration asked for, or the bot fails nearly always.
+        UserError: `count` is less than 1, or the bot nearly always fails.
     """
     if count < 1:
         raise UserError(f"at least one demonstration is needed, got {count}")
@@ -130,8 +132,8 @@ def collect(
 def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Demonstration | None:
     """Records an episode of the bot; returns `None` and counts in `dropped` if it fails.
 
-    In levels with mistakes, they are executed, and the bot goes on from there. The recorded
-    actions are the executed ones, except in levels that mislabel some.
+    In levels with mistakes, random actions replace some of the bot's actions, and the bot goes on
+    from there. The recorded actions are the executed actions, except in levels with wrong labels.
     """
     level, random = adapter.level, np.random.default_rng([seed, MISTAKES])
     states, actions, rewards = [adapter.reset(seed)], [], []
@@ -142,7 +144,7 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
         while not (terminated or truncated):
             bot.stack.looks = 0
             action = int(bot.replan(action))
-            if action == END:  # `done`: the bot believes the mission over, and it is not
+            if action == END:  # `done`: the bot wrongly believes that the mission is over
                 break
             if random.random() < level.mistakes:
                 action = int(random.integers(END))

@@ -31,7 +31,7 @@ def make(name: str, options: Settings) -> Domain:
     """Makes a level by name or id; makes its environment once, to read its size.
 
     Raises:
-        UserError: an unknown level.
+        UserError: the level is unknown.
     """
     level = levels.find_level(name)
     with contextlib.closing(levels.make_environment(level)) as env:
@@ -74,9 +74,9 @@ def check_states(states: Observation, where: str, level: Level) -> None:
     """Checks that the numbers of observations are in range.
 
     Args:
-        states: `[n + 1, ...]` of one episode.
+        states: observations `[n + 1, ...]` of one episode.
         where: name of the episode, for the message.
-        level: of the episode.
+        level: level of the episode.
 
     Raises:
         UserError: names the numbers and their range.

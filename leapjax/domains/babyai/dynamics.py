@@ -1,4 +1,4 @@
-"""Poses of an agent that turns and moves, as pure functions: for constraints on plans."""
+"""Pure functions that compute the poses of a moving agent, for constraints on plans."""
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,15 @@ def find_passable(grid: jax.Array) -> jax.Array:
 def roll(observation: Observation, actions: jax.Array) -> jax.Array:
     """Computes the poses that a plan leads through if only the agent moves.
 
-    Doors and objects stay as they are, even if the plan acts on them, and lava is passed. The
-    agent stops at the end action and at the first MASK.
+    Doors and objects do not change, even if the plan acts on them, and the agent can cross lava. It
+    stops at the end action and at the first MASK.
 
     Args:
-        observation: the current state.
-        actions: `[T]` a plan, which may hold MASK.
+        observation: current state.
+        actions: plan `[T]`, which may hold MASK.
 
     Returns:
-        `[T + 1, 3]` int32: x, y and direction before the first action, and after each.
+        `[T + 1, 3]` int32: x, y and direction before the first action, and after each action.
     """
     free = find_passable(jnp.asarray(observation.grid))
     vectors = jnp.asarray(DIRECTION_VECTORS)

@@ -1,4 +1,4 @@
-"""BabyAI levels as data: the paper's seven by name, any registered one by its id."""
+"""BabyAI levels as data: the paper's seven levels by name, any registered level by its id."""
 
 import contextlib
 import dataclasses
@@ -16,25 +16,46 @@ from leapjax.errors import UserError, did_you_mean
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """A level, and the settings of the paper for it (appendix, tables 4 and 7)."""
+    """A level, and the paper's settings for it (appendix, tables 4 and 7).
+
+    Attributes:
+        name: name of the level, or its registered id.
+        task: class in `.worlds` or `minigrid.envs.babyai`; empty if `name` is a registered id.
+        room_size: side of a room in cells, walls included.
+        rows: rows of rooms.
+        columns: columns of rooms.
+        distractors: number of objects, with the target if the task draws it from them.
+        doors: doors between rooms: `none`, `open` or `closed`.
+        context: K, past steps in LEAP's context.
+        horizon: T, planned actions.
+        iterations: N, planning iterations.
+        states: states in the context of methods that choose one action at a time, with the current
+            state.
+        words: tokens of the longest instruction.
+        sequence: whether an instruction may join several tasks with "and" and "then".
+        lava: number of lava cells, in tasks with lava.
+        slip: probability that a turn becomes another of MiniGrid's first six actions.
+        mistakes: share of the demonstrator's actions that are random.
+        mislabelled: share of a demonstration's recorded actions that are replaced at random.
+    """
 
     name: str
-    task: str = ""  # class in .worlds or minigrid.envs.babyai; empty: `name` is a registered id
-    room_size: int = 0  # side of a room, walls included
-    rows: int = 1  # rooms
-    columns: int = 1  # rooms
-    distractors: int = 0  # objects, the target included where the task draws it among them
-    doors: str = "none"  # between rooms: "none", "open" or "closed"
-    context: int = 0  # K, past steps in the context
-    horizon: int = 5  # T
-    iterations: int = 10  # N
-    states: int = 5  # in the context of methods of single actions, the current one included
-    words: int = vocabulary.LONGEST  # the longest instruction, in tokens
-    sequence: bool = True  # an instruction may join several tasks, with "and" and "then"
-    lava: int = 0  # cells, where the task has them
-    slip: float = 0.0  # probability that a turn becomes one of the five other actions
-    mistakes: float = 0.0  # share of a demonstrator's actions that are random ones
-    mislabelled: float = 0.0  # share of a demonstration's actions that are replaced by random ones
+    task: str = ""
+    room_size: int = 0
+    rows: int = 1
+    columns: int = 1
+    distractors: int = 0
+    doors: str = "none"
+    context: int = 0
+    horizon: int = 5
+    iterations: int = 10
+    states: int = 5
+    words: int = vocabulary.LONGEST
+    sequence: bool = True
+    lava: int = 0
+    slip: float = 0.0
+    mistakes: float = 0.0
+    mislabelled: float = 0.0
 
 
 _GO_TO, _WITH_PLACE = 5, 9  # "go to the red ball", "pick up the red ball in front of you"
@@ -67,29 +88,29 @@ LEVELS = {
 
 
 def _room(name: str, task: str, side: int, objects: int = 1, **options: Any) -> Level:
-    """One room, with the settings of the paper's."""
+    """Makes a level with one room and the paper's settings for such levels."""
     return Level(name, task, side, distractors=objects, words=_GO_TO, sequence=False, **options)
 
 
 def _like(name: str, paper: str, **options: Any) -> Level:
-    """A level of the paper, and what differs from it."""
+    """Makes a variant of a level of the paper."""
     return dataclasses.replace(LEVELS[paper], name=name, **options)
 
 
-# Of the paper's analyses (section 5 and appendix): a maze of side 10 wants plans of ten actions.
+# Levels of the paper's analyses (section 5, appendix). Some have the settings of a maze of side 10.
 _LONG = {"horizon": 10, "iterations": 30, "states": 10}
 MODIFIED = {
     level.name: level
     for level in (
-        # Online adaptation: what is learned has no lava.
+        # Online adaptation: the training level has no lava.
         _room("GoToLocalS8N1", "GoToLocal", 8, **_LONG),
         _room("GoToLavaEasy", "GoToBehindLava", 8, lava=2),
         _room("GoToLavaMedium", "GoToBehindLava", 8, lava=worlds.MOST_LAVA),
         _like("GoToLavaHard", "GoToObjMazeS4", task="GoToAmongLava", lava=4),
-        # An errand: what is learned has no coloured cell.
+        # An errand: the training level has no coloured cell.
         _room("GoToVia", "GoToVia", 8),
         _room("GoToViaDetour", "GoToVia", 8, 7),
-        # Generalisation: learned in one room.
+        # Generalisation: the training level is a single room.
         _room("GoToLocalS8N15", "GoToLocal", 8, 15),
         _room("GoToLocalS7N1", "GoToLocal", 7),
         _like("GoToObjMazeS4R2", "GoToObjMazeS4R2Close", doors="open"),
@@ -110,15 +131,15 @@ MODIFIED = {
 
 
 def registered_levels() -> list[str]:
-    """The ids of all BabyAI levels that MiniGrid registers."""
+    """Lists the ids of all BabyAI levels that MiniGrid registers."""
     return sorted(name for name in gym.registry if name.startswith("BabyAI-"))
 
 
 def find_level(name: str) -> Level:
-    """The level of that name or id.
+    """Finds a level by name or id.
 
     Raises:
-        UserError: there is none; names the nearest.
+        UserError: the level is unknown; names the most similar level.
     """
     own = {**LEVELS, **MODIFIED}
     if name in own:
@@ -133,13 +154,13 @@ def find_level(name: str) -> Level:
 
 
 def make_environment(level: Level) -> RoomGridLevel:
-    """MiniGrid's environment of a level, without wrappers, not yet reset."""
+    """Makes MiniGrid's environment of a level, without wrappers and not yet reset."""
     if not level.task:
         with silenced():
             return gym.make(level.name).unwrapped  # type: ignore[return-value]
     rooms = {"room_size": level.room_size, "num_rows": level.rows, "num_cols": level.columns}
     distractors = {"num_dists": level.distractors}
-    # Each task takes only what it does not fix itself.
+    # Each task takes only the arguments that it does not fix itself.
     arguments = {
         "GoToLocal": {"room_size": level.room_size, **distractors},
         "GoTo": {**rooms, **distractors, "doors_open": level.doors == "open"},
@@ -157,15 +178,15 @@ def make_environment(level: Level) -> RoomGridLevel:
 
 
 def silenced() -> contextlib.redirect_stdout:
-    """Level generation prints 'Sampling rejected: ...': not for our users."""
+    """Hides the messages of level generation, 'Sampling rejected: ...'."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def longest_episode(level: Level, env: RoomGridLevel) -> int:
-    """The step limit of the level's longest instruction.
+    """Returns the step limit for the level's longest instruction.
 
-    MiniGrid's grows with the navigations that an instruction needs: 2 for each of 4 clauses.
+    MiniGrid's limit grows with the navigations that an instruction needs: 2 for each of 4 clauses.
     """
     navigations = 8 if level.sequence else 1
     grows = navigations * env.room_size**2 * env.num_rows * env.num_cols
-    return max(env.max_steps or 0, grows)  # where the limit is not said beforehand it is 0
+    return max(env.max_steps or 0, grows)  # 0 if the limit is unknown before the reset

@@ -1,7 +1,7 @@
 """Observations of a BabyAI level: the full state, and the goal fixed at reset.
 
-All functions read MiniGrid's state without changing it. Shape letters, in addition to
-`leapjax.types`: S the side of the grid, L the tokens of an instruction.
+All functions read MiniGrid's state without changing it. Shape letters, in addition to those in
+`leapjax.types`: S is the side of the grid, L the number of tokens of an instruction.
 """
 
 from collections import deque
@@ -21,14 +21,14 @@ Cell = tuple[int, int]
 
 
 class Observation(NamedTuple):
-    """One state of a grid world, as numbers. Positions are `[x, y]`, `grid[x, y]`.
+    """One state of a grid world, as numbers. A position (x, y) is the cell `grid[x, y]`.
 
     Attributes:
-        grid: `[S, S, 3]` uint8, object, colour and state of every cell, agent included.
-        pose: `[3]` int32, x, y and direction (0 right, 1 down, 2 left, 3 up).
-        carried: `[2]` int32, object and colour held; (0, 0) for empty hands.
-        goal: `[2]` int32, x and y of the target; (-1, -1) if it is not observed.
-        instruction: `[L]` int32, token ids; 0 pads on the right.
+        grid: object, colour and state of every cell, `[S, S, 3]` uint8; shows the agent too.
+        pose: x, y and direction (0 right, 1 down, 2 left, 3 up), `[3]` int32.
+        carried: object and colour that the agent carries, `[2]` int32; (0, 0) for empty hands.
+        goal: x and y of the target, `[2]` int32; (-1, -1) if it is not observed.
+        instruction: token ids `[L]` int32; 0 pads on the right.
     """
 
     grid: Array
@@ -53,10 +53,10 @@ def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) 
     """Reads the full state of a level as an `Observation` of NumPy arrays.
 
     Args:
-        env: a level that was reset.
+        env: environment of a level, after its reset.
         side: S; smaller or non-square grids are padded at the far ends with zeros.
-        goal: found by `nearest_goal` at reset.
-        instruction: `[L]` token ids.
+        goal: cell that `nearest_goal` found at reset.
+        instruction: token ids `[L]`.
 
     Raises:
         UserError: the level is larger than S.
@@ -80,12 +80,14 @@ def observe(env: RoomGridLevel, side: int, goal: Cell, instruction: np.ndarray) 
 
 
 def nearest_goal(env: RoomGridLevel) -> Cell:
-    """The target of an instruction that names one: the match nearest by path length.
+    """Finds the target of an instruction: the matching object with the shortest path.
 
-    Ties go to the smaller x, then the smaller y. Paths lead through doors, open or not;
-    where objects block every path, the nearest through them counts, after all others.
-    `NO_GOAL` for instructions with several targets, and where every match is out of the
-    grid (a key in a closed box).
+    Ties go to the smaller x, then the smaller y. Paths lead through open and closed doors. A match
+    whose every path is blocked by objects comes after all others, ordered by its path through the
+    objects.
+
+    Returns `NO_GOAL` if the instruction has several targets, or if every match is outside the grid
+    (such as a key in a closed box).
     """
     instruction = env.instrs  # type: ignore[attr-defined]
     if not isinstance(instruction, GoToInstr | OpenInstr | PickupInstr):
@@ -105,10 +107,10 @@ def nearest_goal(env: RoomGridLevel) -> Cell:
 
 
 def path_lengths(grid: Grid, start: Cell, through_objects: bool) -> dict[Cell, int]:
-    """Moves from `start` to every cell that can be reached, or touched, from it.
+    """Counts the moves from `start` to every cell that can be reached, or touched, from it.
 
-    An object ends a path (it is reached, not passed) unless `through_objects`; a wall
-    always does, doors and coloured floors never.
+    Paths end at objects, which are reached but not passed, unless `through_objects`. Paths always
+    end at walls, and pass doors and coloured floors.
     """
     lengths = {start: 0}
     queue = deque([start])
@@ -129,12 +131,12 @@ def path_lengths(grid: Grid, start: Cell, through_objects: bool) -> dict[Cell, i
 
 
 def agent_cell(env: RoomGridLevel) -> Cell:
-    """The cell that the agent stands in."""
+    """Returns the agent's cell."""
     x, y = env.agent_pos
     return int(x), int(y)
 
 
 def front_cell(env: RoomGridLevel) -> Cell:
-    """The cell that the agent faces."""
+    """Returns the cell that the agent faces."""
     x, y = env.front_pos
     return int(x), int(y)

@@ -1,6 +1,6 @@
-"""Maps a function over sequences whose elements often repeat: one call for each repeated element.
+"""Maps a function over sequences, and calls it once for repeated elements.
 
-States of an episode stay equal for several steps, for example while it has not begun.
+States repeat for several steps, for example before an episode begins.
 """
 
 import functools
@@ -21,19 +21,19 @@ def map_repeats(
     """Applies a function to B sequences of n elements: `[B, n, ...]`.
 
     It calls the function once for equal consecutive elements of a sequence. The number of calls
-    depends on the data, so a loop ends when all are done. JAX cannot differentiate such a loop;
-    its gradient is written here.
+    depends on the data, so a loop of variable length makes them. JAX cannot differentiate such a
+    loop, so this module defines its gradient.
 
     Args:
-        function: (element, row of its sequence) -> array; it may capture arrays of floating-point
+        function: (element, row of its sequence) -> array. It may capture arrays of floating-point
             numbers, such as parameters.
-        sequences: leaves `[B, n, ...]` of any type, n > 0; they get no gradient.
-        rows: floating-point numbers `[B, ...]`, one row a sequence.
-        size: elements of a call. The gradient computes them again, as storing the intermediate
-            values costs more.
+        sequences: leaves `[B, n, ...]` of any type, n > 0, without gradients.
+        rows: floating-point numbers `[B, ...]`, a row for each sequence.
+        size: elements in a call. The gradient calls the function again, because storing the
+            intermediate values costs more.
     """
     first, total, which = _find_repeats(sequences)
-    # There is room for all elements; the rest after the last repeat is filled with the first.
+    # The arrays have room for all elements; the first element fills the unused end.
     first = jnp.pad(first, (0, -len(first) % size)).reshape(-1, size)
     things = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[first], sequences)
     rows = rows[first // which.shape[1]]
@@ -46,8 +46,8 @@ def _find_repeats(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds groups of equal consecutive elements along axis 1.
 
     Returns:
-        `[B * n]` index of the first element of each group among all B * n, then zeros; `[]` number
-        of groups; `[B, n]` group of each element.
+        Indices `[B * n]` of the groups' first elements among all B * n elements, then zeros; the
+        number `[]` of groups; and the group `[B, n]` of each element.
     """
 
     def differs(leaf: jax.Array) -> jax.Array:
@@ -63,7 +63,7 @@ def _find_repeats(sequences: PyTree) -> tuple[jax.Array, jax.Array, jax.Array]:
 def _map_parts(
     each: Callable[..., jax.Array], things: PyTree, count: jax.Array, rows: PyTree, captured: list
 ) -> jax.Array:
-    """Applies `each` to the first `count []` of P parts: `[P, ...]`, zeros for the others."""
+    """Applies `each` to the first `count []` of P parts; returns `[P, ...]`, zeros for the rest."""
 
     def step(part: jax.Array, found: jax.Array) -> jax.Array:
         return _put(found, each(*_at((things, rows), part), *captured), part)

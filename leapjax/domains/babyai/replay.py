@@ -1,8 +1,9 @@
-"""Plays recorded episodes of MiniGrid's own observations again.
+"""Plays recorded episodes with MiniGrid's own observations again.
 
-Minari's published data sets of BabyAI hold an image, a direction and the mission, seen from the
-agent or as a whole. They hold no object carried, and no goal. Their levels follow from the seed
-of the reset, so the recorded actions lead through the same states again, whole.
+Minari's published data sets of BabyAI hold an image of the agent's view or of the whole grid, a
+direction and the mission. They lack the carried object and the goal. The seed of the reset
+determines the level, so the recorded actions lead through the same states again, which can then be
+observed in full.
 """
 
 import numpy as np
@@ -26,11 +27,12 @@ def replay(recording: Recording, level: Level) -> Demonstration | str | None:
     """Plays a recorded episode again, to make a demonstration of it.
 
     Args:
-        recording: of MiniGrid's own observations; `None` is returned for others.
-        level: of the recording.
+        recording: recorded episode.
+        level: level of the recording.
 
     Returns:
-        The demonstration, or the reason why the episode cannot be used.
+        The demonstration, or the reason why the episode cannot be used, or `None` if the
+        observations are not MiniGrid's own.
     """
     stored = recording.observations
     if not isinstance(stored, dict) or not {"image", "mission"} <= set(stored):
@@ -84,5 +86,5 @@ def _matches(adapter: BabyAIAdapter, image: np.ndarray, mission: np.ndarray) -> 
     whole = adapter.observe().grid[: env.width, : env.height]
     if np.array_equal(whole, image):
         return True
-    # The adapter removed the agent's view from the environment, as it does not use it.
+    # The adapter replaces `gen_obs` of the environment, so call the method of its class.
     return np.array_equal(type(env).gen_obs(env)["image"], image)

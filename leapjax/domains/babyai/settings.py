@@ -1,4 +1,4 @@
-"""The options of this domain."""
+"""The options of the BabyAI domain."""
 
 import dataclasses
 
@@ -13,13 +13,13 @@ class Settings:
         augment: Change training windows at random: mirror the level, recolour and rename objects,
             and restate the instruction.
         exchange_objects: With `augment`: also exchange keys, balls and boxes for each other.
-        clutter: Largest share of the cells not needed by the demonstration to fill with random
-            objects, in 0 .. 1.
+        clutter: Largest probability, in 0 .. 1, that a free cell gets a random object. Cells that
+            the demonstration needs stay free.
         channels: Features of each grid cell.
         rounds: Rounds of convolution over the grid.
-        fields: Learned distance fields; 0 leaves convolutions alone.
+        fields: Learned distance fields; 0 for convolutions alone.
         sweeps: Rounds of value iteration that compute the distance fields.
-        word_heads: Attention heads from cells to the words of the instruction; 0 for none.
+        word_heads: Attention heads from cells to the words of the instruction; 0 for no attention.
         radius: Cells around the agent, in each direction, that are read one by one.
     """
 
@@ -36,8 +36,8 @@ class Settings:
     def __post_init__(self) -> None:
         check_types(self)
         check_at_least(self, 1, "channels", most=10_000)
-        check_at_least(self, 1, "sweeps", most=10_000)  # no way in any level is longer
-        check_at_least(self, 0, "rounds", most=200)  # each is compiled by itself
+        check_at_least(self, 1, "sweeps", most=10_000)  # no path in any level is longer
+        check_at_least(self, 0, "rounds", most=200)  # each round is compiled by itself
         check_at_least(self, 0, "fields", "word_heads", most=1000)
         check_at_least(self, 0, "radius", most=100)  # no level is larger
         check_within(self, 0, 1, "clutter")

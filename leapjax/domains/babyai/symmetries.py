@@ -1,8 +1,8 @@
 """Symmetries of a grid world and of its language, as pure functions.
 
-MiniGrid's dynamics are equivariant: stepping then transforming equals transforming then
-stepping, where a reflection exchanges the two turns. Grids must be square. Names can be exchanged,
-and a sequence of tasks can be told from its beginning or from its end.
+MiniGrid's dynamics are equivariant: stepping then transforming equals transforming then stepping. A
+reflection also exchanges the two turns. Grids must be square. Names can be exchanged, and a
+sequence of tasks can be told from its beginning or from its end.
 """
 
 import functools
@@ -16,24 +16,24 @@ import numpy as np
 from leapjax.domains.babyai.observations import Observation
 
 DIRECTION_VECTORS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], np.int32)  # [4, 2]
-LEFT, RIGHT, DROP = 0, 1, 4  # MiniGrid's actions that tell left from right, or need a free cell
-EMPTY = 1  # MiniGrid's object index of a cell with nothing in it
-COLOURS = 6  # of MiniGrid
+LEFT, RIGHT, DROP = 0, 1, 4  # MiniGrid's actions
+EMPTY = 1  # MiniGrid's object index of an empty cell
+COLOURS = 6  # number of MiniGrid's colours
 FIRST_COLOURED, LAST_COLOURED = 4, 7  # MiniGrid's object indices: door, key, ball, box
-# Key, ball and box: alike where no door is locked and nobody toggles a box, which would vanish.
+# Key, ball and box behave alike unless a door is locked, or the agent toggles a box (it vanishes).
 INTERCHANGEABLE = (5, 6, 7)
 AGENT = 10  # MiniGrid's object index of the agent; the state of its cell is its direction
 
 
 @functools.lru_cache
 def _sources(side: int) -> np.ndarray:
-    """For each number of quarter turns, the flat cell that each cell comes from."""
+    """Computes the flat index of the cell that each cell comes from, by number of quarter turns."""
     cells = np.arange(side * side).reshape(side, side)
     return np.stack([np.rot90(cells, -quarter).reshape(-1) for quarter in range(4)])
 
 
 def rotate_position(position: jax.Array, quarters: jax.Array, side: int) -> jax.Array:
-    """Turns `[2]` by `quarters` counter-clockwise (direction 1 becomes 0); -1 stays -1."""
+    """Turns a position `[2]` counter-clockwise by `quarters` quarter turns; -1 stays -1."""
     x, y = position[0], position[1]
     far = side - 1
     turned = jnp.stack(
@@ -48,7 +48,7 @@ def rotate_position(position: jax.Array, quarters: jax.Array, side: int) -> jax.
 
 
 def rotate_pose(pose: jax.Array, quarters: jax.Array, side: int) -> jax.Array:
-    """Turns a pose `[3]`."""
+    """Turns a pose `[3]` counter-clockwise by quarter turns; direction 1 becomes 0 after one."""
     position = rotate_position(pose[:2], quarters, side)
     return jnp.append(position, (pose[2] - quarters) % 4)
 
@@ -56,7 +56,7 @@ def rotate_pose(pose: jax.Array, quarters: jax.Array, side: int) -> jax.Array:
 def rotate(observation: Observation, quarters: jax.Array) -> Observation:
     """Turns the world counter-clockwise by quarter turns; `quarters [] int32` may be traced.
 
-    Turning by the agent's own direction makes it face right. Instructions do not change:
+    A turn by the agent's own direction makes it face right. Instructions do not change, because
     their words are relative to the agent.
     """
     side = observation.grid.shape[0]
@@ -73,8 +73,8 @@ def reflect(observation: Observation, mirrored_words: jax.Array) -> Observation:
     """Mirrors the world top to bottom: y becomes S - 1 - y, left turns become right turns.
 
     Args:
-        observation: what to mirror.
-        mirrored_words: `[vocabulary]` the word that each word becomes (left and right).
+        observation: state to mirror.
+        mirrored_words: ids `[vocabulary]` of the word that each word becomes (left and right).
     """
     side = observation.grid.shape[0]
 
@@ -91,22 +91,28 @@ def reflect(observation: Observation, mirrored_words: jax.Array) -> Observation:
 
 
 def reflect_actions(actions: jax.Array) -> jax.Array:
-    """Exchanges the two turns and leaves every other token."""
+    """Exchanges the two turns, and leaves all other tokens unchanged."""
     return jnp.where(actions == LEFT, RIGHT, jnp.where(actions == RIGHT, LEFT, actions))
 
 
 class Renaming(NamedTuple):
-    """Permutations of names that change nothing but names."""
+    """Permutations of colours and kinds of objects, in the grid and in the language.
 
-    colours: jax.Array  # [6] int32: the colour that each colour becomes
-    objects: jax.Array  # [11] int32: the object that each object becomes
-    words: jax.Array  # [vocabulary] int32: the word that each word becomes
+    Attributes:
+        colours: the colour that each colour becomes, `[6]` int32.
+        objects: the object that each object becomes, `[11]` int32.
+        words: the word that each word becomes, `[vocabulary]` int32.
+    """
+
+    colours: jax.Array
+    objects: jax.Array
+    words: jax.Array
 
 
 def rename(observation: Observation, renaming: Renaming) -> Observation:
-    """Exchanges colours, and kinds of objects, everywhere at once."""
+    """Exchanges colours and kinds of objects in the grid, the hands and the instruction."""
     kinds, colours = observation.grid[..., 0], observation.grid[..., 1]
-    # Only what has a colour in the language is recoloured: walls stay grey.
+    # Only objects with a colour in the language change colour: walls stay grey.
     coloured = (kinds >= FIRST_COLOURED) & (kinds <= LAST_COLOURED)
     new_kinds = renaming.objects[kinds].astype(kinds.dtype)
     new_colours = renaming.colours[colours].astype(colours.dtype)
@@ -122,17 +128,17 @@ def rename(observation: Observation, renaming: Renaming) -> Observation:
 
 
 def restate(instruction: jax.Array, then: jax.Array, after: jax.Array) -> jax.Array:
-    """Says "A, then B" as "B after you A" and the other way round: both mean the same.
+    """Replaces "A, then B" by the equivalent "B after you A", and vice versa.
 
     Args:
-        instruction: `[L]` token ids, 0 pads on the right; without either of them it is unchanged.
-        then: `[2]` the ids of ", then".
-        after: `[2]` the ids of "after you".
+        instruction: token ids `[L]`, 0 pads on the right; unchanged if it has neither phrase.
+        then: ids `[2]` of ", then".
+        after: ids `[2]` of "after you".
     """
     place = jnp.arange(instruction.shape[0])
     joins = (instruction == then[0]) | (instruction == after[0])
     first = jnp.argmax(joins)  # tokens of the first part
-    second = jnp.sum(instruction > 0) - first - 2  # tokens of the second
+    second = jnp.sum(instruction > 0) - first - 2  # tokens of the second part
     swapped = instruction[jnp.where(place < second, place + first + 2, place - second - 2)]
     join = jnp.where(instruction[first] == then[0], after, then)
     swapped = jnp.where(place == second, join[0], swapped)
@@ -141,7 +147,7 @@ def restate(instruction: jax.Array, then: jax.Array, after: jax.Array) -> jax.Ar
 
 
 def _turn_agent(grid: jax.Array, turn: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """The agent's cell holds its direction as its state: turn that too."""
+    """Turns the agent's direction, which is the state of its cell."""
     state = grid[..., 2]
     turned = turn(state.astype(jnp.int32)).astype(grid.dtype)
     return grid.at[..., 2].set(jnp.where(grid[..., 0] == AGENT, turned, state))

@@ -1,6 +1,6 @@
-"""Instructions as token ids, from BabyAI's grammar and never from the order of the data.
+"""Encodes instructions as token ids, which follow BabyAI's grammar and do not depend on the data.
 
-Every registered BabyAI level speaks this language (minigrid.envs.babyai.core.verifier):
+Every registered BabyAI level uses this language (minigrid.envs.babyai.core.verifier):
 
     instruction = sequence | pair;  sequence = pair ", then" pair | pair "after you" pair
     pair        = clause | clause "and" clause
@@ -28,14 +28,14 @@ SIZE = len(WORD_IDS) + 1  # padding included
 
 # "put the red ball in front of you next to the red ball in front of you"
 LONGEST_CLAUSE = 17
-LONGEST = 4 * LONGEST_CLAUSE + 4  # four clauses, "and" twice and ", then" or "after you"
+LONGEST = 4 * LONGEST_CLAUSE + 4  # four clauses, "and" twice, and ", then" or "after you"
 
 
 def encode(instruction: str, length: int) -> np.ndarray:
-    """Token ids `[length]` int32 of an instruction, padded on the right.
+    """Encodes an instruction as token ids `[length]` int32, padded on the right.
 
     Raises:
-        UserError: a word that is not BabyAI's, which it names, or too many words.
+        UserError: a word is not BabyAI's (names it), or there are too many words.
     """
     words = re.findall(r"[a-z]+|[^a-z\s]", instruction.lower())
     unknown = [word for word in words if word not in WORD_IDS]
@@ -54,13 +54,13 @@ def encode(instruction: str, length: int) -> np.ndarray:
 
 
 def decode(ids: np.ndarray) -> str:
-    """The instruction that token ids stand for."""
+    """Decodes token ids to an instruction."""
     words = [WORDS[index - 1] for index in np.asarray(ids) if index != PAD]
     return " ".join(words).replace(" ,", ",")
 
 
 def mirrored_words() -> np.ndarray:
-    """`[SIZE]` int32: the id of each word in a mirrored world (left and right swapped)."""
+    """Returns ids `[SIZE]` int32 of each word in a mirrored world (left and right swapped)."""
     ids = np.arange(SIZE, dtype=np.int32)
     left, right = WORD_IDS["left"], WORD_IDS["right"]
     ids[[left, right]] = right, left
@@ -68,16 +68,16 @@ def mirrored_words() -> np.ndarray:
 
 
 def colour_words() -> np.ndarray:
-    """`[6]` int32: the id of each colour's word, in MiniGrid's order of colours."""
+    """Returns ids `[6]` int32 of the words for colours, in MiniGrid's order of colours."""
     return np.array([WORD_IDS[IDX_TO_COLOR[i]] for i in sorted(IDX_TO_COLOR)], np.int32)
 
 
 def object_words(objects: tuple[int, ...]) -> np.ndarray:
-    """int32: the id of the word for each of MiniGrid's object indices."""
+    """Returns ids, int32, of the words for MiniGrid's object indices."""
     return np.array([WORD_IDS[IDX_TO_OBJECT[i]] for i in objects], np.int32)
 
 
 def joining_words() -> tuple[np.ndarray, np.ndarray]:
-    """The ids of ", then" and of "after you", `[2]` int32 each."""
+    """Returns the ids of ", then" and of "after you", `[2]` int32 each."""
     then, after = [WORD_IDS[","], WORD_IDS["then"]], [WORD_IDS["after"], WORD_IDS["you"]]
     return np.array(then, np.int32), np.array(after, np.int32)

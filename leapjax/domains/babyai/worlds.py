@@ -1,6 +1,6 @@
-"""Levels that MiniGrid does not have: those of the paper's analyses (section 5).
+"""Levels of the paper's analyses (section 5) that MiniGrid does not have.
 
-The paper says little of them; the details are those of its authors' code.
+The paper describes them only briefly; details follow its authors' code.
 """
 
 from minigrid.core.world_object import Ball, Box, Floor, Key, Lava
@@ -10,11 +10,11 @@ from minigrid.envs.babyai.core.verifier import GoToInstr, ObjDesc, PickupInstr
 
 from leapjax.domains.babyai.observations import Cell, agent_cell, path_lengths
 
-MOST_LAVA = 5  # cells, of the medium one
+MOST_LAVA = 5  # most lava cells of GoToLavaMedium
 
 
 def target_cell(env: RoomGridLevel) -> Cell:
-    """Where the only object is that a level's instruction names, while it is being made."""
+    """Finds the cell of the object that the instruction names, while a level is being made."""
     described = env.instrs.desc  # type: ignore[attr-defined]
     described.find_matching_objs(env)
     x, y = described.obj_poss[0]
@@ -22,15 +22,18 @@ def target_cell(env: RoomGridLevel) -> Cell:
 
 
 def free_cells(env: RoomGridLevel, cells: list[Cell]) -> list[Cell]:
-    """Those cells in which there is nothing, nor the agent."""
+    """Returns the cells that hold neither an object nor the agent."""
     return [cell for cell in cells if env.grid.get(*cell) is None and cell != agent_cell(env)]
 
 
 class GoToBehindLava(GoToLocal):
-    """One room and one object, with lava on the straight ways to it: easy, or `wide`.
+    """One room and one object, with lava on the straight paths to it.
 
-    A cell between agent and object on the agent's row, and one on its column; where it is wide,
-    also their neighbours to both sides of the way, at most five cells in all.
+    One lava cell is on the agent's row, and one on the agent's column, between agent and object.
+    With `wide`, their neighbours to both sides of the path are lava too, at most five cells in all.
+
+    Attributes:
+        wide: whether to add lava beside the first cells.
     """
 
     def __init__(self, room_size: int, wide: bool) -> None:
@@ -38,7 +41,7 @@ class GoToBehindLava(GoToLocal):
         super().__init__(room_size=room_size, num_dists=1)
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         super().gen_mission()
         (x, y), (far_x, far_y) = agent_cell(self), target_cell(self)
         lava: list[Cell] = []
@@ -59,14 +62,18 @@ class GoToBehindLava(GoToLocal):
 
 
 class GoToAmongLava(GoTo):
-    """The paper's maze with lava somewhere in its rooms."""
+    """The paper's maze with lava at random cells of its rooms.
+
+    Attributes:
+        cells: number of lava cells.
+    """
 
     def __init__(self, cells: int, **rooms: int) -> None:
         self.cells = cells
         super().__init__(**rooms, doors_open=True)
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         super().gen_mission()
         for _ in range(self.cells):
             column, row = self._rand_int(0, self.num_cols), self._rand_int(0, self.num_rows)
@@ -76,14 +83,18 @@ class GoToAmongLava(GoTo):
 
 
 class GoToBehindObstacles(RoomGridLevel):
-    """One room, a key three columns and three rows away, obstacles in the square between."""
+    """One room, a key three columns and three rows away, and obstacles in the square between.
+
+    Attributes:
+        obstacles: number of obstacles.
+    """
 
     def __init__(self, room_size: int, obstacles: int) -> None:
         self.obstacles = obstacles
         super().__init__(num_rows=1, num_cols=1, room_size=room_size)
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         self.place_agent()
         x, y = agent_cell(self)
         far_x, far_y = x + 3 * self._rand_elem([-1, 1]), y + 3 * self._rand_elem([-1, 1])
@@ -105,13 +116,13 @@ class GoToBehindObstacles(RoomGridLevel):
 
 
 class GoToVia(GoToLocal):
-    """One room, with objects; and a coloured cell, somewhere, that is to be visited first.
+    """One room with objects, and a coloured cell that the agent should visit first.
 
-    The instruction does not say so.
+    The instruction does not mention the coloured cell.
     """
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         super().gen_mission()
         x, y = self.place_obj(Floor("yellow"))
         require_a_way(self, (int(x), int(y)))
@@ -121,7 +132,7 @@ class PickUpLocal(GoToLocal):
     """Pick up the only object of a room."""
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         super().gen_mission()
         self.instrs = PickupInstr(self.instrs.desc)  # type: ignore[assignment]
 
@@ -130,12 +141,16 @@ class PickUp(GoTo):
     """Pick up the only object of a maze."""
 
     def gen_mission(self) -> None:
-        """Places everything."""
+        """Places agent and objects, and sets the instruction."""
         super().gen_mission()
         self.instrs = PickupInstr(self.instrs.desc)  # type: ignore[assignment]
 
 
 def require_a_way(env: RoomGridLevel, to: Cell) -> None:
-    """Refuses levels, while they are made, where lava or objects are on every way to a cell."""
+    """Rejects a level that is being made if lava or objects block every path to a cell.
+
+    Raises:
+        RejectSampling: every path is blocked; MiniGrid then makes the level anew.
+    """
     if to not in path_lengths(env.grid, agent_cell(env), through_objects=False):
         raise RejectSampling("something is on every way")

@@ -38,9 +38,9 @@ class Settings:
     """Settings of an environment.
 
     Attributes:
-        success_return: Return that an episode must reach to count as a success. By default the
-            environment's own `reward_threshold`; without it an episode succeeds that terminates
-            with a positive reward.
+        success_return: Return that an episode must reach to count as a success; by default the
+            environment's own `reward_threshold`. Without either, an episode succeeds if it
+            terminates with a positive reward.
         max_steps: Steps after which an episode is cut off; by default the limit of the environment.
         arguments: Keyword arguments of `gymnasium.make`, as a JSON object.
     """
@@ -65,7 +65,7 @@ class Settings:
 
 
 class CheckedAdapter(GymnasiumAdapter):
-    """A user's environment: turns its errors into one-line `UserError`s."""
+    """Adapts a user's environment, and turns its errors into one-line `UserError`s."""
 
     def __init__(
         self, env: gym.Env, name: str, blank: PyTree, success_return: float | None
@@ -90,7 +90,7 @@ class CheckedAdapter(GymnasiumAdapter):
     def _guard(self, what: str, work: Callable[[], R]) -> R:
         try:
             return work()
-        except Exception as error:  # it is the user's code
+        except Exception as error:  # the user's code may raise anything
             raise UserError(
                 f"{what} of {self._name} raised {type(error).__name__}: {first_line(error)}"
             ) from error
@@ -116,7 +116,7 @@ def make_environment(name: str, options: Settings) -> gym.Env:
     """Makes an environment by its id, or by `module:id`, cut off after `max_steps`.
 
     Raises:
-        UserError: it cannot be made, or an episode may never end.
+        UserError: the environment cannot be made, or an episode may never end.
     """
     try:
         env = gym.make(name, options.max_steps, **json.loads(options.arguments))
@@ -135,7 +135,7 @@ def make_environment(name: str, options: Settings) -> gym.Env:
 
 
 def _explain(name: str, error: Exception) -> str:
-    """Explains why an environment cannot be made, and proposes a remedy if it knows one."""
+    """Explains why an environment cannot be made; proposes a remedy for known errors."""
     module, _, short = name.rpartition(":")
     register = "" if module else f"; if a module registers it, give MODULE:{name}"
     if ":" in module:
@@ -145,7 +145,7 @@ def _explain(name: str, error: Exception) -> str:
     if isinstance(error, gym.error.NamespaceNotFound):
         namespace = short.partition("/")[0]
         return f"no {namespace}/ is registered: install the package that has it{register}"
-    if isinstance(error, ModuleNotFoundError):  # Gymnasium's own holds Python's
+    if isinstance(error, ModuleNotFoundError):  # Gymnasium's own error wraps Python's
         missing = error.name or getattr(error.__cause__, "name", None)
         if missing:
             return f"no module {missing!r}: install it, or put its folder on PYTHONPATH"
@@ -160,7 +160,7 @@ def make(name: str, options: Settings) -> Domain:
     """Makes the domain of an environment by id; makes the environment once, to read its spaces.
 
     Raises:
-        UserError: it cannot be made, or its spaces cannot be used.
+        UserError: the environment cannot be made, or its spaces cannot be used.
     """
     env = make_environment(name, options)
     try:
@@ -177,7 +177,7 @@ def _describe(env: gym.Env, name: str, options: Settings) -> Domain:
         raise UserError(f"{name} has actions {actions}: expected Discrete(n), counted from 0")
     space = env.observation_space
     played = describe_environment(env)
-    if options.max_steps is not None:  # the user has chosen
+    if options.max_steps is not None:  # the user has chosen a limit
         played = played._replace(max_steps=None)
     blank, parts = blank_of(space, f"the observation of {name}"), parts_of(space)
 
@@ -191,7 +191,7 @@ def _describe(env: gym.Env, name: str, options: Settings) -> Domain:
             return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
 
         return {
-            "paper": functools.partial(tokens, 0),  # it embeds actions itself
+            "paper": functools.partial(tokens, 0),  # its network embeds actions itself
             "leapjax": functools.partial(tokens, int(actions.n) + 1),
         }
 

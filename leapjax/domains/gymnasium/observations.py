@@ -1,8 +1,8 @@
-"""What observations of a Gymnasium environment are made of, and a network that reads them.
+"""The arrays in observations of a Gymnasium environment, and an encoder that reads them.
 
-Each array of an observation is a *part*: choices, which become one-hot codes; or numbers, in a
-vector or a picture, which become features by what values the training data have (see
-`leapjax.domains.gymnasium.scaling`). What a space says of bounds is not used: it is often infinite.
+Each array of an observation is a *part*. It holds choices, or numbers in a vector or a picture. The
+encoder turns choices into one-hot codes. It scales numbers by the values in the training data (see
+`leapjax.domains.gymnasium.scaling`), because the bounds of spaces are often infinite.
 """
 
 import math
@@ -32,27 +32,33 @@ from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense, embed
 from leapjax.types import Context, Demonstration, PyTree
 
-SMALL = 12  # pixels: a picture is halved until no side is longer
-FIRST_FEATURES = 32  # of a picture's first layer; the others have twice as many
-MOST_INPUTS = 2**18  # of a layer: with a width of 128 training it takes 0.5 GB
-MOST_PIXELS = 2**20  # numbers of a picture
-ROUNDING = 0.1, 1e-3  # float32 may move numbers by a share of their spread, or so little
-NOISE = 1e-12  # spread of a number that never changes but for rounding errors, as a share of it
+SMALL = 12  # pixels; convolutions halve a picture until no side is longer
+FIRST_FEATURES = 32  # features of a picture's first layer; later layers have twice as many
+MOST_INPUTS = 2**18  # largest input of a layer; at width 128, training it takes 0.5 GB
+MOST_PIXELS = 2**20  # largest number of values in a picture
+ROUNDING = 0.1, 1e-3  # allowed rounding error: as a share of the spread, or absolute
+NOISE = 1e-12  # relative spread up to which a number is constant but for rounding errors
 
 
 class Part(NamedTuple):
-    """One array of an observation."""
+    """One array of an observation.
 
-    kind: str  # "vector", "picture" or "choices"
-    choices: int = 0  # of each number, where they are choices
-    first: int = 0  # the least of them, where they are not counted from 0
+    Attributes:
+        kind: "vector", "picture" or "choices".
+        choices: number of choices of each element; 0 for other kinds.
+        first: value of the choice with index 0 in the one-hot code; 0 for other kinds.
+    """
+
+    kind: str
+    choices: int = 0
+    first: int = 0
 
 
 def blank_of(space: gym.Space, name: str) -> PyTree:
-    """An observation of zeros, in the types of 32 bits or less that JAX computes with.
+    """Makes an observation of zeros, in types of at most 32 bits, which JAX computes with.
 
     Raises:
-        UserError: a space that no network here can read; says what to do.
+        UserError: no encoder can read the space; says what to do.
     """
     if isinstance(space, gym.spaces.Dict):
         if not space.spaces or not all(isinstance(key, str) for key in space.spaces):
@@ -72,7 +78,7 @@ def blank_of(space: gym.Space, name: str) -> PyTree:
 
 
 def _narrow_type(dtype: np.dtype) -> np.dtype:
-    """The type that JAX computes with in place of one of NumPy's."""
+    """Returns the type of at most 32 bits that JAX computes with instead of a NumPy type."""
     if dtype.kind == "f":
         return np.dtype(np.float32)
     return np.dtype(f"{dtype.kind}4") if dtype.itemsize == 8 else dtype
@@ -107,7 +113,7 @@ def _check_size(space: gym.Space, name: str) -> None:
 
 
 def parts_of(space: gym.Space) -> tuple[Part, ...]:
-    """The arrays of an observation, in the order of `jax.tree.leaves`."""
+    """Lists the parts of an observation, in the order of `jax.tree.leaves`."""
     if isinstance(space, gym.spaces.Dict):
         return tuple(part for key in sorted(space.spaces) for part in parts_of(space[key]))
     if isinstance(space, gym.spaces.Discrete):
@@ -122,21 +128,21 @@ def parts_of(space: gym.Space) -> tuple[Part, ...]:
 
 
 def _choices(start: int, end: int) -> Part:
-    """Choices in `start` .. `end - 1`: counted from 0, where that is possible."""
+    """Makes a part of choices in `start` .. `end - 1`; counts them from 0 if it can."""
     first = min(start, 0) if end <= MOST_INPUTS else start
     return Part("choices", end - first, first)
 
 
 def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
-    """Refuses choices outside of their space: their one-hot code would be all zeros.
+    """Checks that choices are in their space; outside it, their one-hot code would be zeros.
 
     Args:
-        space: of one observation.
-        observations: any number of them, `[n, ...]`.
-        where: they are from.
+        space: space of one observation.
+        observations: one observation, or several, `[n, ...]`.
+        where: where the observations are from, for the message.
 
     Raises:
-        UserError: says which.
+        UserError: a choice is outside its space; names it and its range.
     """
     if isinstance(space, gym.spaces.Dict):
         for key, part in space.spaces.items():
@@ -155,15 +161,17 @@ def check_choices(space: gym.Space, observations: PyTree, where: str) -> None:
 
 
 def check_precision(space: gym.Space, observations: PyTree, where: str) -> None:
-    """Refuses numbers of 64 bits whose changes float32 cannot hold, such as seconds since 1970.
+    """Checks that float32 can represent how 64-bit numbers change during an episode.
+
+    It cannot if they are seconds since 1970, for example.
 
     Args:
-        space: of one observation.
-        observations: of an episode, `[n + 1, ...]`, as they were recorded.
-        where: they are from.
+        space: space of one observation.
+        observations: recorded observations `[n + 1, ...]` of an episode.
+        where: where the observations are from, for the message.
 
     Raises:
-        UserError: says what to do.
+        UserError: numbers change by too little for float32; says what to do.
     """
     if isinstance(space, gym.spaces.Dict):
         for key, part in space.spaces.items():
@@ -172,7 +180,7 @@ def check_precision(space: gym.Space, observations: PyTree, where: str) -> None:
     dtype = np.dtype(space.dtype)
     if dtype.kind != "f" or dtype.itemsize <= 4:
         return
-    with np.errstate(over="ignore", invalid="ignore"):  # what does not fit is refused elsewhere
+    with np.errstate(over="ignore", invalid="ignore"):  # another check rejects overflow
         moved = np.abs(observations - observations.astype(np.float32)).max(axis=0)
         spread, size = observations.std(axis=0), np.abs(observations).max(axis=0)
         lost = (moved > ROUNDING[0] * spread) & (moved > ROUNDING[1]) & (spread > NOISE * size)
@@ -186,14 +194,15 @@ def check_precision(space: gym.Space, observations: PyTree, where: str) -> None:
 
 
 def measure_parts(parts: Sequence[Part], demonstrations: Sequence[Demonstration]) -> Statistics:
-    """Finds the knots of each part in all states of the training data; none of choices.
+    """Finds the knots of each part from all states of the training data.
 
     Args:
-        parts: of an observation.
-        demonstrations: to learn from.
+        parts: parts of an observation.
+        demonstrations: training data.
 
     Returns:
-        For each part its `Knots`; () if all parts are choices, or there are no demonstrations.
+        The `Knots` of each part, `()` for choices; `()` alone if all parts are choices, or there
+        are no demonstrations.
     """
     if not demonstrations or all(part.kind == "choices" for part in parts):
         return ()
@@ -205,11 +214,11 @@ def measure_parts(parts: Sequence[Part], demonstrations: Sequence[Demonstration]
 
 
 def _measure(part: Part, arrays: Sequence[np.ndarray]) -> Knots:
-    """The knots of one part, from arrays `[n, ...]` of several episodes."""
+    """Finds the knots of one part from arrays `[n, ...]` of several episodes."""
     shape, states = arrays[0].shape[1:], sum(map(len, arrays))
     columns, bins = _count_columns(part, shape), count_bins(math.prod(shape))
     tables = [_arrange(array, part).reshape(len(array), -1, columns) for array in arrays]
-    # Knots need no more than a sample of the states, but the least and the largest are of all.
+    # A sample of the states is enough for the knots, but the extremes come from all states.
     stride = -(-states * math.prod(shape) // SAMPLE)
     firsts = np.cumsum([0, *map(len, tables)])[:-1]
     some = [table[-first % stride :: stride] for table, first in zip(tables, firsts, strict=True)]
@@ -220,10 +229,10 @@ def _measure(part: Part, arrays: Sequence[np.ndarray]) -> Knots:
 
 
 def check_statistics(statistics: Statistics, parts: Sequence[Part], blank: PyTree) -> None:
-    """Checks that knots are of these parts.
+    """Checks that statistics fit the parts of an observation.
 
     Raises:
-        UserError: they are not.
+        UserError: they do not fit.
     """
     leaves = jax.tree.leaves(blank)
     fits = len(statistics) == len(parts) and all(
@@ -242,7 +251,7 @@ def check_statistics(statistics: Statistics, parts: Sequence[Part], blank: PyTre
 
 
 def _count_columns(part: Part, shape: Sequence[int]) -> int:
-    """Into how many columns of numbers an array is arranged: each has its own knots."""
+    """Counts the columns of numbers in a part; each column has its own knots."""
     if part.kind == "picture":
         return _with_channels(np.zeros((1, *shape), bool)).shape[-1]
     numbers = math.prod(shape)
@@ -250,16 +259,17 @@ def _count_columns(part: Part, shape: Sequence[int]) -> int:
 
 
 def _arrange(states: Any, part: Part) -> Any:
-    """Arrays `[n, ...]` as pictures `[n, H, W, C]` or vectors `[n, G]`."""
+    """Arranges arrays `[n, ...]` as pictures `[n, H, W, C]` or vectors `[n, G]`."""
     if part.kind == "picture":
         return _with_channels(states)
     return states.reshape(len(states), -1)
 
 
 def _with_channels(pictures: Any) -> Any:
-    """Pictures `[n, ...]` as `[n, H, W, C]`.
+    """Arranges pictures `[n, ...]` as `[n, H, W, C]`.
 
-    The channels are the axis beside two equal ones; if there are no equal ones, the shorter end.
+    Pictures without channels get a single channel. If two neighbouring axes have equal length, the
+    third axis holds the channels. Otherwise the shorter of the first and the last axis holds them.
     """
     if pictures.ndim == 3:
         return pictures[..., None]
@@ -269,21 +279,29 @@ def _with_channels(pictures: Any) -> Any:
 
 
 class StateTokens(Encoder):
-    """A token for each state of a context: `[K + 1, D]`, the current state last."""
+    """A token for each state of a context: `[K + 1, D]`, the current state last.
+
+    Attributes:
+        parts: parts of an observation.
+        width: D, width of a token.
+        num_actions: A; 0 if tokens hold neither past actions nor their order.
+        dtype: type of matrix products and convolutions.
+        statistics: statistics of the training data, from `measure_parts`.
+    """
 
     parts: tuple[Part, ...]
     width: int
-    num_actions: int  # A; 0: tokens hold neither past actions nor their order
+    num_actions: int
     dtype: Dtype = jnp.float32
-    statistics: Statistics = ()  # of the training data, as `measure_parts` finds them
+    statistics: Statistics = ()
 
     def __call__(self, context: Context) -> jax.Array:
-        """Tokens of the K past states and the current one."""
+        """Returns the tokens of the K past states and the current state."""
         return self.encode_next(context, None)
 
     @nn.compact
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """The same, given the tokens of the past states."""
+        """Returns the tokens of all states, given the tokens `[K, D]` of the past states."""
         current = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], context.observation)
         states = current
         if known is None:

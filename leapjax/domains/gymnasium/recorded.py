@@ -10,7 +10,7 @@ import numpy as np
 from leapjax.domain import Described
 from leapjax.errors import UserError
 
-UNBOUNDED = 2.0**31 - 1  # larger bounds stand for unbounded; versions of Gymnasium differ in them
+UNBOUNDED = 2.0**31 - 1  # from here on bounds count as infinite; Gymnasium's versions differ
 # Wrappers of Gymnasium that change neither observations, nor rewards, nor actions.
 WATCHING = frozenset(
     {
@@ -21,7 +21,7 @@ WATCHING = frozenset(
 
 
 def describe_environment(env: gym.Env) -> Described:
-    """Describes an environment as the metadata of a data set describe theirs."""
+    """Describes an environment in the form of a data set's metadata."""
     spaces = {"observation": env.observation_space, "action": env.action_space}
     if env.spec is None:
         return Described(spaces=spaces)
@@ -38,7 +38,7 @@ def describe_environment(env: gym.Env) -> Described:
 
 
 def _read_arguments(spec: gym.envs.registration.EnvSpec) -> Mapping[str, Any] | None:
-    """Reads an environment's arguments as a data set stores them; None if they are not JSON."""
+    """Reads an environment's arguments as a data set stores them; `None` if they are not JSON."""
     try:
         return json.loads(spec.to_json())["kwargs"]
     except Exception:  # noqa: BLE001  (arguments that are not JSON raise many kinds)
@@ -48,12 +48,12 @@ def _read_arguments(spec: gym.envs.registration.EnvSpec) -> Mapping[str, Any] | 
 def check_environment(recorded: Described, where: str, played: Described) -> None:
     """Checks that a data set was recorded in the environment that is played.
 
-    Wrappers are not rebuilt: a data set could then choose which code is imported.
+    It does not rebuild the data set's wrappers: a data set could then choose the imported code.
 
     Args:
         recorded: description of the data set's environment.
         where: name of the data set, for the message.
-        played: the environment; `max_steps` is None if the user has chosen it.
+        played: description of the played environment; `max_steps` is `None` if the user chose it.
 
     Raises:
         UserError: names the arguments, wrappers, step limit or space that differs.
@@ -125,7 +125,7 @@ def _as_json(value: Any) -> Any:
 
     try:
         return json.loads(json.dumps(value, default=convert))
-    except (TypeError, ValueError, RecursionError):  # keys that are no text, or a cycle
+    except (TypeError, ValueError, RecursionError):  # keys that are not strings, or a cycle
         return repr(value)
 
 
@@ -150,7 +150,7 @@ def _check_space(
 
 
 def _is_same(recorded: Any, played: Any) -> bool:
-    """Returns whether two spaces hold the same values, of any types."""
+    """Returns whether two spaces hold the same values; their number types may differ."""
     if type(recorded) is not type(played) or recorded.shape != played.shape:
         return False
     if isinstance(played, gym.spaces.Box):

@@ -1,42 +1,44 @@
-"""Numbers of any size as inputs of a network: scaled by the values that training data have.
+"""Scales numbers of any size to inputs of a network, by the values in the training data.
 
 Each column of numbers has *knots*, values of the training data in ascending order. A number becomes
-one feature for each interval between two knots: -1 below the interval, 1 above, linear inside
-(Gorishniy et al., 2022, "On Embeddings for Numerical Features in Tabular Deep Learning"). Mean and
-standard deviation would serve as well until one value of 1e9 stands for "nothing seen": then all
-others would be one number.
+one feature for each interval between two knots. The feature is -1 below the interval, 1 above it,
+and linear inside. Source: Gorishniy et al., 2022, "On Embeddings for Numerical Features in Tabular
+Deep Learning".
+
+Mean and standard deviation would fail where, for example, 1e9 marks a missing value: all other
+values would become nearly equal.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-Knots = tuple[tuple[float, ...], ...]  # of each column; of one column: all numbers share them
+Knots = tuple[tuple[float, ...], ...]  # knots of each column, or of one column for all numbers
 
-BINS = 16  # intervals of a column, at most
-FEWEST_BINS = 4  # of a column of a large array
-FEATURES = 2**13  # of an array: one with more numbers has fewer intervals
-SAMPLE = 2**22  # numbers that knots are found in; the least and the largest are of all
-# Without training data nothing is known of the size of numbers, and nothing is learned.
+BINS = 16  # most intervals of a column
+FEWEST_BINS = 4  # intervals of a column in a large array
+FEATURES = 2**13  # features of an array; with more numbers, each has fewer intervals
+SAMPLE = 2**22  # numbers to find knots in; the smallest and the largest come from all numbers
+# Knots of a network without training data, which does not learn either.
 UNMEASURED: Knots = ((-10.0, -1.0, -0.1, -0.01, 0.0, 0.01, 0.1, 1.0, 10.0),)
 LARGEST = float(np.finfo(np.float32).max)
 
 
 def count_bins(numbers: int) -> int:
-    """The most intervals that each number of an array of so many has."""
+    """Returns the most intervals of each number in an array of so many `numbers`."""
     return min(BINS, max(FEWEST_BINS, FEATURES // numbers))
 
 
 def find_knots(values: np.ndarray, bins: int) -> Knots:
     """Finds the knots of each column.
 
-    All distinct values, if there are few. If not, half of the knots are quantiles of the values,
-    which tell frequent values apart, and half are quantiles of the distinct values, which tell
-    rare ones apart.
+    If a column has few distinct values, all of them are knots. Otherwise half of the knots are
+    quantiles of the values, to separate frequent values. The other half are quantiles of the
+    distinct values, to separate rare values.
 
     Args:
-        values: `[n, G]`, n > 0.
-        bins: how many intervals there may be, an even number.
+        values: numbers `[n, G]`, n > 0.
+        bins: largest number of intervals, an even number.
     """
     return tuple(_column_knots(np.sort(column), bins) for column in values.T)
 
@@ -52,14 +54,15 @@ def _column_knots(ordered: np.ndarray, bins: int) -> tuple[float, ...]:
 
 
 def scale_numbers(values: jax.Array, knots: Knots) -> jax.Array:
-    """Turns numbers `[..., G]` into features `[..., G m]`, m the most intervals of a column.
+    """Turns numbers `[..., G]` into features `[..., G m]`, with m intervals for each column.
 
-    Beyond the outermost knots features grow with the logarithm of the distance. A column with one
-    knot never changed in the training data, so nothing is known of its changes: it gives zeros.
+    Columns with fewer intervals get zeros for the others. Beyond the outermost knots, features grow
+    with the logarithm of the distance. A column with one knot was constant in the training data:
+    its features are zeros.
 
     Args:
-        values: of any real type.
-        knots: of each of the G columns, or of one that all share.
+        values: numbers of any real type.
+        knots: knots of each of the G columns, or of one column for all numbers.
     """
     longest = max(2, *(len(column) for column in knots))
     table = np.array([column + column[-1:] * (longest - len(column)) for column in knots])
@@ -67,7 +70,7 @@ def scale_numbers(values: jax.Array, knots: Knots) -> jax.Array:
     first = np.arange(longest - 1) == 0
     last = np.arange(longest - 1) == np.array([[len(column) - 2] for column in knots])
     wide = widths > 0
-    # The reciprocal of 3e38 is not a number that devices have, nor is that of 1e-39.
+    # Devices cannot represent the reciprocals of 3e38 and of 1e-39: multiply by factors first.
     factors = np.where(widths > 1, 2.0**-64, 2.0**64)
     distances = _subtract(values[..., None], starts) * jnp.float32(factors)
     places = distances / jnp.float32(np.where(wide, widths * factors, 1.0))
@@ -79,9 +82,9 @@ def scale_numbers(values: jax.Array, knots: Knots) -> jax.Array:
 
 
 def _subtract(values: jax.Array, knots: np.ndarray) -> jax.Array:
-    """Differences in float32, exact wherever float32 has them."""
+    """Subtracts knots from values in float32; exact if float32 can represent the difference."""
     if values.dtype.itemsize == 4 and jnp.issubdtype(values.dtype, jnp.integer):
-        # float32 has no 2,000,000,001: the upper and the lower 16 bits are subtracted apart.
+        # float32 cannot represent 2,000,000,001: subtract the upper and the lower 16 bits apart.
         upper, lower = (values >> 16).astype(jnp.float32), (values & 0xFFFF).astype(jnp.float32)
         high = np.floor(knots / 2**16)
         low = knots - high * 2**16

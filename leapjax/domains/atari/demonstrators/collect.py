@@ -1,7 +1,7 @@
-"""Collects data in the format of DQN-Replay from real games: no download is needed.
+"""Plays games and writes them in the format of DQN-Replay, without a download.
 
-A file holds a game or more. Its content depends only on its number, so data do not depend on the
-number of processes, nor on interruptions.
+A file holds one or more games. Its content does not depend on the other files, so data do not
+depend on the number of processes or on interruptions.
 """
 
 import itertools
@@ -29,11 +29,11 @@ from leapjax.domains.atari.demonstrators.workers import is_finished, start_worke
 from leapjax.domains.atari.games import Game, find_game
 from leapjax.errors import UserError
 
-# Transitions of a file, at least. A killed program loses the unfinished file of each core: at most
-# these transitions and one more game.
+# Smallest number of transitions in a file. A killed program loses the unfinished file of each core:
+# at most these transitions and one more game.
 SHARD = 1_000
-GAMES = 1_000  # of a file, at most
-BYTES = 200  # of a transition on the disk, approximately
+GAMES = 1_000  # most games of a file
+BYTES = 200  # approximate size of a transition on the disk
 POLL = 0.2  # seconds
 MARK = ".made-by-leapjax"  # marks a folder whose files may be replaced
 
@@ -50,13 +50,14 @@ def collect(
     """Plays games until a folder holds enough transitions; resumes if it was stopped.
 
     Args:
-        folder: of all games.
-        game: to play.
+        folder: folder of all games.
+        game: game to play.
         transitions: smallest number of transitions, in whole games.
-        dqn_seed: number from 1 that names the folder as DQN-Replay does; each has other games.
-        longest: decisions after which a game is cut off: see `replay.Episode`.
-        workers: number of processes; as many as cores by default.
-        progress: called with the number of transitions so far.
+        dqn_seed: number from 1 in the name of the folder, as in DQN-Replay; each number has its own
+            games.
+        longest: decisions after which a game is cut off, see `replay.Episode`.
+        workers: number of processes; by default the number of cores.
+        progress: function to call with the number of transitions so far.
 
     Returns:
         The manifest of each file: its games, with their scores.
@@ -71,7 +72,7 @@ def collect(
         _claim(logs)
         files.check_room(logs, transitions * BYTES)
         made = read_manifests(folder, game, dqn_seed, transitions, longest)
-        if count_transitions(made) < transitions:  # else start no process
+        if count_transitions(made) < transitions:  # otherwise start no process
             waiting = (
                 n
                 for n in itertools.count()
@@ -105,9 +106,9 @@ def is_whole(folder: Path, game: Game, transitions: int, dqn_seed: int, longest:
 
 
 def find_shards(folder: Path, game: Game, transitions: int, dqn_seed: int) -> range | None:
-    """Returns the numbers of the first files that hold so many transitions.
+    """Returns the numbers of the first files that together hold so many `transitions`.
 
-    Returns `None` if the files were not made here, or hold too few.
+    Returns `None` if the files were not made here, or hold too few transitions.
 
     Raises:
         UserError: the files are of another game or `dqn_seed`.
@@ -117,7 +118,7 @@ def find_shards(folder: Path, game: Game, transitions: int, dqn_seed: int) -> ra
 
 
 def _claim(logs: Path) -> None:
-    """Marks a folder as one whose files may be replaced.
+    """Marks a folder, which allows `collect` to replace its files.
 
     Raises:
         UserError: the folder holds files that were not made here.
@@ -155,6 +156,6 @@ def make_shard(folder: Path, name: str, dqn_seed: int, number: int, longest: int
         **playing.describe_rules(game), "games": games,
         "versions": {each: metadata.version(each) for each in ("leapjax", "ale-py", "numpy")},
     }  # fmt: skip
-    # The manifest is written last: a file without it is made again.
+    # The manifest is written last: a file without a manifest is made again.
     files.write_text(manifest_path(logs, number), json.dumps(manifest) + "\n")
     return manifest

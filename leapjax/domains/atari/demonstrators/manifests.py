@@ -1,4 +1,4 @@
-"""Manifests: which games a file holds, with which seeds, noise and rules they were played."""
+"""Manifests, which list the games of a file with their seeds, noise and rules."""
 
 import json
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ def read_manifest(
     """Reads the manifest of a file; returns `None` if the file was not made here.
 
     Args:
-        folder: of all games.
-        game: to expect.
-        dqn_seed: to expect.
-        number: of the file.
-        longest: decisions of a game, to check that the file would be made alike now; not checked
-            by default.
+        folder: folder of all games.
+        game: expected game.
+        dqn_seed: expected seed of the DQN.
+        number: number of the file.
+        longest: most decisions of a game. If given, checks that the file would have the same
+            content if it were made now.
 
     Raises:
         UserError: the manifest is damaged, of another game or `dqn_seed`, or fails the check.
@@ -61,7 +61,7 @@ def read_manifest(
             f"{another}"
         )
     rules = playing.describe_rules(game)
-    # Manifests without these keys are from when all demonstrators had their first rules.
+    # Early manifests lack these keys; all demonstrators then had their first rules.
     played = {"demonstrator": rules["demonstrator"], "rules": 1} | {
         name: manifest[name] for name in rules if name in manifest
     }
@@ -87,15 +87,15 @@ def read_manifests(
     longest: int | None = None,
     before: Sequence[Manifest] = (),
 ) -> list[Manifest]:
-    """Reads the manifests of consecutive files until they hold so many transitions.
+    """Reads the manifests of consecutive files until they hold so many `transitions`.
 
     Args:
-        folder: of all games.
-        game: to expect.
-        dqn_seed: to expect.
+        folder: folder of all games.
+        game: expected game.
+        dqn_seed: expected seed of the DQN.
         transitions: number of transitions after which to stop.
-        longest: as in `read_manifest`.
-        before: the first manifests, if they were read already.
+        longest: see `read_manifest`.
+        before: first manifests, if they were read already.
     """
     made = list(before)
     while count_transitions(made) < transitions:

@@ -11,19 +11,19 @@ class Table(NamedTuple):
     """A game with a ball that flies along an axis, and a paddle that moves across it.
 
     Attributes:
-        along: memory address of the ball's position along the axis; 0 there: there is no ball.
+        along: memory address of the ball's position along the axis; the value 0 means no ball.
         across: memory address of the ball's position across the axis.
         paddle: memory address of the paddle's position across the axis.
         line: position of the paddle along the axis.
         walls: positions across the axis where the ball bounces.
         middle: the ball's position minus the paddle's when it hits the middle of the paddle.
         more: action that increases the paddle's position.
-        less: action that decreases it.
+        less: action that decreases the paddle's position.
         tap: distance that one decision moves the paddle.
         coast: part of this distance that comes after the decision.
         stay: action that does not move the paddle. In Breakout it also asks for a new ball.
-        spread: largest distance from the middle at which to hit a ball. A ball that is always hit
-            in the same place may fly in a circle for ever.
+        spread: largest distance from the middle at which to hit a ball. If the paddle always hits
+            the ball in the same place, the ball may repeat its path for ever.
     """
 
     along: int
@@ -42,20 +42,20 @@ class Table(NamedTuple):
 
 PONG = Table(49, 54, 51, 187, (44, 207), 5, 3, 2, 22.5, 12.5, NOOP, 1)
 BREAKOUT = Table(101, 99, 72, 180, (55, 201), 9, 2, 3, 22, 11, 1, 3)
-_LOOK_AHEAD = 2.0  # decisions to predict the ball for; more do not win more
+_LOOK_AHEAD = 2.0  # decisions for which to predict the ball; more decisions win no more points
 
 
 class Paddle:
     """Plays Pong and Breakout: follows the ball.
 
-    Its rule can be inferred from the frames. A search in the emulator for the best place to hit
+    An agent can infer this rule from the frames. A search in the emulator for the best place to hit
     each ball wins more, but agents learn less from it.
     """
 
     def __init__(self, table: Table) -> None:
         self._table = table
         self._before = np.zeros(128, np.uint8)
-        self._aim = 0.0  # where to hit the next ball, from the middle
+        self._aim = 0.0  # distance from the middle at which to hit the next ball
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
         """Chooses an action."""

@@ -1,4 +1,4 @@
-"""Plays games with the built-in demonstrators: who plays which game, and with how much noise."""
+"""Plays games with the built-in demonstrators; defines each game's demonstrator and noise."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,20 +12,20 @@ from leapjax.domains.atari.demonstrators.seaquest import play_seaquest
 from leapjax.domains.atari.emulator import MOST_NOOPS, Emulator
 from leapjax.domains.atari.games import GAMES, MAX_STEPS, Game
 
-# Chooses an action, and leaves the emulator as it found it. One plays one game, from its start.
+# Chooses an action, and does not change the emulator's state. Plays one game from its start.
 Demonstrator = Callable[[Emulator, np.random.Generator], int]
 
 # Probabilities of a random action, so that returns vary and demonstrations show how to recover. A
 # paddle that is always in the right place does not teach how to return there: its clone misses a
-# ball and stays where it is (docs/lessons.md).
+# ball and then does not move (docs/lessons.md).
 NOISES = (0.1, 0.3, 0.5)
 # With more noise in Seaquest the demonstrator scores less, but agents that learn from it do not.
 MORE_NOISE = {"Seaquest": (0.3, 0.5, 0.7)}
-# Version of the demonstrator of each game. Raise it whenever a demonstrator acts differently: then
-# `collect` does not mix its games with those before.
+# Version of the demonstrator of each game. Raise it whenever a demonstrator acts differently, so
+# that `collect` does not mix its games with earlier games.
 RULES = dict.fromkeys(GAMES, 1)
 
-# By game: the demonstrator's name in manifests, and how to make one.
+# For each game: the demonstrator's name in manifests, and a function that makes it.
 _MAKERS: dict[str, tuple[str, Callable[[], Demonstrator]]] = {
     "Breakout": ("Paddle", lambda: Paddle(BREAKOUT)),
     "Qbert": ("Qbert", Qbert),
@@ -49,9 +49,9 @@ class PlayedGame(NamedTuple):
     """A game of `n` decisions.
 
     Attributes:
-        frames: `[n, 84, 84]` uint8, before each action.
-        actions: `[n]` int32, as executed.
-        rewards: `[n]` float32, not clipped.
+        frames: frames `[n, 84, 84]` uint8 before each action.
+        actions: executed actions `[n]` int32.
+        rewards: rewards `[n]` float32, not clipped.
     """
 
     frames: np.ndarray
@@ -65,13 +65,13 @@ class PlayedGame(NamedTuple):
 
 
 def play(game: Game, seed: int, noise: float, most_steps: int = MAX_STEPS) -> PlayedGame:
-    """Plays a game, which is a function of the arguments.
+    """Plays a game. Equal arguments give equal games.
 
     Args:
-        game: to play.
-        seed: of everything random, such as the number of no-ops at the start, up to 30.
+        game: game to play.
+        seed: seed of all random choices, such as the number of no-ops at the start, up to 30.
         noise: probability that a random action replaces a decision.
-        most_steps: decisions after which to stop; some games hardly end.
+        most_steps: decisions after which to stop, because some games may not end.
     """
     starts, noises, choices = (
         np.random.default_rng(part) for part in np.random.SeedSequence(check_seed(seed)).spawn(3)

@@ -8,30 +8,30 @@ _TILES = (
     21, 52, 54, 83, 85, 87, 98, 100, 102, 104, 1, 3, 5, 7, 9, 32, 34, 36, 38, 40, 42,
 )  # fmt: skip  # memory addresses of the colours of the tiles, row by row
 _TILE_PLACES = [(row, place) for row in range(6) for place in range(row + 1)]
-_HOPS = {5: (1, 0), 3: (1, 1), 2: (-1, 0), 4: (-1, -1)}  # by action: change of row and of place
+_HOPS = {5: (1, 0), 3: (1, 1), 2: (-1, 0), 4: (-1, -1)}  # change of row and place, by action
 _LONGEST_HOP = 12  # decisions; most take 7
 _WAIT = 4  # decisions
-_HOPS_AHEAD = 2  # with 3 it scored no more, and put off hops
+_HOPS_AHEAD = 2  # depth of the search; with 3 it scored no more, and put off hops
 _DIED = -40.0  # value of losing a life, in tiles
-_FAR = 0.08  # value of a hop towards a tile: from corner to corner less than one tile
+_FAR = 0.08  # cost in tiles of a hop to the nearest tile to change; below 1 from corner to corner
 
 
 class Qbert:
     """Plays Qbert: searches a tree of hops whenever Qbert can hop.
 
-    While Qbert cannot hop, it chooses the following hop already, or any hop. So agents that learn
-    from it need not recognise the moment to hop. From a demonstrator that waits for that moment,
-    or between two lives, they learn to wait for ever.
+    While Qbert cannot hop, the demonstrator already chooses the next hop, or any hop. Agents that
+    learn from it therefore need not recognise the moment to hop. Agents that learn from a
+    demonstrator that waits for this moment, or between two lives, learn to wait for ever.
     """
 
     def __init__(self) -> None:
-        self._colours: list[int] = []  # of tiles in this round, in order of appearance
+        self._colours: list[int] = []  # tiles' colours in this round, in order of appearance
         self._next = NOOP  # the hop after the current one
         self._lives = 0
 
     def __call__(self, emulator: Emulator, random: np.random.Generator) -> int:
         """Chooses an action."""
-        del random  # so agents can learn which of two equally good hops it chooses
+        del random  # agents can then learn which of two equally good hops it chooses
         ram = emulator.ram()
         colours = [int(ram[at]) for at in _TILES]
         if len(set(colours)) == 1:  # a new round
@@ -54,7 +54,7 @@ class Qbert:
         return 3  # Qbert is not on the pyramid
 
     def _search(self, emulator: Emulator, depth: int) -> tuple[float, int, int]:
-        """Finds the best action; returns its value in tiles, the action, and the one after."""
+        """Finds the best action; returns its value in tiles, the action, and the next action."""
         saved, (row, place) = emulator.save(), _find_tile(emulator.ram())
         most, best, after = -np.inf, NOOP, NOOP
         for action in (*_HOPS, NOOP):  # the first of equally good actions wins
@@ -102,7 +102,7 @@ def _can_hop(ram: np.ndarray) -> bool:
 
 
 def _find_tile(ram: np.ndarray) -> tuple[int, int]:
-    """Finds the row in which Qbert stands, and the place in it."""
+    """Finds the row in which Qbert stands, and its place in the row."""
     row = round((int(ram[67]) - 25) / 28)
     return row, round(((int(ram[43]) - 77) / 12 + row) / 2)
 

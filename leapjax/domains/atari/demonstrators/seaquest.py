@@ -6,18 +6,18 @@ import numpy as np
 
 from leapjax.domains.atari.emulator import SCREEN, Emulator
 
-# Actions that move and fire, by their direction: right and down.
+# Actions that move and fire, by direction (right, down).
 _SHOTS = {
     (0, 0): 1, (0, -1): 10, (1, 0): 11, (-1, 0): 12, (0, 1): 13, (1, -1): 14, (-1, -1): 15,
     (1, 1): 16, (-1, 1): 17,
 }  # fmt: skip
-_LANES = (103, 79, 55, 31)  # depth of the submarine in each lane; enemies and divers stay in one
+_LANES = (103, 79, 55, 31)  # the submarine's depth in each lane; enemies, divers keep their lane
 _SURFACE = 13
-_UP = ((20, _SURFACE), (32, _LANES[3]), (44, _LANES[2]))  # (air, the depth to rise to below it)
+_UP = ((20, _SURFACE), (32, _LANES[3]), (44, _LANES[2]))  # with less air than this, rise to depth
 _HOME = 1  # lane to stay in if there is no diver
-_TURNS = (56, 96)  # where to turn round if there is no target
+_TURNS = (56, 96)  # positions at which to turn round if there is no target
 _REACHABLE = range(21, 135)  # positions that the submarine can reach
-_BOAT = 6  # divers that fit in
+_BOAT = 6  # divers that fit in the submarine
 _TANK = 60  # air of an almost full tank
 _CLOSE = 24  # distance to keep from an enemy
 _PASSED = 16  # distance behind the submarine from which an enemy is harmless
@@ -27,9 +27,9 @@ class Swimmer(NamedTuple):
     """An enemy or a diver that crosses the screen.
 
     Attributes:
-        across: its position.
-        lane: its lane.
-        direction: 1: to the right, -1: to the left.
+        across: horizontal position.
+        lane: index of the lane, from the lowest lane up.
+        direction: 1 to the right, -1 to the left.
     """
 
     across: int
@@ -41,13 +41,13 @@ class Scene(NamedTuple):
     """A moment of Seaquest.
 
     Attributes:
-        across: position of the submarine.
-        depth: of the submarine.
-        facing: 1: right, -1: left.
-        air: left in the tank.
+        across: horizontal position of the submarine.
+        depth: depth of the submarine.
+        facing: 1 if the submarine faces right, -1 if left.
+        air: air left in the tank.
         aboard: number of divers in the submarine.
-        enemies: and their missiles.
-        divers: in the water.
+        enemies: enemies and their missiles.
+        divers: divers in the water.
     """
 
     across: int
@@ -66,12 +66,12 @@ def read_scene(ram: np.ndarray) -> Scene:
     for lane in range(len(_LANES)):
         kind, row, first, other = (int(ram[at + lane]) for at in (89, 36, 30, 71))
         direction = -1 if kind & 8 else 1
-        for bit, place in ((4, 0), (2, 16), (1, 32)):  # up to three in a row
+        for bit, place in ((4, 0), (2, 16), (1, 32)):  # up to three enemies side by side
             across = (first + place) % 256
             if row & bit and across < SCREEN[1]:
                 enemies.append(Swimmer(across, lane, direction))
         if 0 < other < SCREEN[1]:
-            shot = 4 <= kind % 8 <= 6  # a lane of submarines
+            shot = 4 <= kind % 8 <= 6  # a lane of enemy submarines, which shoot
             (enemies if shot else divers).append(Swimmer(other, lane, direction))
     across, depth, air, aboard = (int(ram[at]) for at in (70, 97, 102, 62))
     return Scene(across, depth, -1 if ram[86] & 8 else 1, air, aboard, enemies, divers)
@@ -81,11 +81,11 @@ def play_seaquest(emulator: Emulator, random: np.random.Generator) -> int:
     """Plays Seaquest: moves to and fro in a lane, and fires all the time.
 
     The submarine collects six divers and surfaces with them, or rises as its air runs out. It
-    never waits: agents that learn from a demonstrator that waits do nothing else (docs/lessons.md).
+    never waits, because agents that learn to wait never stop waiting (docs/lessons.md).
     """
     del random
     scene = read_scene(emulator.ram())
-    if scene.depth == _SURFACE and scene.air < _TANK:  # it cannot dive before
+    if scene.depth == _SURFACE and scene.air < _TANK:  # it cannot dive until the tank is full
         return _SHOTS[0, 1]
     goal = _choose_depth(scene)
     down = int(np.sign(goal - scene.depth)) if abs(goal - scene.depth) > 2 else 0
@@ -107,7 +107,7 @@ def _choose_depth(scene: Scene) -> int:
     def distance(diver: Swimmer) -> float:
         return abs(_LANES[diver.lane] - scene.depth) + abs(diver.across - scene.across) / 2
 
-    # Sorted from the top: of two equally distant divers the upper one is chosen.
+    # Sorted from the top, so that the upper of two equally distant divers wins.
     near = [diver for diver in reversed(scene.divers) if diver.across in _REACHABLE]
     return _LANES[min(near, key=distance).lane if near else _HOME]
 

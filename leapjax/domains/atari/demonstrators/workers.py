@@ -1,4 +1,4 @@
-"""Processes that play games beside each other."""
+"""Processes that play games in parallel."""
 
 import contextlib
 import multiprocessing
@@ -40,7 +40,7 @@ def start_workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def is_finished(made: Future[Any]) -> bool:
-    """Returns whether a process has finished its file; raises its exception here."""
+    """Returns whether a process has finished its file; raises the process's exception."""
     if not made.done():
         return False
     made.result()
@@ -48,7 +48,7 @@ def is_finished(made: Future[Any]) -> bool:
 
 
 def _end_with_parent() -> None:
-    """Ignores Ctrl-C, which reaches all processes, and ends with the first process instead."""
+    """Makes a process ignore Ctrl-C, and end when the process that started it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     first = multiprocessing.parent_process()
 

@@ -13,17 +13,17 @@ from leapjax.domains.atari.replay.shards import STORED, part_path
 from leapjax.errors import UserError, first_line
 
 _BLOCK = 2**19  # bytes to unpack at once
-_EXPANSION = 1032  # gzip compresses at most so many bytes to one
+_EXPANSION = 1032  # largest compression ratio of gzip
 
 
 class Array(NamedTuple):
     """An array that is unpacked from its first row to its last.
 
     Attributes:
-        path: of its file.
-        file: open at the next row.
-        dtype: of its elements.
-        shape: of a row.
+        path: path of the file.
+        file: the file, open at the next row.
+        dtype: type of the elements.
+        shape: shape of a row.
         rows: number of rows.
     """
 
@@ -39,7 +39,7 @@ def open_array(logs: Path, number: int, name: str) -> Iterator[Array]:
     """Opens a part of a shard, and reads only its header.
 
     Raises:
-        UserError: it is damaged, or not of DQN-Replay.
+        UserError: the file is damaged, or not of DQN-Replay.
     """
     path = part_path(logs, f"$store$_{name}", number)
     dtype, row = STORED[name]
@@ -84,7 +84,7 @@ def read_rows(array: Array, rows: int) -> np.ndarray:
 
 @contextlib.contextmanager
 def _explain_damage(path: Path) -> Iterator[None]:
-    """Turns the exceptions of gzip and NumPy into a UserError: the file is damaged."""
+    """Turns exceptions of gzip and NumPy into a `UserError` that the file is damaged."""
     try:
         yield
     except Exception as error:  # noqa: BLE001  (gzip, zlib and NumPy raise many kinds)

@@ -1,4 +1,4 @@
-"""Converts trajectories of DQN-Replay to memory-mapped frames, and opens them."""
+"""Converts trajectories of DQN-Replay to files of memory-mapped frames, and opens the files."""
 
 import itertools
 import shutil
@@ -27,11 +27,11 @@ def convert(logs: Path, choice: Choice, game: Game, target: Path) -> None:
     Raises:
         UserError: the data are damaged or of another game, or the disk is full.
     """
-    spans = sorted(choice.spans)  # so each shard is read once, from its first row on
+    spans = sorted(choice.spans)  # to read each shard once, from its first row on
     most = sum(span.end - span.start + 1 for span in spans)
     files.check_room(target.parent, most * HEIGHT * WIDTH)
     scratch = target.parent / _UNFINISHED
-    shutil.rmtree(scratch, ignore_errors=True)  # of a killed program
+    shutil.rmtree(scratch, ignore_errors=True)  # a killed program may have left it
     try:
         scratch.mkdir()
         with (scratch / _FRAMES).open("wb") as out:
@@ -72,7 +72,7 @@ def _unpack(
     """Appends the frames `[n + 1, 84, 84]` of each trajectory of a shard to a file.
 
     Yields:
-        The actions `[n]` and the rewards `[n]` of each.
+        The actions `[n]` and the rewards `[n]` of each trajectory.
     """
     number, first, last = spans[0].shard, spans[0].start, spans[-1].end
     with open_array(logs, number, "action") as array:

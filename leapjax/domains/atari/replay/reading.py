@@ -1,4 +1,4 @@
-"""Reads a sample of whole trajectories from DQN-Replay, converted once and then memory-mapped."""
+"""Reads a sample of whole trajectories from DQN-Replay: converts it once, then memory-maps it."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from leapjax.domains.atari.replay.shards import PARTS, find_logs, find_shards, p
 from leapjax.domains.atari.replay.trajectories import choose_trajectories
 from leapjax.errors import UserError
 
-FORMAT = 1  # raise it whenever the content of a conversion changes: old ones are then unused
+FORMAT = 1  # raise it whenever conversions change, so that old conversions are not used
 
 
 def read(
@@ -27,27 +27,29 @@ def read(
 ) -> Collection:
     """Samples whole trajectories nearly as the Decision Transformer's loader does.
 
-    A random shard at a time gives up to ten trajectories, from where the last visit ended, until
-    there are enough; docs/deviations.md lists the differences. Padding is left out. Data of other
-    makers may lack it; then the first trajectory of a shard may be cut, and counts as cut.
+    It visits a random shard at a time and takes up to ten trajectories, until there are enough
+    transitions. The next visit to a shard continues where the last visit ended. The page
+    docs/deviations.md lists the differences. The result leaves out padding. Data from other
+    programs may have no padding. The first trajectory of a shard may then be incomplete, so it
+    counts as cut.
 
-    The frames are unpacked once into a memory-mapped file beside the data, or in the user's cache
-    folder if the data are read-only. Until a shard changes, later calls with the same arguments
-    only open it. It may be deleted whenever no program uses it.
+    The first call unpacks the frames into a memory-mapped file beside the data, or in the user's
+    cache folder if the data are read-only. Later calls with the same arguments only open this file,
+    until a shard changes. A user may delete the file while no program uses it.
 
     Args:
-        folder: of DQN-Replay, with a folder for each game.
-        game: to read.
-        transitions: smallest number of transitions; all, if there are fewer.
-        seed: of the sampling.
+        folder: folder of DQN-Replay, with a folder for each game.
+        game: game to read.
+        transitions: smallest number of transitions; if there are fewer, reads all.
+        seed: seed of the sampling.
         dqn_seed: seed of the DQN that played; DQN-Replay has 1 to 5 of each game.
         shards: numbers of the shards to read; all by default.
 
     Returns:
         The trajectories, in the order of the visits, and the number of cut trajectories in the
-        visited shards. The frames are views of the memory map. DQN-Replay does not store the
-        frame after the last action; the frame before it stands there twice. Only models that
-        predict states learn from it: elsewhere the value after the end is 0.
+        visited shards. The frames are views of the memory map. DQN-Replay does not store the frame
+        after the last action, so the result repeats the frame before it. Only models that predict
+        states learn from this frame, because the value after the end of an episode is 0.
 
     Raises:
         UserError: there are no data, or a visited shard is damaged or of another game; names the
@@ -63,7 +65,7 @@ def read(
         return load_conversion(beside / key)
     place = beside
     if not _is_writable(beside):
-        files.make_private(cached)  # this user alone made its content
+        files.make_private(cached)  # so only this user can have made its content
         place = cached
         if (place / key).is_dir():
             return load_conversion(place / key)
@@ -74,7 +76,7 @@ def read(
 
 
 def _name_conversion(logs: Path, numbers: list[int], transitions: int, seed: int) -> str:
-    """Returns a name for a conversion, which changes whenever a file changes."""
+    """Names a conversion by its arguments and the sizes and times of its files."""
     paths = (part_path(logs, part, number) for number in numbers for part in PARTS)
     states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     text = json.dumps([FORMAT, int(transitions), int(seed), states])

@@ -12,25 +12,25 @@ from leapjax.domains.atari.games import GAMES, HEIGHT, WIDTH, Game
 from leapjax.errors import UserError
 
 PADDING = 3  # rows before each episode
-STORED: dict[str, tuple[np.dtype, tuple[int, ...]]] = {  # by name: type, shape of a row
+STORED: dict[str, tuple[np.dtype, tuple[int, ...]]] = {  # type and shape of a row, by name
     "action": (np.dtype(np.int32), ()),
     "reward": (np.dtype(np.float32), ()),
     "terminal": (np.dtype(np.uint8), ()),
     "observation": (np.dtype(np.uint8), (HEIGHT, WIDTH)),
 }
-# The largest is written last: a shard that has it is complete.
+# The largest part is written last, so a shard that has it is complete.
 PARTS = tuple(f"$store$_{name}" for name in STORED)
 
 
 class Episode(NamedTuple):
     """One game of n steps, played until it was over or cut off.
 
-    The format has one mark for both, and agents learn both as an end.
+    The format does not tell these two cases apart, so agents learn both as an end.
 
     Attributes:
-        frames: `[n, 84, 84]` uint8, before each action.
-        actions: `[n]` int32.
-        rewards: `[n]` float32.
+        frames: frames `[n, 84, 84]` uint8 before each action.
+        actions: actions `[n]` int32.
+        rewards: rewards `[n]` float32.
     """
 
     frames: np.ndarray
@@ -57,7 +57,7 @@ def find_logs(folder: Path, game: Game, dqn_seed: int) -> Path:
     """Finds the folder of the shards of one DQN.
 
     Raises:
-        UserError: it does not exist; says what does, and how to get data.
+        UserError: the folder does not exist; names existing data, and says how to get others.
     """
     logs = replay_logs(folder, game, dqn_seed)
     if logs.is_dir():
@@ -107,7 +107,7 @@ def find_shards(logs: Path, chosen: Sequence[int] | None) -> list[int]:
 
 
 def write_header(file: IO[bytes] | gzip.GzipFile, dtype: np.dtype, shape: tuple[int, ...]) -> None:
-    """Writes the header of a `.npy`; its length does not depend on the number of rows."""
+    """Writes the header of a `.npy`; the header's length does not depend on the number of rows."""
     descr = np.lib.format.dtype_to_descr(dtype)
     header = {"descr": descr, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(file, header)

@@ -1,4 +1,4 @@
-"""Samples trajectories from shards: where they begin and end, and which of them are whole."""
+"""Samples whole trajectories from shards: finds their first and last rows."""
 
 import contextlib
 import itertools
@@ -13,7 +13,7 @@ from leapjax.domains.atari.replay.arrays import open_array, read_rows
 from leapjax.domains.atari.replay.shards import PADDING, STORED
 from leapjax.errors import UserError
 
-TRAJECTORIES_PER_VISIT = 10  # as in the Decision Transformer's loader, which takes one more
+TRAJECTORIES_PER_VISIT = 10  # the Decision Transformer's loader takes 11
 CUT_BEFORE, CUT_AFTER = "cut by the beginning of a file", "cut by the end of a file"
 
 
@@ -21,9 +21,9 @@ class Span(NamedTuple):
     """The rows of a whole trajectory, with its padding if it has any.
 
     Attributes:
-        shard: number of its shard.
-        start: its first row.
-        end: the row after its last.
+        shard: number of the shard.
+        start: first row.
+        end: row after the last row.
     """
 
     shard: int
@@ -35,7 +35,7 @@ class Choice(NamedTuple):
     """A sample of trajectories.
 
     Attributes:
-        spans: in the order of the visits.
+        spans: trajectories, in the order of the visits.
         dropped: number of cut trajectories in the visited shards, by reason.
     """
 
@@ -46,8 +46,8 @@ class Choice(NamedTuple):
 def choose_trajectories(logs: Path, numbers: list[int], transitions: int, seed: int) -> Choice:
     """Samples whole trajectories without unpacking their frames.
 
-    A random shard at a time gives up to `TRAJECTORIES_PER_VISIT` trajectories, until there are
-    enough transitions.
+    It visits a random shard at a time and takes up to `TRAJECTORIES_PER_VISIT` trajectories, until
+    there are enough transitions.
 
     Raises:
         UserError: there is no whole trajectory.
@@ -64,7 +64,7 @@ def choose_trajectories(logs: Path, numbers: list[int], transitions: int, seed: 
             if total >= transitions or not waiting[number]:
                 break
             span = waiting[number].pop(0)
-            total += span.end - span.start - PADDING  # or more, if it has none
+            total += span.end - span.start - PADDING  # more, if the span has no padding
             chosen.append(span)
         if not waiting[number]:
             left.remove(number)
@@ -75,7 +75,7 @@ def choose_trajectories(logs: Path, numbers: list[int], transitions: int, seed: 
 
 
 def _find_trajectories(logs: Path, number: int) -> tuple[list[Span], Counter[str]]:
-    """Finds the whole trajectories of a shard, and counts the others by reason."""
+    """Finds the whole trajectories of a shard, and counts the cut ones by reason."""
     with contextlib.ExitStack() as stack:
         arrays = {name: stack.enter_context(open_array(logs, number, name)) for name in STORED}
         rows = {name: array.rows for name, array in arrays.items()}
@@ -85,7 +85,7 @@ def _find_trajectories(logs: Path, number: int) -> tuple[list[Span], Counter[str
                 f"the parts of shard {number} in {logs} are of unequal lengths ({lengths} in "
                 f"{arrays['observation'].path.name} and so on): copy them again"
             )
-        # The last row is not of this shard.
+        # The last row does not belong to this shard.
         terminal = read_rows(arrays["terminal"], rows["terminal"])[:-1]
         head = [
             read_rows(arrays[name], min(PADDING, len(terminal)))
@@ -97,13 +97,13 @@ def _find_trajectories(logs: Path, number: int) -> tuple[list[Span], Counter[str
     if spans and not is_padding(*head, terminal[:PADDING]):
         spans = spans[1:]
         dropped[CUT_BEFORE] += 1
-    if len(terminal) - borders[-1] > PADDING:  # fewer are the padding of the next episode
+    if len(terminal) - borders[-1] > PADDING:  # fewer rows are padding of the next episode
         dropped[CUT_AFTER] += 1
     return spans, dropped
 
 
 def is_padding(*rows: np.ndarray) -> bool:
-    """Returns whether the first rows of an episode are its padding: zeros in all stored arrays.
+    """Returns whether the first rows of an episode are padding: three rows of zeros in all arrays.
 
     A single black frame may belong to the game.
     """

@@ -17,7 +17,7 @@ from leapjax.domains.atari.replay.shards import (
     write_header,
 )
 
-_LEVEL = 4  # of gzip: twice as fast as the default, and the files are hardly larger
+_LEVEL = 4  # gzip level: twice as fast as the default, with hardly larger files
 
 
 def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
@@ -26,12 +26,13 @@ def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
     Clips the rewards, and adds a row of zeros in place of the last row, which is not read.
 
     Args:
-        folder: of the shards of one DQN, see `replay_logs`; made if it does not exist.
-        number: of the shard; an existing one is replaced.
-        episodes: at least one.
+        folder: folder of a DQN's shards, see `replay_logs`; made if it does not exist.
+        number: number of the shard; replaces an existing shard.
+        episodes: episodes to write, at least one.
 
     Raises:
-        ValueError: the arrays of an episode differ in length, or the frames in size.
+        ValueError: there are no episodes, an episode has no steps, its arrays differ in length, or
+            its frames are not `[84, 84]`.
         UserError: the files cannot be written, for example because the disk is full.
     """
     for episode in episodes:
@@ -48,10 +49,10 @@ def write_shard(folder: Path, number: int, episodes: Sequence[Episode]) -> None:
         "observation": (e.frames for e in episodes),
     }
     added = sum(PADDING + len(e.actions) for e in episodes)
-    # Dopamine's range for stacks of four frames: one row before the next to write, and four on.
+    # Dopamine's range for stacks of four frames: the row before the next row to write, and four on.
     invalid = (added - 1 + np.arange(PADDING + 2)) % (added + 1)
     # Remove the frames first, so that old and new parts never look like a complete shard.
-    with contextlib.suppress(OSError):  # missing, or not writable: the writes below say so
+    with contextlib.suppress(OSError):  # missing, or not writable, which the writes below report
         part_path(folder, "$store$_observation", number).unlink()
     for part, array in (("add_count", np.array(added)), ("invalid_range", invalid)):
         _write_part(part_path(folder, part, number), array.dtype, array.shape, [array])

@@ -1,7 +1,8 @@
-"""More windows from the same demonstrations, one kind of augmentation a file.
+"""Augments windows of demonstrations, with a file for each kind of augmentation.
 
-`equivalents` applies symmetries of the world and its language, `clutter` adds objects. The extras
-of a window are the cells that its demonstration needs free from here on: `[S, S]` bool.
+The module `equivalents` applies symmetries of the world and of its language, and `clutter` adds
+objects. A window's `extras`, `[S, S]` bool, mark the cells that the rest of its demonstration needs
+free.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ from leapjax.types import Demonstration
 
 
 def choose_augmentations(settings: Settings) -> list[Augmentation]:
-    """Returns the augmentations that the settings ask for; the last of them is applied first."""
+    """Returns the augmentations that the settings ask for; the last is applied first."""
     found: list[Augmentation] = []
     if settings.augment:
         found.append(
@@ -30,13 +31,13 @@ def choose_augmentations(settings: Settings) -> list[Augmentation]:
 def mark_needed_cells(demonstration: Demonstration) -> np.ndarray:
     """Marks the cells that the rest of a demonstration needs free, from each step on.
 
-    The agent stands on them, or puts an object down on them.
+    The agent stands on these cells, or puts an object down on them.
 
     Args:
-        demonstration: of n steps.
+        demonstration: demonstration of n steps.
 
     Returns:
-        `[n, S, S]` bool.
+        Booleans `[n, S, S]`.
     """
     poses, actions = demonstration.observations.pose, demonstration.actions
     needed = np.zeros((len(poses), *demonstration.observations.grid.shape[1:3]), bool)

@@ -11,9 +11,9 @@ from leapjax.types import Context, Window
 def add_clutter(key: jax.Array, window: Window, share: float) -> Window:
     """Puts random objects on cells that the demonstration does not need.
 
-    A shortest path stays the shortest when other paths are blocked, so the demonstration stays
-    optimal, and shows that paths lead around objects. (If random actions replace those of the
-    demonstration, up to one window in 120 handles a new object.)
+    A shortest path stays the shortest when objects block other paths. So the demonstration stays
+    optimal, and shows that paths lead around objects. (If a demonstration holds random actions, up
+    to one window in 120 handles a new object.)
 
     Half of the windows do not change. In the others each free cell gets an object with a
     probability that is drawn for the window, in 0 .. `share`. Kind and colour both differ from
@@ -21,8 +21,8 @@ def add_clutter(key: jax.Array, window: Window, share: float) -> Window:
     because the meaning of their instruction is unknown here.
 
     Args:
-        key: of the random choices.
-        window: one training example.
+        key: random key.
+        window: training window.
         share: largest probability, in 0 .. 1.
     """
     share_key, where_key, kind_key, colour_key = jax.random.split(key, 4)
@@ -34,13 +34,13 @@ def add_clutter(key: jax.Array, window: Window, share: float) -> Window:
 def choose_cells(
     share_key: jax.Array, where_key: jax.Array, window: Window, share: float
 ) -> jax.Array:
-    """Draws cells `[S, S]` that are free, now and in all of the past, and that nothing needs."""
+    """Draws cells `[S, S]` that are free in all states and that the demonstration does not need."""
     observation, past = window.context.observation, window.context.past.grid
     # The past is all zeros before the start.
     free = (observation.grid[..., 0] == symmetries.EMPTY) & (past[..., 0] <= symmetries.EMPTY).all(
         axis=0
     )
-    probability = share * jax.random.uniform(share_key, minval=-1.0)  # negative: none
+    probability = share * jax.random.uniform(share_key, minval=-1.0)  # no cell if negative
     chosen = jax.random.uniform(where_key, free.shape) < probability
     return chosen & free & ~window.extras & (observation.goal[0] >= 0)
 
@@ -48,9 +48,9 @@ def choose_cells(
 def draw_unlike(
     kind_key: jax.Array, colour_key: jax.Array, target: jax.Array, cells: tuple[int, ...]
 ) -> tuple[jax.Array, jax.Array]:
-    """Draws kinds and colours `[S, S]` that both differ from those of the target `[3]`."""
+    """Draws kinds and colours `[S, S]` that differ from a target `[3]` in both."""
     kinds = jnp.array(symmetries.INTERCHANGEABLE)
-    # A cyclic shift by at least one never gives the target's.
+    # A cyclic shift by at least one never gives the target's kind or colour.
     shift = jax.random.randint(kind_key, cells, 1, len(kinds))
     kind = kinds[(target[0] - kinds[0] + shift) % len(kinds)]
     shift = jax.random.randint(colour_key, cells, 1, symmetries.COLOURS)
@@ -58,7 +58,7 @@ def draw_unlike(
 
 
 def put_objects(window: Window, chosen: jax.Array, kind: jax.Array, colour: jax.Array) -> Window:
-    """Puts objects of these kinds and colours on the chosen cells, all `[S, S]`, of every state."""
+    """Puts objects on the chosen cells of every state; all three arrays are `[S, S]`."""
     context = window.context
     grid = context.observation.grid
     objects = jnp.stack([kind, colour, jnp.zeros_like(kind)], axis=-1).astype(grid.dtype)
@@ -73,7 +73,7 @@ def put_objects(window: Window, chosen: jax.Array, kind: jax.Array, colour: jax.
 
 
 def find_target(context: Context) -> jax.Array:
-    """Returns the object on the goal's cell, or the last one there: `[3]` int32."""
+    """Returns the object on the goal's cell, or the last object there: `[3]` int32."""
     x, y = context.observation.goal
     now = jnp.asarray(context.observation.grid)[x, y]
     seen = jnp.concatenate([jnp.asarray(context.past.grid)[:, x, y], now[None]])  # [K + 1, 3]

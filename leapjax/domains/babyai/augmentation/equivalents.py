@@ -1,4 +1,4 @@
-"""Equivalent windows: mirrored, recoloured, with objects exchanged, or in other words."""
+"""Makes equivalent windows: mirrored, recoloured, with objects exchanged, or restated."""
 
 from collections.abc import Callable
 
@@ -16,16 +16,16 @@ def apply_symmetries(
 ) -> Window:
     """Mirrors, recolours and restates a window at random, and may exchange kinds of objects.
 
-    Each is a symmetry of the levels, so the result is as good a demonstration as before.
+    Each change is a symmetry of the levels, so the result is as good a demonstration as before.
 
     Args:
-        key: of the random choices.
-        window: one training example.
+        key: random key.
+        window: training window.
         words: token ids of the words to exchange.
         exchange_objects: whether to exchange keys, balls and boxes. They are equivalent in
             demonstrations that unlock no door and toggle no box.
     """
-    # Arrays are made here because a program sets its number of devices after it makes a domain.
+    # JAX arrays are made here: a program sets its number of devices after it makes a domain.
     words = jax.tree.map(jnp.asarray, words)
     flip_key, colour_key, object_key, restate_key = jax.random.split(key, 4)
     colours = jax.random.permutation(colour_key, len(words.colours))
@@ -57,8 +57,8 @@ def _reflect(window: Window, mirrored_words: jax.Array) -> Window:
     """Mirrors a window."""
     context = window.context
     past = jax.vmap(lambda o: symmetries.reflect(o, mirrored_words))(context.past)
-    # Blank states before the start stay blank. (The step does not tell their number: the past of
-    # an unrolled window goes on beyond it.)
+    # Blank states before the start stay blank. (`step` does not give their number, because the past
+    # of an unrolled window extends beyond `step`.)
     length = context.actions.shape[0]
     known = (jnp.asarray(context.past.grid) != 0).any(axis=(1, 2, 3))
 
@@ -87,6 +87,6 @@ def _change_states(window: Window, change: Callable[[Observation], Observation])
 
 
 def _choose_either(key: jax.Array, first: Window, second: Window) -> Window:
-    """Chooses one of two windows with equal probabilities."""
+    """Chooses the first or the second window with equal probabilities."""
     take = jax.random.bernoulli(key)
     return jax.tree.map(lambda a, b: jnp.where(take, a, b), first, second)

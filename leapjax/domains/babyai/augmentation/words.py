@@ -10,11 +10,11 @@ class GridWords(NamedTuple):
     """Token ids of the words that augmentations read or exchange.
 
     Attributes:
-        colours: `[6]` int32, in MiniGrid's order of colours.
-        objects: `[3]` int32: key, ball, box.
-        mirrored: `[vocabulary]` int32: the word that each word becomes in a mirror.
-        then: `[2]` int32: ", then".
-        after: `[2]` int32: "after you".
+        colours: ids `[6]` int32 of the colours, in MiniGrid's order.
+        objects: ids `[3]` int32 of "key", "ball" and "box".
+        mirrored: ids `[vocabulary]` int32 of the word that each word becomes in a mirror.
+        then: ids `[2]` int32 of ", then".
+        after: ids `[2]` int32 of "after you".
     """
 
     colours: Array

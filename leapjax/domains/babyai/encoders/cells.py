@@ -1,4 +1,4 @@
-"""Cells of the grid as vectors, and features of the grid at a position."""
+"""Embeds the cells of a grid, and reads features of the grid at a position."""
 
 import flax.linen as nn
 import jax
@@ -13,7 +13,11 @@ DIRECTIONS = 4
 
 
 class CellEmbedding(nn.Module):
-    """Embeds the content of each cell, from one-hot codes of its object, colour and state."""
+    """Embeds the content of each cell, from one-hot codes of its object, colour and state.
+
+    Attributes:
+        channels: features of a cell.
+    """
 
     channels: int
 
@@ -22,7 +26,7 @@ class CellEmbedding(nn.Module):
         """Computes `[S, S, channels]`; marks the cells of the agent and the goal."""
         grid = observation.grid
         side = grid.shape[0]
-        # One-hot and a matrix product: the gradient of a table look-up is a slow scatter.
+        # One-hot codes and a matrix product: the gradient of a table look-up is a slow scatter.
         kinds = [
             jax.nn.one_hot(grid[..., part], size)
             for part, size in enumerate((OBJECTS, COLOURS, STATES))
@@ -51,10 +55,10 @@ def read_neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> ja
         position[0],
         position[1],
         jnp.zeros_like(position[0]),
-    )  # of one type, also with 64 bits
+    )  # all of the same type, also if JAX uses 64 bits
     return jax.lax.dynamic_slice(padded, start, (size, size, image.shape[-1])).reshape(-1)
 
 
 def read_cell(image: jax.Array, position: jax.Array) -> jax.Array:
-    """Reads the features `[C]` of a cell; zeros if the position is (-1, -1), not observed."""
+    """Reads the features `[C]` of a cell; zeros if the position is (-1, -1): not observed."""
     return jnp.einsum("xyc,xy->c", image, mark_cell(position, image.shape[0]))

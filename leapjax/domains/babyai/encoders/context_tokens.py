@@ -26,13 +26,13 @@ from leapjax.types import Context, pad_token
 class ContextTokens(Encoder):
     """Our encoder: four tokens for a whole context.
 
-    It turns the grid so that the agent faces right, computes learned distances on it, and reads
-    it at the agent, at the goal and as a whole.
+    It turns the grid so that the agent faces right, and computes learned distances on it. Then it
+    reads the grid at the agent, at the goal and as a whole.
 
     Attributes:
         settings: sizes of the encoder.
-        width: D, of a token.
-        dtype: of convolutions.
+        width: D, width of a token.
+        dtype: type of convolutions.
     """
 
     settings: Settings
@@ -76,13 +76,14 @@ class ContextTokens(Encoder):
     def _mark_faced(self, context: Context, turned: jax.Array) -> jax.Array:
         """Marks the objects and doors that the agent has faced in the context: `[S, S, 2]`.
 
-        The first feature is 1 where it has; the second is how recently, in (0, 1], 1 for now.
-        They show which part of an instruction is done. Past actions and the rest of the agent's
-        way are left out: a network could recognise a demonstration by them (docs/lessons.md).
+        The first feature is 1 on these cells. The second says how recently the agent faced them, in
+        (0, 1], where 1 is now. Both show which part of an instruction is done. The encoder leaves
+        out past actions and the rest of the agent's path, because a network could recognise a
+        demonstration by them (docs/lessons.md).
 
         Args:
-            context: with K past steps.
-            turned: `[S, S, 3]` the current grid, turned so that the agent faces right.
+            context: context with K past steps.
+            turned: current grid `[S, S, 3]`, turned so that the agent faces right.
         """
         side, past = turned.shape[0], context.actions.shape[0]
         direction = context.observation.pose[2]

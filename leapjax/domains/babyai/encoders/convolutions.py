@@ -1,7 +1,7 @@
 """Convolutions, normalisation and pooling of the paper's encoder.
 
-Which convolution is fastest on a CPU depends on the map (docs/lessons.md). On these small and deep
-maps it is one matrix product over shifted copies; on whole grids of few channels it is XLA's own.
+The fastest convolution on a CPU depends on the map (docs/lessons.md). On these small maps with many
+channels it is a matrix product over shifted copies. On whole grids with few channels it is XLA's.
 """
 
 import flax.linen as nn
@@ -21,9 +21,9 @@ def stack_patches(image: jax.Array, side: int, padding: tuple[int, int]) -> jax.
 
 
 def halve(image: jax.Array) -> jax.Array:
-    """Takes the largest of each 2x2 cells: `[X, Y, C]` to `[X // 2, Y // 2, C]`.
+    """Takes the maximum of each 2x2 cells: `[X, Y, C]` to `[X // 2, Y // 2, C]`.
 
-    It equals `nn.max_pool`, whose gradient is slower: XLA searches it window by window.
+    It equals `nn.max_pool`, whose gradient is slower, because XLA searches window by window.
     """
     width, height = image.shape[0] // 2, image.shape[1] // 2
     windows = image[: 2 * width, : 2 * height].reshape(width, 2, height, 2, -1)
@@ -31,14 +31,14 @@ def halve(image: jax.Array) -> jax.Array:
 
 
 class Convolution(nn.Module):
-    """A convolution as one matrix product, for small maps of many channels.
+    """A convolution as one matrix product, for small maps with many channels.
 
     Attributes:
-        features: of the result.
-        side: of the kernel, in cells.
-        padding: cells added before and after each side.
-        stride: in cells.
-        dtype: of the matrix product; parameters are float32.
+        features: features of the result.
+        side: side of the kernel, in cells.
+        padding: cells to add before and after, along both axes.
+        stride: stride in cells.
+        dtype: type of the matrix product; parameters are float32.
     """
 
     features: int
@@ -59,12 +59,12 @@ class Convolution(nn.Module):
 class GroupNorm(nn.Module):
     """Group normalisation (Wu and He, 2018), in place of the authors' batch normalisation.
 
-    It equals `nn.GroupNorm`, whose gradient takes as long as a convolution: this one sums over
-    cells first, so it splits no large array into groups. Both take the first axis for a batch:
-    each column of a map is normalised by itself (docs/deviations.md).
+    It equals `nn.GroupNorm`, whose gradient takes as long as a convolution. This module sums over
+    cells first, so it splits no large array into groups. Both treat the first axis as a batch, so
+    they normalise each column of a map by itself (docs/deviations.md).
 
     Attributes:
-        dtype: of the result; statistics are float32.
+        dtype: type of the result; statistics are float32.
     """
 
     dtype: Dtype = jnp.float32
@@ -89,7 +89,12 @@ class GroupNorm(nn.Module):
 
 
 class FiLMBlock(nn.Module):
-    """Two convolutions modulated by a condition (paper: ExpertControllerFiLM)."""
+    """Two convolutions modulated by a condition (paper: ExpertControllerFiLM).
+
+    Attributes:
+        width: features of the result.
+        dtype: type of matrix products.
+    """
 
     width: int
     dtype: Dtype = jnp.float32
@@ -104,7 +109,12 @@ class FiLMBlock(nn.Module):
 
 
 class HalvingBlock(nn.Module):
-    """A residual block of stride 2: halves the sides of a map, rounded up."""
+    """A residual block of stride 2: halves the sides of a map, rounded up.
+
+    Attributes:
+        width: features of the result.
+        dtype: type of matrix products.
+    """
 
     width: int
     dtype: Dtype = jnp.float32

@@ -1,7 +1,7 @@
-"""Distance fields on a grid: value iteration in sweeps, and convolutions that read them.
+"""Distance fields on a grid, and convolutions that read them.
 
-The fields are value iteration in the min-plus sense (Tamar et al., 2016, "Value Iteration
-Networks").
+Sweeps of value iteration in the min-plus sense compute the fields (Tamar et al., 2016, "Value
+Iteration Networks").
 """
 
 import functools
@@ -13,25 +13,25 @@ from flax.typing import Dtype
 
 from leapjax.domains.babyai.encoders.cells import mark_cell, read_cell
 
-FAR = 64.0  # the distance of a cell that no way leads to, in steps
+FAR = 64.0  # largest distance in steps, also of cells that no path reaches
 BARRIER = 8.0  # cost in steps of each nat of -log P(free)
-_OPPOSITE = (1, 0, 3, 2)  # of the neighbours at x - 1, x + 1, y - 1, y + 1
+_OPPOSITE = (1, 0, 3, 2)  # opposite of the neighbours at x - 1, x + 1, y - 1, y + 1
 
 
 class GridEncoder(nn.Module):
     """Features of cells: learned distances, then local convolutions.
 
-    Each field learns from the demonstrations which cells can be entered: it is not told that
-    walls block the way. Half of the fields measure from the goal if it is observed, the others
-    from places that they learn. A sweep carries a distance one cell further and has no matrix
-    product, so the dozens of sweeps that mazes need cost little.
+    Each field learns from the demonstrations which cells the agent can enter; the code does not say
+    that walls block it. Half of the fields measure from the goal if it is observed. The others
+    measure from places that they learn. A sweep carries a distance one cell further without a
+    matrix product, so the dozens of sweeps that mazes need cost little.
 
     Attributes:
         channels: features of a cell.
         fields: number of distance fields; 0 for convolutions alone.
-        sweeps: rounds of value iteration, the length in cells of the longest way.
+        sweeps: rounds of value iteration; the longest path that they find has so many cells.
         rounds: rounds of convolutions, which share their weights.
-        dtype: of the convolutions; distances are float32.
+        dtype: type of the convolutions; distances are float32.
     """
 
     channels: int
@@ -47,14 +47,14 @@ class GridEncoder(nn.Module):
         """Computes features `[S, S, channels]` and the agent's distances `[fields]`.
 
         Args:
-            cells: `[S, S, C]` features of each cell's content.
-            agent: `[2]` the agent's cell.
-            goal: `[2]` the goal's cell; (-1, -1) if it is not observed.
+            cells: features `[S, S, C]` of each cell's content.
+            agent: the agent's cell `[2]`.
+            goal: the goal's cell `[2]`; (-1, -1) if it is not observed.
         """
         distance = jnp.zeros((*cells.shape[:2], 0))
         if self.fields:
             distance = self._compute_fields(cells, goal)
-        # A convolution needs differences only: distances relative to the agent's, squashed.
+        # A convolution needs only differences: distances relative to the agent's, squashed.
         here = read_cell(distance, agent)
         relative = jnp.tanh((distance - here) / 4)
         both = jnp.concatenate([cells, relative], axis=-1)
@@ -90,12 +90,12 @@ def _make_convolution(features: int, name: str, dtype: Dtype) -> nn.Conv:
 def compute_entering_cost(blocked: jax.Array) -> jax.Array:
     """Computes the cost of entering a cell, in steps, from the log-odds that it is blocked.
 
-    The cost is one step, and `BARRIER` for each nat of -log P(free). Distances then prefer ways
-    that are likely to be free, however long. Demonstrations alone would teach a lower cost: just
+    The cost is one step, and `BARRIER` for each nat of -log P(free). Distances then prefer paths
+    that are likely to be free, however long. Demonstrations alone would teach a lower cost, just
     enough to explain their own detours, which are short.
 
     Args:
-        blocked: `[...]` log-odds.
+        blocked: log-odds `[...]`.
     """
     return 1 + BARRIER * nn.softplus(blocked)
 
@@ -104,13 +104,13 @@ def compute_entering_cost(blocked: jax.Array) -> jax.Array:
 def find_distances(start: jax.Array, cost: jax.Array, sweeps: int) -> jax.Array:
     """Finds distances `[S, S, F]`: d(c) = min(start(c), cost(c) + min over 4 neighbours of d).
 
-    The gradient is the fixed point's: it flows back along the shortest ways and stores no sweep.
-    It is exact if no shortest way has more than `sweeps` cells.
+    The gradient is the gradient of the fixed point: it flows back along the shortest paths, so no
+    sweep is stored. It is exact if no shortest path has more than `sweeps` cells.
 
     Args:
-        start: `[S, S, F]` distance of a way that ends in the cell.
-        cost: `[S, S, F]` of entering the cell.
-        sweeps: number of rounds; finds ways of at most so many cells.
+        start: distance `[S, S, F]` of a path that ends in the cell.
+        cost: cost `[S, S, F]` of entering the cell.
+        sweeps: number of rounds; finds paths of at most so many cells.
     """
 
     def sweep(_: int, distance: jax.Array) -> jax.Array:
@@ -131,11 +131,11 @@ def _find_backward(
 ) -> tuple[jax.Array, jax.Array]:
     start, cost, distance = saved
     near = _stack_neighbours(distance, FAR)  # [4, S, S, F]
-    through = start > cost + near.min(axis=0)  # the way goes on, to the first nearest neighbour
+    through = start > cost + near.min(axis=0)  # the path goes on, to the first nearest neighbour
     onward = jax.nn.one_hot(near.argmin(axis=0), 4, axis=0) * through
 
     def sweep(_: int, flow: jax.Array) -> jax.Array:
-        """Adds each cell's gradient to the flow from neighbours whose way leads through it."""
+        """Adds each cell's gradient to the flow from neighbours whose path leads through it."""
         sent = onward * flow
         return gradient + sum(
             _stack_neighbours(sent[direction], 0.0)[_OPPOSITE[direction]] for direction in range(4)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax.typing import Initializer
 
-# How embeddings start: as in PyTorch, which the authors use, and as in Flax.
+# Initialisers of embeddings: PyTorch's, which the authors use, and Flax's.
 LARGE = nn.initializers.normal(1.0)
 SMALL = nn.initializers.variance_scaling(1.0, "fan_in", "normal", out_axis=0)
 
@@ -16,9 +16,9 @@ class Instruction(NamedTuple):
     """An encoded instruction.
 
     Attributes:
-        words: `[L, width]` each word in the context of the words before it.
-        given: `[L]` bool, False for padding.
-        whole: `[width]` the state after the last word.
+        words: features `[L, width]` of each word in the context of earlier words.
+        given: booleans `[L]`, False for padding.
+        whole: state `[width]` of the GRU after the last word.
     """
 
     words: jax.Array
@@ -27,7 +27,13 @@ class Instruction(NamedTuple):
 
 
 class InstructionEncoder(nn.Module):
-    """Word embeddings and a GRU (paper, appendix, network details)."""
+    """Word embeddings and a GRU (paper, appendix, network details).
+
+    Attributes:
+        vocabulary: number of token ids.
+        width: width of embeddings and of the GRU.
+        embedding_init: initialiser of the embeddings.
+    """
 
     vocabulary: int
     width: int
@@ -47,12 +53,13 @@ class InstructionEncoder(nn.Module):
 class WordAttention(nn.Module):
     """Attention from cells to the words of an instruction.
 
-    In 'go to the red ball and the key, then ...' a single vector would have to hold, for every
-    object, whether and when it is meant. Here the cell of an object finds the words that name it.
+    A single vector of 'go to the red ball and the key, then ...' would have to say of every object
+    whether and when to go there. With attention, the cell of an object finds the words that name
+    it.
 
     Attributes:
         heads: number of heads.
-        features: of each head.
+        features: features of each head.
     """
 
     heads: int
@@ -60,7 +67,7 @@ class WordAttention(nn.Module):
 
     @nn.compact
     def __call__(self, cells: jax.Array, instruction: Instruction) -> jax.Array:
-        """Computes the words' part `[S, S, C]` in the features of cells `[S, S, C]`."""
+        """Computes an update `[S, S, C]` of cells `[S, S, C]` from the words."""
 
         def heads(x: jax.Array, name: str) -> jax.Array:
             return nn.DenseGeneral((self.heads, self.features), name=name)(x)

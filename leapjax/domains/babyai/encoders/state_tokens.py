@@ -27,8 +27,8 @@ class StateEncoder(nn.Module):
     """Encodes pose, goal and carried object as one vector (paper, appendix: 256, 256, 128).
 
     Attributes:
-        side: S, of the grid.
-        width: of the vector.
+        side: S, side of the grid.
+        width: width of the vector.
     """
 
     side: int
@@ -36,18 +36,18 @@ class StateEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Observation) -> jax.Array:
-        """Computes `[width]`; embeds coordinates instead of scaling them, as the authors do."""
+        """Computes `[width]`; embeds coordinates instead of scaling them, as the authors' code."""
 
         def table(count: int, name: str) -> nn.Embed:
             return nn.Embed(count, self.width, embedding_init=LARGE, name=name)
 
-        # The last row is for the -1 of a goal that is not observed.
+        # The last row is for unobserved goals, whose coordinates are -1.
         coordinates = table(self.side + 1, "coordinates")
         parts = [
             coordinates(observation.pose[:2]),
             table(DIRECTIONS, "direction")(observation.pose[2:]),
             coordinates(jnp.where(observation.goal < 0, self.side, observation.goal)),
-            # The appendix has no carried object; levels where objects are moved need it.
+            # The appendix does not encode the carried object; levels with movable objects need it.
             table(OBJECTS, "carried")(observation.carried[:1]),
             table(COLOURS, "carried_colour")(observation.carried[1:]),
         ]
@@ -58,7 +58,13 @@ class StateEncoder(nn.Module):
 
 
 class PaperStateEncoder(nn.Module):
-    """The image encoder of the appendix, fused with instruction and pose by FiLM."""
+    """The image encoder of the appendix, fused with instruction and pose by FiLM.
+
+    Attributes:
+        side: S, side of the grid.
+        width: D, width of the token.
+        dtype: type of convolutions.
+    """
 
     side: int
     width: int
@@ -91,9 +97,9 @@ class StateTokens(Encoder):
     """The encoder of the appendix: `[K + 1, D]`, a token for each state, oldest first.
 
     Attributes:
-        side: S, of the grid.
-        width: D, of a token.
-        dtype: of convolutions.
+        side: S, side of the grid.
+        width: D, width of a token.
+        dtype: type of convolutions.
         later: whether to add a token for later states, whose unknown pose is (0, 0, 0).
     """
 
@@ -113,10 +119,10 @@ class StateTokens(Encoder):
         return self.encode_next(context, None)
 
     def encode_next(self, context: Context, known: jax.Array | None) -> jax.Array:
-        """Encodes all states in one batch, which is faster than one after the other.
+        """Encodes all states in a batch, which is faster than one after the other.
 
-        A later state differs from the current one only in its pose, which the network reads late:
-        `vmap` over the two poses computes the part before once.
+        A later state differs from the current state only in its pose, which the network reads late.
+        So `vmap` over the two poses computes the layers before it once.
         """
         instruction = self.instruction(context.observation.instruction).whole
         now, past = context.observation, context.past
@@ -136,8 +142,8 @@ class StateTokens(Encoder):
     def encode_batch(self, contexts: Context) -> jax.Array:
         """Encodes contexts; on a CPU a few states at a time, and equal consecutive states once.
 
-        The maps of a few states stay in a core's cache. Equal states fill the part of a context
-        before its episode, for example.
+        The feature maps of a few states fit in a core's cache. Consecutive states are equal, for
+        example, before the start of an episode.
         """
         if not contexts.actions.shape[1] or jax.default_backend() != "cpu":
             return super().encode_batch(contexts)
@@ -154,5 +160,5 @@ class StateTokens(Encoder):
 
 
 def _hide_pose(observation: Observation) -> Observation:
-    """Sets the pose to (0, 0, 0), which stands for an unknown one."""
+    """Sets the pose to (0, 0, 0), which stands for an unknown pose."""
     return observation._replace(pose=jnp.zeros_like(observation.pose))
