@@ -154,8 +154,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         # A demonstration has at least two states.
         states = 2 * config.demos if source is None else source.amount
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation
-    # The planner makes plans in one batch. It scores restarts and candidates a few at a time, with T
-    # passes each.
+    # The planner makes plans in one batch, and scores restarts and candidates a few at a time, with
+    # T passes each.
     many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
     scored = (many > 1 and not hasattr(search, "beams")) or search.score
     scored |= getattr(search, "judge", "") == "energy" or getattr(search, "keep", "") == "best"
