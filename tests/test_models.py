@@ -32,8 +32,8 @@ EVERYWHERE = np.arange(HORIZON)
 
 
 class Mixing(ContextTokens):
-    def mix_actions(self, tokens):
-        return tokens + jnp.tanh(jnp.roll(tokens, 1, axis=0))
+    def place_actions(self, tokens, positions):
+        return positions + tokens + jnp.tanh(jnp.roll(tokens, 1, axis=0))
 
 
 def make(kind, architecture, past, dtype="float32"):

@@ -265,7 +265,7 @@ def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
     ):
         np.testing.assert_allclose(later, first, rtol=1e-5, atol=1e-6)
     other = formula._replace(values=np.where(formula.values < 2, 1 - formula.values, OPEN))
-    assert np.abs(encode(other).places - encode(formula).places).max() > 0.01
+    assert np.abs(encode(other).positions.tokens - encode(formula).positions.tokens).max() > 0.01
 
 
 def test_no_action_sees_a_later_one_where_attention_is_causal():

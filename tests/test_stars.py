@@ -1,6 +1,7 @@
 """Star graphs: the way to the goal is what an oracle finds, whatever a graph's names."""
 
 import dataclasses
+import functools
 from collections import Counter
 
 import jax
@@ -229,8 +230,9 @@ def test_with_neighbours_the_token_of_an_action_also_holds_those_beside_it():
     tokens = jax.random.normal(jax.random.key(0), (4, 8))
     for neighbours, changed in ((False, [1]), (True, [0, 1, 2])):
         encoder = make("Star3x4", Settings(neighbours=neighbours)).encoders["leapjax"](config, 0)
-        mix, params = encoder.init_with_output(jax.random.key(1), tokens, method="mix_actions")
-        after = encoder.apply(params, tokens.at[1].add(1.0), method="mix_actions")
+        place = functools.partial(encoder.apply, method="place_actions")
+        params = encoder.init(jax.random.key(1), tokens, 0.5, method="place_actions")
+        mix, after = (place(params, each, 0.5) for each in (tokens, tokens.at[1].add(1.0)))
         same(np.flatnonzero(np.any(mix != after, axis=1)), changed)
     causal = dataclasses.replace(config, attention="causal")
     with pytest.raises(UserError, match="neighbours with attention 'causal'"):

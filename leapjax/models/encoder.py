@@ -43,40 +43,25 @@ class Encoder(nn.Module):
         del known
         return self(context)
 
-    def encode_positions(self, context: Context, horizon: int) -> jax.Array | None:
-        """Returns an embedding `[T, D]` of each position of a plan, such as a cell of a board.
+    def encode_positions(self, context: Context, horizon: int) -> PyTree | None:
+        """Returns the positions of a plan as `place_actions` needs them; computed once per plan.
 
-        It returns `None` by default; the network then learns an embedding of each position.
+        By default it returns `None`, and the network learns an embedding `[T, D]` of the positions.
         """
         del context, horizon
         return None
 
-    def mix_actions(self, tokens: jax.Array) -> jax.Array:
-        """Mixes the tokens `[T, D]` of a plan's actions; by default it leaves them unchanged.
+    def place_actions(self, tokens: jax.Array, positions: PyTree) -> jax.Array:
+        """Returns the tokens `[T, D]` of a plan's actions at their positions; by default the sum.
 
-        An encoder overrides this if an action means little without its neighbours.
-        """
-        return tokens
-
-    def relate_positions(self, context: Context, horizon: int) -> PyTree:
-        """Returns what `exchange_messages` must know of a context, such as shared constraints.
-
-        It returns `()` by default.
-        """
-        del context, horizon
-        return ()
-
-    def exchange_messages(self, tokens: jax.Array, relations: PyTree) -> jax.Array:
-        """Returns the tokens `[T, D]` of a plan, changed by related tokens; here unchanged.
-
-        An encoder overrides this if it knows which positions constrain each other.
+        An encoder overrides this if an action means little without related actions.
 
         Args:
-            tokens: of actions, with the embeddings of their positions.
-            relations: result of `relate_positions`.
+            tokens: tokens `[T, D]` of the actions alone.
+            positions: result of `encode_positions`, or the learned embedding `[T, D]`.
         """
-        del relations
-        return tokens
+        placed: jax.Array = tokens + positions
+        return placed
 
     def add_later_state(self) -> "Encoder":
         """Returns this encoder with an additional token for later states, whose pose is unknown.

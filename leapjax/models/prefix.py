@@ -18,13 +18,11 @@ class Prefix(NamedTuple):
 
     Attributes:
         known: keys and values of the context's tokens, per layer.
-        places: embeddings `[T, D]` of the positions of a plan.
-        relations: of the positions; see `Encoder.relate_positions`.
+        positions: positions of a plan, as the encoder's `place_actions` takes them.
     """
 
     known: list[KeysValues]
-    places: jax.Array
-    relations: PyTree = ()
+    positions: PyTree
 
 
 class PrefixModel(nn.Module):
@@ -34,9 +32,8 @@ class PrefixModel(nn.Module):
     keys and values once per plan, and a pass runs over T action tokens only. A network that is
     conditioned on the return to go has an additional context token.
 
-    The encoder may embed the positions of a plan (`encode_positions`); otherwise this network
-    learns an embedding of each. It may also mix the tokens of a plan's actions (`mix_actions`), and
-    pass messages between related positions (`exchange_messages`).
+    The encoder may encode the positions of a plan (`encode_positions`); otherwise this network
+    learns an embedding of each. The encoder also puts actions at their positions (`place_actions`).
 
     Attributes:
         config: size of the network.
@@ -85,10 +82,10 @@ class PrefixModel(nn.Module):
             tokens = jnp.concatenate([tokens, jnp.tanh(self.goal(returns[-1:, None]))])
         tokens = self.drop(tokens, deterministic=deterministic)
         known = self.transformer.prefix(tokens, deterministic=deterministic)
-        places = self.context.encode_positions(context, self.sizes.horizon)
-        if places is None:
-            places = self.position(jnp.arange(self.sizes.horizon))
-        return Prefix(known, places, self.context.relate_positions(context, self.sizes.horizon))
+        positions = self.context.encode_positions(context, self.sizes.horizon)
+        if positions is None:
+            positions = self.position(jnp.arange(self.sizes.horizon))
+        return Prefix(known, positions)
 
     def logits(
         self,
@@ -106,8 +103,7 @@ class PrefixModel(nn.Module):
             deterministic: whether to leave out dropout.
         """
         check_plan(actions, self.sizes.horizon)
-        tokens = self.context.mix_actions(self.action(actions)) + memory.places
-        tokens = self.context.exchange_messages(tokens, memory.relations)
+        tokens = self.context.place_actions(self.action(actions), memory.positions)
         x = self.drop(tokens, deterministic=deterministic)
         cached = memory.known[0].keys.shape[0]
         mask = make_attention_mask(self.config, self.sizes.horizon, cached)

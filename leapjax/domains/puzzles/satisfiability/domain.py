@@ -74,16 +74,16 @@ class Messages(nn.Module):
         return tokens + self.listen((heard / degree).reshape(count, -1))
 
 
-class Relations(NamedTuple):
-    """What the messages in a plan need to know of a formula.
+class Variables(NamedTuple):
+    """The variables of a formula, for a plan that assigns them.
 
     Attributes:
+        tokens: tokens `[n, D]` without a plan, the next variable first.
         holds: `[clauses, 2 n]`, see `Messages`.
-        tokens: of variables, `[n, D]`, without a plan.
     """
 
-    holds: jax.Array
     tokens: jax.Array
+    holds: jax.Array
 
 
 class FormulaTokens(Encoder):
@@ -95,7 +95,7 @@ class FormulaTokens(Encoder):
         count: number of variables.
         width: D, of a token.
         rounds: of messages, before a plan is known and in each pass.
-        mixed: whether the actions of a plan exchange messages.
+        mixed: whether the variables of a plan exchange messages.
         dtype: type of matrix products.
     """
 
@@ -113,29 +113,27 @@ class FormulaTokens(Encoder):
 
     def __call__(self, context: Context) -> jax.Array:
         """Returns the tokens `[n, D]`; the first is marked."""
-        return self._relate(context).tokens.at[:1].add(self.next(jnp.zeros(1, jnp.int32)))
+        return self._encode(context).tokens.at[:1].add(self.next(jnp.zeros(1, jnp.int32)))
 
-    def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """Encodes the variables that a plan assigns: `[T, D]`."""
-        return self._relate(context).tokens[jnp.minimum(jnp.arange(horizon), self.count - 1)]
-
-    def relate_positions(self, context: Context, horizon: int) -> Relations:
-        """Returns which variables share a clause."""
+    def encode_positions(self, context: Context, horizon: int) -> Variables:
+        """Returns the variables that a plan assigns, and those after its end."""
         del horizon
-        return self._relate(context)
+        return self._encode(context)
 
-    def exchange_messages(self, tokens: jax.Array, relations: Relations) -> jax.Array:
-        """Returns the tokens `[T, D]` after messages between variables that share a clause."""
+    def place_actions(self, tokens: jax.Array, positions: Variables) -> jax.Array:
+        """Adds the variables `[T, D]`, and exchanges messages between variables of a clause."""
+        count = min(len(tokens), self.count)
+        last = positions.tokens[jnp.minimum(jnp.arange(len(tokens)), self.count - 1)]
+        placed = tokens + last
         if not self.mixed:
-            return tokens
+            return placed
         # Variables after the plan's end take part as they are before the plan.
-        inside = min(len(tokens), self.count)
-        whole = jnp.concatenate([tokens[:inside], relations.tokens[inside:]])
+        whole = jnp.concatenate([placed[:count], positions.tokens[count:]])
         for messages in self.within:
-            whole = messages(whole, relations.holds)
-        return jnp.concatenate([whole[:inside], tokens[inside:]])
+            whole = messages(whole, positions.holds)
+        return jnp.concatenate([whole[:count], placed[count:]])
 
-    def _relate(self, context: Context) -> Relations:
+    def _encode(self, context: Context) -> Variables:
         formula = context.observation
         # Variables are counted from the next one on, as positions of a plan are.
         literals = (formula.literals - 2 * formula.variable) % (2 * self.count)
@@ -143,7 +141,7 @@ class FormulaTokens(Encoder):
         tokens = self.value(jnp.roll(formula.values, -formula.variable))
         for messages in self.before:
             tokens = messages(tokens, holds)
-        return Relations(holds, tokens)
+        return Variables(tokens, holds)
 
 
 def make(name: str, settings: Settings) -> Domain:

@@ -73,18 +73,19 @@ class GraphTokens(Encoder):
         task = self.names(jnp.stack([graph.node, graph.goal])).reshape(1, -1)
         return jnp.concatenate([self.edge(edges), self.task(task)])
 
-    def mix_actions(self, tokens: jax.Array) -> jax.Array:
-        """Adds to the token of each action those of the actions before and after it, `[T, D]`.
+    def place_actions(self, tokens: jax.Array, positions: jax.Array) -> jax.Array:
+        """Adds to the token of each action its position, and the actions before and after it.
 
         One layer then finds the edge between an action and its neighbour. Otherwise a layer must
         learn to fetch the neighbour before the next can learn to use it (short convolutions: Fu et
         al., 2023, H3).
         """
         if not self.neighbours:
-            return tokens
+            return tokens + positions
         blank = jnp.zeros_like(tokens[:1])
         before = self.before(jnp.concatenate([blank, tokens[:-1]]))
-        return tokens + before + self.after(jnp.concatenate([tokens[1:], blank]))
+        after = self.after(jnp.concatenate([tokens[1:], blank]))
+        return tokens + before + after + positions
 
 
 def make(name: str, settings: Settings) -> Domain:
