@@ -50,6 +50,7 @@ class _Episode(NamedTuple):
     over: jax.Array  # [] bool
     success: jax.Array  # [] bool
     plans: jax.Array  # [] int32
+    passes: jax.Array  # [] int32: passes of the model in all plans
     valid: jax.Array  # [] bool: no energy was NaN or -inf
     strange: jax.Array  # [] int32: the first step with a number that is not finite, or -1
 
@@ -102,9 +103,9 @@ def compile_rollout(
             observation, past, jnp.full(context, pad_token(end + 1), jnp.int32),
             jnp.zeros(context), jnp.int32(0), jnp.float32(0),
         )  # fmt: skip
-        no, yes = jnp.bool_(False), jnp.bool_(True)
+        no, yes, zero = jnp.bool_(False), jnp.bool_(True), jnp.int32(0)
         strange = jnp.where(_is_finite(observation), -1, 0)
-        return _Episode(state, blank, jnp.float32(0), no, no, jnp.int32(0), yes, strange)
+        return _Episode(state, blank, jnp.float32(0), no, no, zero, zero, yes, strange)
 
     def act(carry: tuple[_Episode, jax.Array], action: jax.Array) -> tuple[PyTree, None]:
         """Takes one action of a plan, unless the plan or the episode is over."""
@@ -129,7 +130,11 @@ def compile_rollout(
         def replanned(episode: _Episode) -> _Episode:
             found = plan(params, plan_key(key, level_seed, episode.plans), episode.context)
             actions = found.actions[:executed]
-            episode = episode._replace(plans=episode.plans + 1, valid=episode.valid & found.valid)
+            episode = episode._replace(
+                plans=episode.plans + 1,
+                passes=episode.passes + found.passes,
+                valid=episode.valid & found.valid,
+            )
             (acted, _), _ = jax.lax.scan(act, (episode, jnp.bool_(False)), actions)
             return acted._replace(over=acted.over | (actions[0] >= end))  # the planner gave up
 
@@ -160,7 +165,7 @@ def compile_rollout(
         seconds = time.perf_counter() - begun
         return Episodes(
             np.asarray(seeds), played.success, played.context.step, played.score,
-            int(played.plans.sum()), seconds, seconds,
+            int(played.plans.sum()), int(played.passes.sum()), seconds, seconds,
         )  # fmt: skip
 
     return rollout

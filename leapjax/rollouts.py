@@ -30,6 +30,7 @@ class Episodes(NamedTuple):
         lengths: `[E]` int, environment steps.
         returns: `[E]` float, sums of rewards, or of scores if the environment reports scores.
         plans: number of plans in all episodes.
+        passes: passes of the model in all plans (see `Plan.passes`).
         planning_seconds: seconds of the planner alone, compilation included.
         seconds: seconds in all.
     """
@@ -39,6 +40,7 @@ class Episodes(NamedTuple):
     lengths: np.ndarray
     returns: np.ndarray
     plans: int
+    passes: int
     planning_seconds: float
     seconds: float
 
@@ -51,6 +53,7 @@ def join(parts: Sequence[Episodes]) -> Episodes:
         np.concatenate([part.lengths for part in parts]),
         np.concatenate([part.returns for part in parts]),
         sum(part.plans for part in parts),
+        sum(part.passes for part in parts),
         max(part.planning_seconds for part in parts),
         max(part.seconds for part in parts),
     )
@@ -358,7 +361,7 @@ def evaluate(
     opened: dict[int, Adapter] = {}  # by index
     active: list[_Episode] = []
     owned: set[int] = set()  # ids of objects that active episodes step
-    over, planned, planning_seconds = 0, 0, 0.0
+    over, planned, passes, planning_seconds = 0, 0, 0, 0.0
 
     def begin(place: int) -> _Episode:
         level_seed = int(level_seeds[place])
@@ -377,7 +380,7 @@ def evaluate(
 
     def decide(group: Sequence[_Episode]) -> Iterator[tuple[_Episode, np.ndarray]]:
         """Plans for some episodes; pairs each with its next actions, `[executed]`."""
-        nonlocal planned, planning_seconds
+        nonlocal planned, passes, planning_seconds
         before = time.perf_counter()
         keys = plan_keys(
             seed,
@@ -393,6 +396,7 @@ def evaluate(
             episode.cache = cache
         planning_seconds += time.perf_counter() - before
         planned += len(group)
+        passes += int(np.sum(plans.passes))
         return zip(group, np.asarray(chosen)[:, :executed], strict=True)
 
     def act(episode: _Episode, actions: np.ndarray) -> bool:
@@ -453,6 +457,7 @@ def evaluate(
         lengths,
         scores,
         planned,
+        passes,
         planning_seconds,
         time.perf_counter() - begun,
     )

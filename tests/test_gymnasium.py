@@ -452,7 +452,8 @@ def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
 
         def plan_next(self, params, keys, context, cache):
             contexts.append(context)
-            return Plan(np.zeros((len(keys), 1), np.int32), *[None] * 3), None
+            nothing = np.zeros(len(keys), np.int32)
+            return Plan(nothing[:, None], *[nothing] * 4), None
 
     episodes = evaluate(lambda: adapter(Moody()), [1, 2, 3], Planner(), (), context=2)
     assert list(episodes.lengths) == [11, 10, 9]

@@ -97,10 +97,10 @@ def test_alone_a_process_agrees_with_itself():
 
 def test_episodes_that_were_played_side_by_side_are_joined_in_order():
     seeds = np.arange(5)
-    whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, seeds / 2, 9, 2.0, 3.0)
+    whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, seeds / 2, 9, 90, 2.0, 3.0)
     parts = [
-        Episodes(*(array[:2] for array in whole[:4]), 4, 1.0, 3.0),
-        Episodes(*(array[2:] for array in whole[:4]), 5, 2.0, 2.5),
+        Episodes(*(array[:2] for array in whole[:4]), 4, 40, 1.0, 3.0),
+        Episodes(*(array[2:] for array in whole[:4]), 5, 50, 2.0, 2.5),
     ]
     for field, expected in zip(join(parts), whole, strict=True):
         np.testing.assert_array_equal(field, expected)

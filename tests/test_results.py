@@ -124,7 +124,7 @@ def test_a_row_is_json_or_refused(tmp_path):
 def test_episodes_are_kept_with_their_rows(tmp_path):
     def played(*lengths):
         seeds = np.arange(len(lengths))
-        return Episodes(seeds, seeds > 0, np.array(lengths), seeds / 3, 1, 1.0, 1.0)
+        return Episodes(seeds, seeds > 0, np.array(lengths), seeds / 3, 1, 10, 1.0, 1.0)
 
     def kept():
         return {name: each["length"].tolist() for name, each in results.read_episodes(path).items()}

@@ -62,14 +62,14 @@ def plan_for(config, energy=ENUMERABLE, params=None, context=NO_TILT, chains=Non
 # How many positions a pass fills.
 
 
-def count_by_hand(probabilities, least, threshold, entropy):
+def count_by_hand(probabilities, least, certainty, entropy):
     """The number of positions of a ranked list that a pass fills, by the definitions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         entropies = -np.nansum(probabilities * np.log(probabilities), axis=1)
     count = least
     while count < len(probabilities):
         following = probabilities[: count + 1]
-        surely = threshold < 1 and (following.max(1) >= threshold).all()
+        surely = certainty < 1 and (following.max(1) >= certainty).all()
         spread = entropies[: count + 1].sum() - entropies[: count + 1].max()
         if not (surely or (entropy > 0 and spread <= entropy)):
             break
@@ -78,10 +78,10 @@ def count_by_hand(probabilities, least, threshold, entropy):
 
 
 @pytest.mark.parametrize(
-    ("least", "threshold", "entropy"),
+    ("least", "certainty", "entropy"),
     [(1, 0.7, 0.0), (1, 1.0, 0.9), (2, 0.6, 0.3), (1, 0.0, 0.0), (2, 1.0, 0.0)],
 )
-def test_a_pass_fills_the_certain_positions(least, threshold, entropy):
+def test_a_pass_fills_the_certain_positions(least, certainty, entropy):
     rng, counts = np.random.default_rng(0), set()
     for _ in range(30):
         logits = rng.normal(scale=3, size=(8, 4)).astype(np.float32)
@@ -89,17 +89,17 @@ def test_a_pass_fills_the_certain_positions(least, threshold, entropy):
         open_[:2] = True
         energies = -jax.nn.log_softmax(jnp.array(logits))
         ranks = most_certain(energies, None)
-        commitment = Commitment(least, threshold, entropy)
+        commitment = Commitment(least, certainty, entropy)
         where, chosen = map(np.asarray, choose_open(energies, jnp.array(open_), ranks, commitment))
         probabilities = np.exp(-np.asarray(energies, np.float64))
         ranked = sorted(np.flatnonzero(open_), key=lambda t: -probabilities[t].max())
-        count = count_by_hand(probabilities[ranked], least, threshold, entropy)
+        count = count_by_hand(probabilities[ranked], least, certainty, entropy)
         assert where[chosen].tolist() == ranked[:count]
         counts.add(count)
     assert len(counts) > 2 or not commitment.adapts
 
 
-@pytest.mark.parametrize("bound", [{"threshold": 0.8}, {"entropy_bound": 0.3}])
+@pytest.mark.parametrize("bound", [{"certainty": 0.8}, {"entropy_bound": 0.3}])
 @pytest.mark.parametrize("kind", [GibbsConfig, BeamConfig])
 def test_certain_positions_save_passes(kind, bound):
     """Trace and `passes` tell how many; without a bound each pass fills one position."""
@@ -346,8 +346,8 @@ def test_more_terms_at_a_position_than_the_degree_are_an_error():
     ("make", "message"),
     [
         (lambda: GibbsConfig(5, 5, fill="uncertain"), "unknown fill 'uncertain'"),
-        (lambda: GibbsConfig(5, 5, threshold=0.9), "fill 'together' fills all"),
-        (lambda: GibbsConfig(5, 5, fill="margin", threshold=1.5), "threshold"),
+        (lambda: GibbsConfig(5, 5, certainty=0.9), "fill 'together' fills all"),
+        (lambda: GibbsConfig(5, 5, fill="margin", certainty=1.5), "certainty"),
         (lambda: GibbsConfig(5, 5, fill="margin", entropy_bound=-1.0), "entropy_bound"),
         (lambda: GibbsConfig(5, 5, keep="first"), "unknown keep 'first'"),
         (lambda: GibbsConfig(5, 5, cool_to=-1.0), "temperature"),

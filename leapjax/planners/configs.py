@@ -61,7 +61,7 @@ class GibbsConfig:
         restarts: R, independent plans; the planner returns the plan of least energy.
         score: Also return the energy of the plan, for T more passes.
         score_trace: Also return the energy after every iteration, for N * T more passes.
-        threshold: A filling pass also fills each next position whose likeliest action has at least
+        certainty: A filling pass also fills each next position whose likeliest action has at least
             this probability. Then the plan takes fewer passes. 1 fills P positions.
         entropy_bound: A filling pass also fills each next position, as long as their entropies
             without the largest add up to at most this, in nats (EB-Sampler, arXiv 2505.24857). 0
@@ -81,7 +81,7 @@ class GibbsConfig:
     restarts: int = 1
     score: bool = False
     score_trace: bool = False
-    threshold: float = 1.0
+    certainty: float = 1.0
     entropy_bound: float = 0.0
     cool_to: float | None = None
     keep: str = "last"
@@ -119,11 +119,11 @@ def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None
     """
     if not callable(config.fill):
         check_name("fill", config.fill, known)
-    check_number("threshold", config.threshold, 0, 1)
+    check_number("certainty", config.certainty, 0, 1)
     check_number("entropy_bound", config.entropy_bound, 0)
     if config.fill == "together" and make_commitment(config).adapts:
         raise ValueError(
-            "threshold and entropy_bound choose how many positions a pass fills, and fill "
+            "certainty and entropy_bound choose how many positions a pass fills, and fill "
             "'together' fills all: use another fill, such as 'confident'"
         )
 
@@ -131,7 +131,7 @@ def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None
 def make_commitment(config: "GibbsConfig | BeamConfig") -> Commitment:
     """Returns how many positions a filling pass of a configuration fills."""
     least = config.resampled if isinstance(config, GibbsConfig) else 1
-    return Commitment(least, config.threshold, config.entropy_bound)
+    return Commitment(least, config.certainty, config.entropy_bound)
 
 
 def find_selection(fill: Fill) -> Select:
@@ -193,11 +193,11 @@ class BeamConfig:
         beams: W, partial plans that are kept.
         temperature: 0 keeps the best beams; above it beams are drawn, all different.
         score: Also return the energy of the plan, for T more passes.
-        fill: Which open position a beam chooses next, as in `GibbsConfig`; from left to right
-            ("sequential") by default. Other orders let each beam take its own.
+        fill: Which open position a beam chooses next, as in `GibbsConfig`. By default beams go from
+            left to right; in other orders each beam takes a position of its own.
         judge: Which complete beam to return. "sum" takes the least sum of the conditional energies
             of its choices, "energy" the least total energy, for W * T more passes.
-        threshold: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
+        certainty: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
             beam branches at the last of them.
         entropy_bound: As in `GibbsConfig`; the beam branches at the last position.
     """
@@ -208,7 +208,7 @@ class BeamConfig:
     score: bool = False
     fill: Fill = "sequential"
     judge: str = "sum"
-    threshold: float = 1.0
+    certainty: float = 1.0
     entropy_bound: float = 0.0
 
     def __post_init__(self) -> None:
@@ -219,7 +219,7 @@ class BeamConfig:
         check_name("judge", self.judge, JUDGES)
         if self.temperature and make_commitment(self).adapts:
             raise ValueError(
-                "threshold and entropy_bound take the most likely actions, and a temperature "
+                "certainty and entropy_bound take the most likely actions, and a temperature "
                 "draws them: use one of the two"
             )
 

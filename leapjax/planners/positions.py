@@ -61,7 +61,7 @@ class Commitment(NamedTuple):
 
     Attributes:
         least: number of positions that every pass fills, while so many are open.
-        threshold: a pass also fills each next position whose likeliest action has at least this
+        certainty: a pass also fills each next position whose likeliest action has at least this
             probability; above 1: no further position.
         entropy: a pass also fills each next position, as long as their entropies without the
             largest add up to at most this, in nats (EB-Sampler, Ben-Hamu et al., arXiv 2505.24857).
@@ -69,13 +69,13 @@ class Commitment(NamedTuple):
     """
 
     least: int = 1
-    threshold: float = 1.0
+    certainty: float = 1.0
     entropy: float = 0.0
 
     @property
     def adapts(self) -> bool:
         """Whether the number of positions depends on the energies."""
-        return self.threshold < 1 or self.entropy > 0
+        return self.certainty < 1 or self.entropy > 0
 
 
 def choose_open(
@@ -103,8 +103,8 @@ def choose_open(
         probabilities = compute_probabilities(energies[where])
         entropies = jax.scipy.special.entr(probabilities).sum(axis=-1)
         spread = jnp.cumsum(entropies) - jax.lax.cummax(entropies)
-        certain = probabilities.max(axis=-1) >= commitment.threshold
-        chosen |= (jnp.cumsum(~certain) == 0) & (commitment.threshold < 1)
+        certain = probabilities.max(axis=-1) >= commitment.certainty
+        chosen |= (jnp.cumsum(~certain) == 0) & (commitment.certainty < 1)
         chosen |= (spread <= commitment.entropy) & (commitment.entropy > 0)
     return where, chosen & open_[where]
 

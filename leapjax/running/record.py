@@ -76,6 +76,7 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
         "train_steps": 0 if config.checkpoint else config.training.steps,
         **{f"{part}_seconds": round(value, 3) for part, value in run.seconds.items()},
         "plans": episodes.plans,
+        "passes": episodes.passes / episodes.plans,
         "plans_per_second": episodes.plans / episodes.planning_seconds,
         "params": int(sum(x.size for x in jax.tree.leaves(planner.params))),
         "paper_success": paper and paper(config.level, config.method),

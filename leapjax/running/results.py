@@ -69,6 +69,7 @@ OF_EXPERIMENT: dict[str, Schema] = {
     "train_steps": COUNT,
     "iterations": SEVERAL,
     "plans": SEVERAL,
+    "passes": Absent(POSITIVE),
     "mean_return": float,
     "return_error": Absent(Nullable(AMOUNT)),
     "configuration": {"planner": {"temperature": Absent(AMOUNT)}},
