@@ -64,13 +64,14 @@ def draw_methods(
         width = 0.8 / len(by_whom)
         for index, (whose, by_method) in enumerate(by_whom.items()):
             places = [names.index(name) + width * (index + 0.5) - 0.4 for name in by_method]
-            axis.bar(places, list(by_method.values()), width, label=whose.replace("`", ""), color=f"C{index}")
+            axis.bar(places, list(by_method.values()), width, label=whose, color=f"C{index}")
         axis.set_xticks(range(len(names)), names, rotation=30)
         axis.set(ylim=(0, 102))
         axis.set_title(level, fontsize=9)
     if rates:
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        titles = [label.replace("`", "") for label in labels]
+        figure.legend(handles, titles, loc="outside lower center", ncols=len(titles))
     plots.save(figure, path)
 
 

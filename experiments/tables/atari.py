@@ -60,7 +60,9 @@ def compare_scores(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         few = data.get(name, ())
         many = data.get(name_data(name, PAPER_TRANSITIONS), ())
         found = {"published": papers}
-        found["preset `leapjax`"], found["preset `leapjax`: raw score"] = _format_scores(rows, name, COLUMNS, few)
+        found["preset `leapjax`"], found["preset `leapjax`: raw score"] = _format_scores(
+            rows, name, COLUMNS, few
+        )
         for setting, columns_of in (("", LARGE), (", temperature 0.1", COLD)):
             title = f"preset `paper`{setting}"
             found[title], found[f"{title}: raw score"] = _format_scores(
