@@ -108,7 +108,7 @@ def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, flo
         for method, setting in by_method.items()
         if method != "random"
     }
-    named["leap, preset `leapjax`, three actions of each plan"] = SETTINGS[executed]
+    named["leap, preset `leapjax`, 3 executed"] = SETTINGS[executed]
     found = {title: compute_middle(rows, setting) for title, setting in named.items()}
     known = {title: each for title, each in found.items() if each is not None}
     return {"LEAP, published": (paper, paper, paper), **known}
