@@ -11,8 +11,9 @@ from leapjax.running import shell, startup
 
 # In the order of `--help`, which shows the first line of each program's docstring.
 PROGRAMS = (
-    "babyai", "atari", "gymnasium", "stars", "sudoku", "properties", "stochastic", "suboptimal",
-    "ablation", "atari_energy", "landscape", "qualitative", "accuracy", "failures",
+    "babyai", "atari", "gymnasium", "stars", "sudoku", "countdown", "satisfiability", "properties",
+    "stochastic", "suboptimal", "ablation", "atari_energy", "landscape", "qualitative", "accuracy",
+    "failures",
 )  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def animate(planner: Pretrained, run: Run, seeds: Sequence[int], path: Path) -> 
             name: np.asarray(plan(planner.params, keys, contexts).trace[0])[:, : star.length]
             for name, plan in plans.items()
         }
-        frames += _draw_frames(star, graph, adapter.path, traces)
+        frames += _draw_frames(star, graph, adapter.solution, traces)
     save_animation(frames, path)
 
 

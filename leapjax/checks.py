@@ -8,6 +8,7 @@ import math
 import operator
 import typing
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -301,10 +302,12 @@ def _check_type(name: str, value: Any, kind: Any) -> Any:
         raise UserError(f"{name} must be True or False, got {_shorten(value)}")
     elif kind is str and not isinstance(value, str):
         raise UserError(f"{name} must be a text, got {_shorten(value)}")
-    elif kind in (bool, str):
+    elif kind is Path and not isinstance(value, str | Path):
+        raise UserError(f"{name} must be a path, got {_shorten(value)}")
+    elif kind in (bool, str, Path):
         checked = kind(value)
     # An integer in a field of floats stays an integer: the names of runs depend on its text.
-    return value if type(value) in (int, float, bool, str) else checked
+    return value if kind is not Path and type(value) in (int, float, bool, str) else checked
 
 
 def check_at_least(config: object, least: int, *names: str, most: int = MOST) -> None:

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
-from leapjax import pretrained, serialization
+from leapjax import files, pretrained, serialization
 from leapjax.agents.base import TrainingConfig
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
-from leapjax.domain import Domain
+from leapjax.domain import Domain, drop_files
 from leapjax.domains import find_domain, make_level
 from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
@@ -136,9 +136,12 @@ def change(config: AnyConfig, **changes: Any) -> AnyConfig:
 
 
 def list_settings(config: AnyConfig, seed: int) -> dict[str, Any]:
-    """Returns all settings that the result of a training seed depends on, as JSON values."""
+    """Returns all settings that the result of a training seed depends on, as JSON values.
+
+    A path stands for the name and the contents of its file.
+    """
     values = {k: v for k, v in dataclasses.asdict(config).items() if k not in _NOT_HASHED}
-    return json.loads(json.dumps({**values, "seed": seed}))
+    return json.loads(json.dumps({**values, "seed": seed}, default=files.describe))
 
 
 def hash_config(config: AnyConfig, seed: int) -> str:
@@ -165,9 +168,10 @@ def make_domain(config: AnyConfig) -> Domain:
 
 def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
     """Makes the specification that a run saves beside its parameters."""
+    groups = {group: getattr(config, group) for group in GROUPS}
+    groups["domain_settings"] = drop_files(config.domain_settings)
     return Specification(
-        config.domain, config.level, config.method, config.context,
-        **{group: getattr(config, group) for group in GROUPS},
+        config.domain, config.level, config.method, config.context, **groups,
         signature=dict(domain.signature),
         origin=Origin(config.preset, seed, config.demos, config.demonstrations),
     )  # fmt: skip

@@ -5,7 +5,9 @@ A family is BabyAI, the games of Atari, or one environment of your own. A `Domai
 to `leapjax.domains`.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -170,6 +172,18 @@ class Scaling(NamedTuple):
     encoders: Callable[[Statistics], Encoders] | None = None
 
 
+class HeldOut(NamedTuple):
+    """Levels of a file, which held-out episodes play.
+
+    Attributes:
+        name: of the file, with a digest of its contents.
+        check: (level seeds) -> UserError if the file has no level for a seed.
+    """
+
+    name: str
+    check: Callable[[range], None]
+
+
 class Domain(NamedTuple):
     """One level: its environment, its actions, and how a network reads its observations.
 
@@ -189,6 +203,7 @@ class Domain(NamedTuple):
         rules: energy with parameters `()` that is lowest for plans that obey known rules; `None`
             without such rules.
         signature: JSON values that a checkpoint and the level must agree on.
+        held_out: levels of a file, which `make_adapter` then plays; `None` if it draws levels.
         made_from: (name in `leapjax.domains`, settings), from which `make_domain` made the level;
             `None` for an unregistered domain, whose planners cannot be saved.
     """
@@ -204,6 +219,7 @@ class Domain(NamedTuple):
     scaling: Scaling = Scaling()
     rules: Energy | None = None
     signature: Mapping[str, Any] = {}
+    held_out: HeldOut | None = None
     made_from: tuple[str, Any] | None = None
 
     @property
@@ -224,6 +240,16 @@ class DomainType(NamedTuple):
     settings: type
     make: Callable[[str, Any], Domain]
     levels: tuple[str, ...]
+
+
+def drop_files(settings: Any) -> Any:
+    """Returns settings of a domain without paths: they name files of held-out levels.
+
+    A network and its training do not depend on such a file.
+    """
+    fields = [field.name for field in dataclasses.fields(settings)]
+    paths = [name for name in fields if isinstance(getattr(settings, name), Path)]
+    return dataclasses.replace(settings, **dict.fromkeys(paths))
 
 
 def measure_statistics(domain: Domain, demonstrations: Sequence[Demonstration]) -> Statistics:

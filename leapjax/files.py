@@ -1,6 +1,7 @@
 """Atomic file writes, locks and permissions of folders, and checks of disk and memory."""
 
 import contextlib
+import hashlib
 import os
 import shutil
 import stat
@@ -64,6 +65,15 @@ def read_text(path: Path, most: int = LARGEST_TEXT) -> str:
         return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {first_line(error)}") from None
+
+
+def describe(path: Path) -> str:
+    """Returns the name of a file of text with a digest of its contents.
+
+    Raises:
+        UserError: the file cannot be read, is too large, or is not text.
+    """
+    return f"{path.name} {hashlib.sha256(read_text(path).encode()).hexdigest()[:12]}"
 
 
 def _check_regular(path: Path) -> None:

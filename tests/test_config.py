@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 import typing
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -157,6 +158,7 @@ NEVER = {
     float: [True, "1", math.nan, -math.inf],
     bool: [1, "yes", None],
     str: [1, None],
+    Path: [1, True, b"path"],
 }
 
 

@@ -1,12 +1,32 @@
 """The examples do what they say."""
 
+import json
 import re
 import runpy
 import sys
 
+import matplotlib.pyplot as plt
 import pytest
 
 from tests.programs import LONG, ROOT
+
+# The constants in the first code cell of each notebook, at toy size.
+NOTEBOOKS = {
+    "tour": {"PASSES": 40, "STARTS": 2},
+    "babyai": {"LEVELS": 2},
+    "train_on_my_data": {"STEPS": 2, "SEEDS": 1, "EPISODES": 2},
+}
+MOST_BYTES = 400_000  # of a notebook, with its pictures
+# A path from the root of a file system, but no part of a relative path or of an address.
+ABSOLUTE = re.compile(r"(?<![\w.:/<)\]])/\w[\w.-]*/\w|\b[A-Z]:\\")
+
+
+def read_notebook(name):
+    return json.loads((ROOT / "examples" / f"{name}.ipynb").read_text(encoding="utf-8"))
+
+
+def code_cells(name):
+    return [cell for cell in read_notebook(name)["cells"] if cell["cell_type"] == "code"]
 
 
 @pytest.mark.parametrize(
@@ -33,3 +53,50 @@ def test_an_example_runs(name, arguments, says, monkeypatch, capsys):
 def test_every_example_is_tried():
     marks = test_an_example_runs.pytestmark[0].args[1]
     assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {mark[0] for mark in marks}
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_runs(name, monkeypatch, tmp_path):
+    """Executes the code cells in order, in one namespace, as a kernel does."""
+    if name != "tour" and not LONG:
+        pytest.skip("make test-long runs it")
+    plt.switch_backend("Agg")
+    monkeypatch.chdir(tmp_path)
+    pictures = []
+    monkeypatch.setattr(plt, "show", lambda: pictures.append(plt.gcf()) or plt.close("all"))
+    namespace = {"__name__": "__main__"}
+    for number, cell in enumerate(code_cells(name)):
+        exec(compile("".join(cell["source"]), f"{name}, code cell {number}", "exec"), namespace)
+        if number == 0:
+            assert NOTEBOOKS[name].keys() <= namespace.keys()
+            namespace.update(NOTEBOOKS[name])
+    shown = [part for cell in code_cells(name) for part in cell["outputs"] if "data" in part]
+    assert len(pictures) == len(shown) > 0
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_committed_notebook_has_outputs(name):
+    """Of one run from top to bottom, without errors and without paths of a machine.
+
+    To make them: `jupyter nbconvert --to notebook --execute --inplace examples/NAME.ipynb`.
+    """
+    assert (ROOT / "examples" / f"{name}.ipynb").stat().st_size < MOST_BYTES
+    assert read_notebook(name)["metadata"]["kernelspec"] == {
+        "display_name": "Python 3",
+        "language": "python",
+        "name": "python3",
+    }
+    cells = code_cells(name)
+    assert [cell["execution_count"] for cell in cells] == [*range(1, len(cells) + 1)]
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    for output in outputs:
+        assert output["output_type"] != "error"
+        assert output.get("name") != "stderr"
+    for cell in read_notebook(name)["cells"]:
+        said = ["".join(output.get("text", "")) for output in cell.get("outputs", [])]
+        assert not ABSOLUTE.search("\n".join(["".join(cell["source"]), *said]))
+
+
+def test_every_notebook_is_tried():
+    assert {path.stem for path in (ROOT / "examples").glob("*.ipynb")} == NOTEBOOKS.keys()

@@ -70,7 +70,7 @@ def test_names_arms_and_the_order_of_edges_are_uniform():
 
 def test_the_path_is_rewarded_and_any_other_step_is_the_last():
     adapter = StarAdapter(STAR)
-    graph, path = adapter.reset(3), adapter.path
+    graph, path = adapter.reset(3), adapter.solution
     steps = [adapter.step(int(node)) for node in path]
     found = [(step.reward, step.terminated, step.success) for step in steps]
     assert found == [(0, False, False)] * 3 + [(1, True, True)]

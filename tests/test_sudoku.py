@@ -1,7 +1,10 @@
 """Sudoku: boards have one solution, whatever is done to them; its rules as an energy."""
 
 import functools
+import hashlib
 import itertools
+import os
+import time
 
 import jax
 import jax.numpy as jnp
@@ -10,23 +13,27 @@ import pytest
 
 from experiments import babyai, sudoku
 from experiments.common import searches
+from leapjax import files
 from leapjax.batching import compile_planner
-from leapjax.data import windows
+from leapjax.configuration import hash_config, list_settings, make_domain, specify
+from leapjax.data import seeds, windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.sudoku import boards
-from leapjax.domains.puzzles.sudoku.boards import Size, SudokuAdapter
+from leapjax.domains.puzzles.sudoku.boards import Level, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.domain import BoardTokens, Settings, make
 from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
+from leapjax.pretrained import describe_identity
 from leapjax.running import results
+from leapjax.running.command_line import parse
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long
 
-SMALL, LARGE = Size(4, 6), Size(9, 36)
-SIZES = pytest.mark.parametrize("size", [SMALL, LARGE], ids=str)
+SMALL, LARGE = Level(4, 6, 6), Level(9, 36, 36)
+LEVELS = pytest.mark.parametrize("level", [SMALL, LARGE], ids=str)
 
 
 @functools.cache
@@ -53,60 +60,134 @@ def test_the_search_finds_every_board_and_no_other():
     assert "".join(map(str, found)) == solution
 
 
-@SIZES
-def test_boards_have_so_many_clues_and_one_solution(size):
-    drawn = [boards.draw(size, seed) for seed in range(10)]
+@LEVELS
+def test_boards_have_so_many_clues_and_one_solution(level):
+    drawn = [boards.draw(level, seed) for seed in range(10)]
     for seed, (clues, solution) in enumerate(drawn):
-        assert (clues > 0).sum() == size.clues and solved(solution, size.side)
+        assert (clues > 0).sum() == level.fewest and solved(solution, level.side)
         np.testing.assert_array_equal(clues, np.where(clues > 0, solution, 0))
         (only,) = boards.find_solutions(clues)
         np.testing.assert_array_equal(only, solution)
-        np.testing.assert_array_equal(boards.draw(size, seed)[0], clues)
+        np.testing.assert_array_equal(boards.draw(level, seed)[0], clues)
     assert len({tuple(clues) for clues, _ in drawn}) == 10
 
 
+def test_a_seed_has_the_board_that_recorded_rows_were_played_on():
+    digest = hashlib.sha256()
+    for level in (SMALL, LARGE, Level(9, 26, 26)):
+        for seed in range(50):
+            for board in boards.draw(level, seed):
+                digest.update(board.tobytes())
+    assert digest.hexdigest()[:16] == "f6ed6fdc74873327"
+
+
+def test_a_range_draws_the_boards_of_its_levels_equally_often():
+    counts = []
+    for seed in range(120):
+        clues, solution = boards.draw(Level(4, 5, 8), seed)
+        counts.append(int((clues > 0).sum()))
+        same = boards.draw(Level(4, counts[-1], counts[-1]), seed)
+        np.testing.assert_array_equal((clues, solution), same)
+    assert np.bincount(counts)[5:].min() > 15 and set(counts) == {5, 6, 7, 8}
+
+
+@pytest.mark.parametrize(
+    ("name", "level"), [("Sudoku9x36", LARGE), ("Sudoku9x31-42", Level(9, 31, 42))]
+)
+def test_a_name_says_how_many_clues_a_board_has(name, level):
+    assert boards.find_level(name) == level
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Sudoku9", "expected Sudoku<4 or 9>x<clues> or Sudoku<4 or 9>x<fewest>-<most clues>"),
+        ("Sudoku9x17", "clues must be in 22 .. 81; .* too long to draw"),
+        ("Sudoku9x21-30", "clues must be in 22 .. 81"),
+        ("Sudoku4x6-17", "clues must be in 4 .. 16"),
+        ("Sudoku4x8-6", "the fewest clues come first: Sudoku4x6-8"),
+    ],
+)
+def test_levels_that_cannot_be_drawn_are_refused(name, message):
+    with pytest.raises(UserError, match=message):
+        boards.find_level(name)
+
+
+def read_digits(line):
+    return np.array([int(digit) for digit in line.replace(".", "0")])
+
+
+SEVENTEEN = "800000043000206000000000000000100670090530000000000200002003000500000900000040000"
+# Published boards that take a search of cells alone seconds to minutes.
+UNSOLVABLE = ".....5.8....6.1.43..........1.5........1.6...3.......553.....61........4........."
+BRUTE_FORCE = "..............3.85..1.2.......5.7.....4...1...9.......5......73..2.1........4...9"
+
+
+@pytest.mark.parametrize(("line", "count"), [(SEVENTEEN, 1), (UNSOLVABLE, 0), (BRUTE_FORCE, 1)])
+def test_sparse_and_unsolvable_boards_take_no_time(line, count):
+    begun = time.process_time()
+    found = boards.find_solutions(read_digits(line))
+    assert time.process_time() - begun < 5 and len(found) == count
+    assert all(solved(solution, 9) for solution in found)
+
+
+@pytest.mark.parametrize(
+    ("board", "message"),
+    [
+        (np.zeros(80, int), r"16 or 81 digits, got shape \(80,\)"),
+        (np.zeros((9, 9), int), r"16 or 81 digits, got shape \(9, 9\)"),
+        (np.zeros(81), "must hold integers, got float64"),
+        (np.full(16, 5), "run from 5 to 5, expected 0 to 4"),
+        (np.full(81, -1), "run from -1 to -1, expected 0 to 9"),
+    ],
+)
+def test_arrays_that_are_no_boards_are_refused(board, message):
+    with pytest.raises(UserError, match=message):
+        boards.find_solutions(board)
+
+
 def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
-    adapter = SudokuAdapter(SMALL)
+    adapter = SudokuAdapter(4, functools.partial(boards.draw, SMALL))
     first = adapter.reset(1)
-    assert (first.digits > 0).sum() == SMALL.clues and first.cell == 0
+    assert (first.digits > 0).sum() == SMALL.fewest and first.cell == 0
     solution = adapter.solution
-    steps = [adapter.step(int(digit) - 1) for digit in solution]
+    steps = [adapter.step(int(action)) for action in solution]
     assert [step.terminated for step in steps] == [False] * 15 + [True]
     assert [step.reward for step in steps] == [0.0] * 15 + [1.0] and steps[-1].success
-    np.testing.assert_array_equal(steps[-1].observation.digits, solution)
+    np.testing.assert_array_equal(steps[-1].observation.digits, solution + 1)
     adapter.reset(1)
-    step = adapter.step(int(solution[0]) % 4)
+    step = adapter.step(int(solution[0] + 1) % 4)
     assert step.terminated and not step.success
     np.testing.assert_array_equal(step.observation.digits, first.digits)
 
 
 @functools.cache
-def transformed(size):
+def transformed(level):
     """The window at a cell of a demonstration, with another board: compiled once."""
-    domain = make(f"Sudoku{size.side}x{size.clues}", Settings())
+    domain = make(f"Sudoku{level.side}x{level.fewest}", Settings())
     data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
-    cut = functools.partial(windows.window, steps, context=2, horizon=size.cells, end=size.side)
-    return jax.jit(lambda key, index: boards.transform(key, cut(index), size.side))
+    cut = functools.partial(windows.window, steps, context=2, horizon=level.cells, end=level.side)
+    return jax.jit(lambda key, index: boards.transform(key, cut(index), level.side))
 
 
-@SIZES
+@LEVELS
 @pytest.mark.parametrize("cell", [0, 7])
-def test_a_transformed_window_is_that_of_another_board(size, cell):
-    seen, rest = set(), size.cells - cell
+def test_a_transformed_window_is_that_of_another_board(level, cell):
+    seen, rest = set(), level.cells - cell
     for seed, episode in itertools.product(range(4), range(2)):
-        window = transformed(size)(jax.random.key(seed), episode * size.cells + cell)
+        window = transformed(level)(jax.random.key(seed), episode * level.cells + cell)
         window = jax.tree.map(np.asarray, window)
         board, past = window.context.observation, window.context.past
         (solution,) = boards.find_solutions(board.digits)  # what is left has one solution
         np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
-        assert (window.actions[rest:] == size.side).all()  # the end action
+        assert (window.actions[rest:] == level.side).all()  # the end action
         assert board.cell == cell and (board.digits[:cell] > 0).all()
         clues = (board.digits[cell:] > 0).sum()
-        assert clues <= size.clues and (cell > 0 or clues == size.clues)
+        assert clues <= level.fewest and (cell > 0 or clues == level.fewest)
         for back in (1, 2):
             if back > cell:
-                assert window.context.actions[-back] == pad_token(size.side + 1)
+                assert window.context.actions[-back] == pad_token(level.side + 1)
                 assert not past.digits[-back].any()
                 continue
             assert window.context.actions[-back] + 1 == solution[cell - back]
@@ -205,6 +286,91 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     assert share(both, ((), ()), certain) == share(energy, (), certain)
 
 
+def write_boards(folder, *lines):
+    path = folder / "hard.txt"
+    path.write_text("# from a magazine\n\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def make_lines(count):
+    """Boards of 4 by 4 cells, as lines of text."""
+    return ["".join(map(str, boards.draw(SMALL, seed)[0])) for seed in range(count)]
+
+
+def test_held_out_episodes_play_the_boards_of_a_file_in_order(tmp_path):
+    lines = make_lines(3)
+    path = write_boards(tmp_path, lines[0], "", lines[1].replace("0", "."), f" {lines[2]} # hard")
+    domain = make("Sudoku4x8-10", Settings(boards=path))
+    adapter, first = domain.make_adapter(), seeds.UNSEEN
+    domain.held_out.check(range(first, first + 3))
+    for seed in range(3):
+        clues, solution = boards.draw(SMALL, seed)
+        np.testing.assert_array_equal(adapter.reset(first + seed).digits, clues)
+        np.testing.assert_array_equal(adapter.solution, solution - 1)
+    drawn = domain.demonstrations.collect(5, 0, lambda done: None).demonstrations
+    counts = [(demonstration.observations.digits[0] > 0).sum() for demonstration in drawn]
+    assert min(counts) >= 8  # training draws the level's boards
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1" * 15, "line 4: 15 characters, expected 16: the cells of a 4 by 4 board"),
+        ("5" + "0" * 15, "line 4: '5' is no cell of a board: expected 1 to 4, or 0 or . if open"),
+        ("11" + "0" * 14, "line 4: the board has no solution, expected exactly one; correct"),
+        ("." * 16, "line 4: the board has several solutions, expected exactly one; correct the"),
+    ],
+)
+def test_a_wrong_line_of_a_file_is_named(line, message, tmp_path, capsys):
+    path = write_boards(tmp_path, *make_lines(1), line)
+    options = f"--level Sudoku4x6 --boards {path} --episodes".split()
+    assert sudoku.main([*options, "2"]) == 2
+    error = capsys.readouterr().err
+    assert f"hard.txt, {message}" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--episodes", "4"],
+            "boards for 3 of the 4 episodes: play at most 3",
+        ),
+        (["--test-seed", "10000002", "--episodes", "2"], "has boards for 1 of the 2 episodes"),
+        (["--test-seed", "0", "--episodes", "2"], "has no level of seed 0 (--test-seed"),
+        (
+            ["--validation", "--episodes", "2"],
+            "test levels of the seeds from 10000000 on",
+        ),
+        (["--boards", "missing.txt"], "cannot read missing.txt"),
+        (["--boards", os.devnull], "cannot read /dev/null: not a file"),
+    ],
+)
+def test_episodes_that_a_file_does_not_have_are_refused(options, message, tmp_path, capsys):
+    path = write_boards(tmp_path, *make_lines(3))
+    assert sudoku.main(["--level", "Sudoku4x6", "--boards", str(path), *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_row_is_named_by_the_contents_of_a_file_and_a_network_is_not(tmp_path):
+    folders = [tmp_path / name for name in "abc"]
+    for folder, count in zip(folders, (3, 3, 2), strict=True):
+        folder.mkdir()
+        write_boards(folder, *make_lines(count))
+    options = "--level Sudoku4x6 --episodes 2".split()
+    plain, *configs = (
+        parse("sudoku", [*options, *each])[0]
+        for each in ([], *(["--boards", str(folder / "hard.txt")] for folder in folders))
+    )
+    names = [hash_config(config, 0) for config in (plain, *configs)]
+    assert names[1] == names[2] and len(set(names)) == 3
+    said = list_settings(configs[0], 0)["domain_settings"]["boards"]
+    assert said == make_domain(configs[0]).held_out.name and said.startswith("hard.txt ")
+    specified = [specify(config, 0, make_domain(config)) for config in (plain, *configs)]
+    assert len(set(map(describe_identity, specified))) == 1
+
+
 def test_data_that_solve_no_board_are_refused():
     source = make("Sudoku4x6", Settings()).demonstrations
     states = source.collect(1, 0, lambda done: None).demonstrations[0].observations
@@ -230,11 +396,15 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     (folder,) = (tmp_path / "runs").glob("sudoku-*")
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0
     assert sudoku.main([*toy, "--method", "rules"]) == 0
+    path = write_boards(tmp_path, *make_lines(2))
+    again = [*toy, "--checkpoint", str(folder), "--boards", str(path), "--episodes"]
+    assert sudoku.main([*again, "2", "--level", "Sudoku4x8"]) == 0
     rows = results.read(tmp_path / "runs" / "sudoku.jsonl")
     found = [(row["method"], results.name_planner(row)) for row in rows]
     assert found == [
         ("leap", "N = 16, confident"), ("leap", "N = 1"), ("leap", "N = 16, confident, rules 1.0"),
         ("rules", "N = 16, confident"), ("rules", "N = 1"),
+        ("leap", f"N = 16, confident, on {files.describe(path)}"),
     ]  # fmt: skip
     # Eight clues leave little open. What two steps have learned is next to nothing.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]

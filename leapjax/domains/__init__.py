@@ -5,7 +5,7 @@ import sys
 from typing import Any, NamedTuple
 
 from leapjax.checks import check_kind
-from leapjax.domain import Domain, DomainType
+from leapjax.domain import Domain, DomainType, drop_files
 from leapjax.errors import UserError
 from leapjax.extras import report_missing
 
@@ -45,6 +45,14 @@ DOMAINS: dict[str, DomainType | Place] = {
     "sudoku": Place(
         "leapjax.domains.puzzles.sudoku.domain", "SUDOKU", "train", "boards with one solution"
     ),
+    "countdown": Place(
+        "leapjax.domains.puzzles.countdown.domain", "COUNTDOWN", "train",
+        "reach a number with four operations on given numbers",
+    ),
+    "satisfiability": Place(
+        "leapjax.domains.puzzles.satisfiability.domain", "SATISFIABILITY", "train",
+        "formulas: find values that satisfy all clauses",
+    ),
 }  # fmt: skip
 
 
@@ -77,7 +85,7 @@ def make_level(name: str, level: str, settings: Any) -> Domain:
     """
     kind = find_domain(name)
     check_kind(settings, kind.settings)
-    return kind.make(level, settings)._replace(made_from=(name, settings))
+    return kind.make(level, settings)._replace(made_from=(name, drop_files(settings)))
 
 
 def check_imported(level: str, named_by: str) -> None:

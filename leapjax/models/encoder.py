@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax
 
 from leapjax.errors import UserError
-from leapjax.types import Context
+from leapjax.types import Context, PyTree
 
 
 class Encoder(nn.Module):
@@ -56,6 +56,26 @@ class Encoder(nn.Module):
 
         An encoder overrides this if an action means little without its neighbours.
         """
+        return tokens
+
+    def relate_positions(self, context: Context, horizon: int) -> PyTree:
+        """Returns what `exchange_messages` must know of a context, such as shared constraints.
+
+        It returns `()` by default.
+        """
+        del context, horizon
+        return ()
+
+    def exchange_messages(self, tokens: jax.Array, relations: PyTree) -> jax.Array:
+        """Returns the tokens `[T, D]` of a plan, changed by related tokens; here unchanged.
+
+        An encoder overrides this if it knows which positions constrain each other.
+
+        Args:
+            tokens: of actions, with the embeddings of their positions.
+            relations: result of `relate_positions`.
+        """
+        del relations
         return tokens
 
     def add_later_state(self) -> "Encoder":

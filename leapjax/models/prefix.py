@@ -10,7 +10,7 @@ from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.models.plans import check_plan, forbid_early_end, make_attention_mask
 from leapjax.models.transformer import KeysValues, Transformer, dense, embed
-from leapjax.types import Context
+from leapjax.types import Context, PyTree
 
 
 class Prefix(NamedTuple):
@@ -19,10 +19,12 @@ class Prefix(NamedTuple):
     Attributes:
         known: keys and values of the context's tokens, per layer.
         places: embeddings `[T, D]` of the positions of a plan.
+        relations: of the positions; see `Encoder.relate_positions`.
     """
 
     known: list[KeysValues]
     places: jax.Array
+    relations: PyTree = ()
 
 
 class PrefixModel(nn.Module):
@@ -33,7 +35,8 @@ class PrefixModel(nn.Module):
     conditioned on the return to go has an additional context token.
 
     The encoder may embed the positions of a plan (`encode_positions`); otherwise this network
-    learns an embedding of each. It may also mix the tokens of a plan's actions (`mix_actions`).
+    learns an embedding of each. It may also mix the tokens of a plan's actions (`mix_actions`), and
+    pass messages between related positions (`exchange_messages`).
 
     Attributes:
         config: size of the network.
@@ -85,7 +88,7 @@ class PrefixModel(nn.Module):
         places = self.context.encode_positions(context, self.sizes.horizon)
         if places is None:
             places = self.position(jnp.arange(self.sizes.horizon))
-        return Prefix(known, places)
+        return Prefix(known, places, self.context.relate_positions(context, self.sizes.horizon))
 
     def logits(
         self,
@@ -104,6 +107,7 @@ class PrefixModel(nn.Module):
         """
         check_plan(actions, self.sizes.horizon)
         tokens = self.context.mix_actions(self.action(actions)) + memory.places
+        tokens = self.context.exchange_messages(tokens, memory.relations)
         x = self.drop(tokens, deterministic=deterministic)
         cached = memory.known[0].keys.shape[0]
         mask = make_attention_mask(self.config, self.sizes.horizon, cached)

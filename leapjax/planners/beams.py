@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import BeamConfig, find_selection, make_commitment
-from leapjax.planners.guard import guard_shapes, is_undefined
+from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
 from leapjax.planners.positions import choose_open
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
 
@@ -125,7 +125,7 @@ def beam_search(
     passes = passes * width
     judged = beams.sums
     if config.judge == "energy":
-        judged = jax.vmap(lambda plan: energy.total(params, memory, plan))(beams.plans)
+        judged = compute_totals(energy, params, memory, beams.plans)
         valid &= ~jnp.any(is_undefined(judged))
         passes += width * horizon
     found = jnp.lexsort((judged, beams.dead))[0]

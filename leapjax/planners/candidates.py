@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import CrossEntropyConfig, ShootingConfig
-from leapjax.planners.guard import guard_shapes, is_undefined
+from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 
@@ -35,7 +35,7 @@ def random_shooting(
     energy = guard_shapes(energy)
     choices = _find_choices(energy, params, memory, config.horizon)
     plans = _draw_plans(key, choices, config.candidates)
-    energies = jax.vmap(lambda a: energy.total(params, memory, a))(plans)
+    energies = compute_totals(energy, params, memory, plans)
     best = jnp.argmin(energies)
     plan = Plan(
         plans[best],
@@ -60,7 +60,7 @@ def cross_entropy_method(
     choices = _find_choices(energy, params, memory, horizon)
 
     def score(plans: jax.Array) -> jax.Array:
-        return jax.vmap(lambda a: energy.total(params, memory, a))(plans)
+        return compute_totals(energy, params, memory, plans)
 
     def breed(
         carry: tuple[jax.Array, jax.Array], round_key: jax.Array

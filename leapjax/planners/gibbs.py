@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
-from leapjax.planners.guard import guard_shapes, is_undefined
+from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
 from leapjax.planners.positions import choose_open, compute_probabilities
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
@@ -38,9 +38,6 @@ def gibbs(
     energy = guard_shapes(energy)
     run = functools.partial(_run_chain, energy, params, memory, config=config)
 
-    def score(plans: jax.Array) -> jax.Array:
-        return jax.vmap(lambda actions: energy.total(params, memory, actions))(plans)
-
     if config.restarts == 1:
         chains = jax.tree.map(lambda leaf: leaf[None], run(key))
     else:
@@ -50,18 +47,18 @@ def gibbs(
     choices = candidates.shape[0] * candidates.shape[1]
     best, energies = jnp.zeros((), int), None
     if choices > 1 or config.score:
-        energies = score(candidates.reshape(choices, config.horizon))
+        energies = compute_totals(energy, params, memory, candidates.reshape(choices, -1))
         best = jnp.argmin(energies)
         valid &= ~jnp.any(is_undefined(energies))
         passes += choices * config.horizon
-    actions = candidates.reshape(choices, config.horizon)[best]
+    actions = candidates.reshape(choices, -1)[best]
     trace = traces[best // candidates.shape[1]]
     satisfied = energy.violation(params, memory, actions) <= 0
     plan = Plan(actions, trace, satisfied, valid, passes)
     if config.score and energies is not None:
         plan = plan._replace(energy=energies[best])
     if config.score_trace:
-        scores = score(trace)
+        scores = compute_totals(energy, params, memory, trace)
         plan = plan._replace(
             trace_energies=scores,
             valid=plan.valid & ~jnp.any(is_undefined(scores)),

@@ -1,10 +1,12 @@
-"""Checks the results of an energy, while a planner is traced and while it runs."""
+"""Evaluates an energy with checks of its results, and totals of many plans in little memory."""
 
 import jax
 import jax.numpy as jnp
 
 from leapjax.checks import check_floats, check_kind
 from leapjax.types import Energy, Params, PyTree
+
+SCORED_TOGETHER = 8  # totals of one context at a time: each may hold T copies of a plan
 
 
 def is_undefined(energies: jax.Array) -> jax.Array:
@@ -37,3 +39,14 @@ def guard_shapes(energy: Energy) -> Energy:
         return check_floats("violation of the energy", found, ())
 
     return energy._replace(conditional=conditional, total=total, violation=violation)
+
+
+def compute_totals(energy: Energy, params: Params, memory: PyTree, plans: jax.Array) -> jax.Array:
+    """Returns the total energies `[C]` of plans `[C, T]`, computed a few at a time."""
+
+    def total(actions: jax.Array) -> jax.Array:
+        return energy.total(params, memory, actions)
+
+    if plans.shape[0] <= SCORED_TOGETHER:
+        return jax.vmap(total)(plans)
+    return jax.lax.map(total, plans, batch_size=SCORED_TOGETHER)

@@ -17,7 +17,8 @@ from leapjax.presets import environments
 Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
 # A module of presets is imported when it is first used: it imports its domain.
-MODULES = {name: f"leapjax.presets.{name}" for name in ("babyai", "atari", "stars", "sudoku")}
+NAMES = ("babyai", "atari", "stars", "sudoku", "countdown", "satisfiability")
+MODULES = {name: f"leapjax.presets.{name}" for name in NAMES}
 PRESETS: dict[str, Mapping[str, Preset]] = {}  # presets of a user's own domains, by domain
 
 

@@ -1,12 +1,14 @@
 """Presets of puzzles: a plan is the whole solution, filled from its most certain position on."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from leapjax.configuration import AnyConfig
 from leapjax.presets import common
 
 EPISODES = 500
+Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
 
 class Puzzle(NamedTuple):
@@ -27,6 +29,19 @@ class Puzzle(NamedTuple):
     demonstrations: int
     settings: Any
     training: Mapping[str, Any]
+
+
+def make_presets(describe: Callable[[str, str], Puzzle]) -> tuple[Preset, Preset]:
+    """Makes the presets `paper` and `leapjax` of a puzzle.
+
+    Args:
+        describe: (level, method) -> numbers of the level, or UserError for an unknown level.
+    """
+
+    def make(preset: str, level: str, method: str) -> AnyConfig:
+        return configure(describe(level, method), method, preset)
+
+    return functools.partial(make, "paper"), functools.partial(make, "leapjax")
 
 
 def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:

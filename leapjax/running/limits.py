@@ -13,6 +13,7 @@ from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
+from leapjax.planners.guard import SCORED_TOGETHER
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
 from leapjax.running import loggers, memory
@@ -58,6 +59,8 @@ def check(config: AnyConfig) -> None:
             f"{config.level}: use {config.flag('level')} {recorded}"
         )
     domain = make_domain(config)
+    if domain.held_out is not None:
+        domain.held_out.check(choose_episode_seeds(config))
     made = config.demonstrations is None and config.checkpoint is None and config.demos > 0
     if made and domain.demonstrations.collect is None and domain.demonstrations.source is None:
         raise UserError(
@@ -151,10 +154,12 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         # A demonstration has at least two states.
         states = 2 * config.demos if source is None else source.amount
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation
-    # The planner makes plans in one batch. Scoring a restart or a candidate takes T passes.
+    # The planner makes plans in one batch, and scores restarts and candidates a few at a time, with
+    # T passes each.
     many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
     scored = (many > 1 and not hasattr(search, "beams")) or search.score
-    passes = many * (horizon if scored else 1)
+    scored |= getattr(search, "judge", "") == "energy" or getattr(search, "keep", "") == "best"
+    passes = max(many, min(many, SCORED_TOGETHER) * horizon if scored else 1)
     plans = min(PLANS_TOGETHER, config.episodes)
     choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
     drawn = getattr(search, "resampled", 1) * domain.num_actions + horizon

@@ -54,7 +54,7 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
         "experiment": run.experiment.name,
         "domain": config.domain,
         "level": config.level,
-        "played": run.domain.level,
+        "played": run.domain.held_out.name if run.domain.held_out else run.domain.level,
         "method": config.method,
         "preset": config.preset,
         "seed": run.seed,

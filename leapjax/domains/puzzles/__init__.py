@@ -1,1 +1,1 @@
-"""Puzzles whose whole solution is one plan: star graphs and Sudoku."""
+"""Puzzles whose whole solution is one plan: star graphs, Sudoku and Countdown."""

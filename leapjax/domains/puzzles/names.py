@@ -1,4 +1,4 @@
-"""Names of levels that hold two numbers, such as Star3x5 and Sudoku9x36."""
+"""Names of levels that hold numbers, such as Star3x5 and Sudoku9x36."""
 
 import re
 from collections.abc import Sequence
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from leapjax.errors import UserError, did_you_mean
 
 
-def read_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, int]:
-    """Reads the two numbers of a level's name, such as 3 and 5 of Star3x5.
+def read_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -> tuple[int, ...]:
+    """Reads the numbers of a level's name, such as 3 and 5 of Star3x5.
 
     Args:
         name: of the level.
-        pattern: a regular expression with a group for each number.
+        pattern: a regular expression with a group for each number; groups may be optional.
         expected: the form of names, for the message.
         known: examples of names.
 
@@ -24,4 +24,4 @@ def read_numbers(name: str, pattern: str, expected: str, known: Sequence[str]) -
             f"unknown level {name!r}: expected {expected}, such as "
             f"{', '.join(known)}{did_you_mean(name, known)}"
         )
-    return int(found[1]), int(found[2])
+    return tuple(int(number) for number in found.groups() if number is not None)

@@ -10,8 +10,8 @@ import numpy as np
 from flax.typing import Dtype
 
 from leapjax.checks import check_range, check_types
-from leapjax.data.solved import collect_solved
-from leapjax.domain import Augmentation, Augmentations, Demonstrations, Domain, DomainType
+from leapjax.domain import Augmentation, Augmentations, Domain, DomainType
+from leapjax.domains.puzzles.common import demonstrate
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
 from leapjax.errors import UserError
@@ -121,10 +121,7 @@ def make(name: str, settings: Settings) -> Domain:
         max_steps=star.length,
         blank=blank,
         encoders={"leapjax": tokens},
-        demonstrations=Demonstrations(
-            functools.partial(collect_solved, make_adapter, lambda adapter: adapter.path),
-            check=functools.partial(check_labels, labels=labels),
-        ),
+        demonstrations=demonstrate(make_adapter, functools.partial(check_labels, labels=labels)),
         augmentations=Augmentations(augmentations),
         signature={"length": star.length, "labels": labels},  # any number of arms
     )

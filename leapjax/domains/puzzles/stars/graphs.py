@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
+from leapjax.domains.puzzles.common import PuzzleAdapter
 from leapjax.domains.puzzles.names import read_numbers
-from leapjax.environments import Transition
 from leapjax.errors import UserError
 from leapjax.types import Array, Window
 
@@ -82,7 +82,7 @@ def draw(star: Star, seed: int) -> tuple[Graph, np.ndarray]:
     return Graph(rng.permutation(edges), names[0], path[-1]), path
 
 
-class StarAdapter:
+class StarAdapter(PuzzleAdapter[Graph]):
     """A star graph as the rollout sees it: an action is the label of the node to go to.
 
     A step along an edge is a step; any other ends the episode. At the goal it ends with success.
@@ -91,21 +91,16 @@ class StarAdapter:
     def __init__(self, star: Star) -> None:
         self.star = star
         self.num_actions = star.labels + 1
-        self.path = np.zeros(0, np.int32)  # of the current graph
 
-    def reset(self, seed: int) -> Graph:
-        """Draws the graph of a seed."""
-        self._graph, self.path = draw(self.star, seed)
-        return self._graph
+    def draw(self, seed: int) -> tuple[Graph, np.ndarray]:
+        """Draws the graph of a seed, and the path to its goal."""
+        return draw(self.star, seed)
 
-    def step(self, action: int) -> Transition:
+    def move(self, graph: Graph, action: int) -> tuple[Graph, bool | None]:
         """Goes to a node."""
-        before = self._graph
-        moved = bool((before.edges == (before.node, action)).all(axis=1).any())
-        if moved:
-            self._graph = before._replace(node=np.int32(action))
-        success = moved and action == before.goal
-        return Transition(self._graph, float(success), success or not moved, False, success)
+        if not (graph.edges == (graph.node, action)).all(axis=1).any():
+            return graph, False
+        return graph._replace(node=np.int32(action)), True if action == graph.goal else None
 
 
 def relabel(key: jax.Array, window: Window, labels: int) -> Window:

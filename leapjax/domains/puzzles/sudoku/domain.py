@@ -2,14 +2,15 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_range, check_types
-from leapjax.data.solved import collect_solved
-from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
+from leapjax.domain import Augmentations, Domain, DomainType
+from leapjax.domains.puzzles.common import PuzzleFile, demonstrate
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.rules import rules
@@ -21,14 +22,17 @@ from leapjax.types import Context
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Sudoku: augmentation.
+    """Sudoku: augmentation, and boards to play.
 
     Attributes:
         augment: Turn every training window into a window of another board, by symmetries that keep
             the rules.
+        boards: Text file of boards that the held-out episodes play in order, in place of drawn
+            boards. A line is a board, row by row; 0 or a dot is an open cell.
     """
 
     augment: bool = True
+    boards: Path | None = None
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -78,28 +82,35 @@ class BoardTokens(Encoder):
 
 
 def make(name: str, settings: Settings) -> Domain:
-    """Makes a level by name, such as Sudoku9x36.
+    """Makes a level by name, such as Sudoku9x36 or Sudoku9x31-42.
 
     Raises:
         UserError: there is no such level.
     """
-    size = boards.find_level(name)
-    make_adapter = functools.partial(SudokuAdapter, size)
-    turn = functools.partial(boards.transform, side=size.side)
+    level = boards.find_level(name)
+    side = level.side
+    make_adapter = functools.partial(SudokuAdapter, side)
+    draw_board = functools.partial(boards.draw, level)
+    file = None
+    if settings.boards is not None:
+        read = functools.partial(boards.read_board, side=side)
+        file = PuzzleFile(settings.boards, "boards", read)
+    turn = functools.partial(boards.transform, side=side)
     return Domain(
         level=name,
-        make_adapter=make_adapter,
-        actions=(*(str(1 + digit) for digit in range(size.side)), "end"),
-        max_steps=size.cells,
-        blank=Board(np.zeros(size.cells, np.int32), np.zeros((), np.int32)),
-        encoders={"leapjax": lambda model, context: BoardTokens(size.side, model.width)},
-        demonstrations=Demonstrations(
-            functools.partial(collect_solved, make_adapter, lambda board: board.solution - 1),
-            check=functools.partial(check_boards, side=size.side),
+        make_adapter=functools.partial(make_adapter, file.find if file else draw_board),
+        actions=(*(str(1 + digit) for digit in range(side)), "end"),
+        max_steps=level.cells,
+        blank=Board(np.zeros(level.cells, np.int32), np.zeros((), np.int32)),
+        encoders={"leapjax": lambda model, context: BoardTokens(side, model.width)},
+        demonstrations=demonstrate(
+            functools.partial(make_adapter, draw_board),  # training never sees the file
+            functools.partial(check_boards, side=side),
         ),
         augmentations=Augmentations([turn] if settings.augment else [], boards.make_puzzles),
-        rules=rules(size.side),
-        signature={"side": size.side, "clues": size.clues},
+        rules=rules(side),
+        signature={"side": side},  # any number of clues
+        held_out=file.held_out if file else None,
     )
 
 

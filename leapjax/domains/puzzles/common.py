@@ -1,0 +1,177 @@
+"""What puzzles share: an adapter, demonstrations, augmented windows, and files of puzzles."""
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from leapjax import files
+from leapjax.data.seeds import UNSEEN
+from leapjax.data.solved import collect_solved
+from leapjax.domain import Demonstrations, HeldOut
+from leapjax.environments import Transition
+from leapjax.errors import UserError
+from leapjax.types import Array, Demonstration, PyTree, Window, pad_token
+
+O = TypeVar("O")  # noqa: E741
+P = TypeVar("P")
+
+
+class PuzzleAdapter(abc.ABC, Generic[O]):
+    """A puzzle as the rollout sees it: a subclass draws puzzles and applies actions.
+
+    Attributes:
+        num_actions: A, the end action included.
+        solution: `[n]` actions that solve the current puzzle.
+    """
+
+    num_actions: int
+    solution: Array
+
+    @abc.abstractmethod
+    def draw(self, seed: int) -> tuple[O, Array]:
+        """Returns the first observation of a seed's puzzle, and the actions of a solution."""
+
+    @abc.abstractmethod
+    def move(self, observation: O, action: int) -> tuple[O, bool | None]:
+        """Returns the observation after an action.
+
+        The second value tells whether the puzzle is solved; `None` if the episode goes on.
+        """
+
+    def reset(self, seed: int) -> O:
+        """Draws the puzzle of a seed."""
+        self._observation, self.solution = self.draw(seed)
+        return self._observation
+
+    def step(self, action: int) -> Transition:
+        """Takes one action; a solved puzzle gives a reward of 1."""
+        self._observation, solved = self.move(self._observation, action)
+        success = bool(solved)
+        return Transition(self._observation, float(success), solved is not None, False, success)
+
+
+def demonstrate(
+    make_adapter: Callable[[], PuzzleAdapter], check: Callable[[PyTree, str], None]
+) -> Demonstrations:
+    """Makes the demonstrations of a puzzle: its solutions.
+
+    Args:
+        make_adapter: makes the environment.
+        check: (observations `[n + 1, ...]`, where) -> UserError if an episode solves no puzzle.
+    """
+    collect = functools.partial(collect_solved, make_adapter, lambda adapter: adapter.solution)
+    return Demonstrations(collect, check=check)
+
+
+def repeat(puzzle: PyTree, demonstration: Demonstration) -> PyTree:
+    """Repeats arrays for every step of a demonstration, as augmentations need them: `[n, ...]`."""
+    steps = len(demonstration.actions)
+    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (steps, *np.shape(leaf))), puzzle)
+
+
+def rewrite(
+    window: Window,
+    place: jax.Array,
+    solution: jax.Array,
+    observe: Callable[[jax.Array], PyTree],
+    end: int,
+) -> Window:
+    """Makes the window of another puzzle at the same place of its solution.
+
+    Args:
+        window: window to change.
+        place: `[]` number of actions that the solution has before the window.
+        solution: `[n]` all actions of the new puzzle's solution.
+        observe: (place) -> observation of the new puzzle after so many actions.
+        end: the end action.
+    """
+    length = solution.shape[0]
+    earlier = place + jnp.arange(-window.context.actions.shape[0], 0)
+    ahead = place + jnp.arange(window.actions.shape[0])
+
+    def read(places: jax.Array, otherwise: int) -> jax.Array:
+        inside = (places >= 0) & (places < length)
+        return jnp.where(inside, solution[jnp.clip(places, 0, length - 1)], otherwise)
+
+    def observe_past(place: jax.Array) -> PyTree:
+        return jax.tree.map(lambda leaf: jnp.where(place < 0, 0, leaf), observe(place))
+
+    context = window.context._replace(
+        observation=observe(place),
+        past=jax.vmap(observe_past)(earlier),
+        actions=read(earlier, pad_token(end + 1)),
+    )
+    return window._replace(context=context, actions=read(ahead, end))
+
+
+@dataclasses.dataclass(frozen=True)
+class PuzzleFile(Generic[P]):
+    """Puzzles of a text file, one a line. The first belongs to the first test episode.
+
+    Blank lines are skipped, and the rest of a line after #.
+
+    Attributes:
+        path: of the file.
+        kind: plural noun for the puzzles, such as "boards", for messages.
+        read: (text of a line) -> puzzle, or UserError.
+    """
+
+    path: Path
+    kind: str
+    read: Callable[[str], P]
+
+    @functools.cached_property
+    def lines(self) -> list[tuple[int, str]]:
+        """The number and the text of each line that holds a puzzle."""
+        found = files.read_text(self.path).split("\n")
+        texts = [line.partition("#")[0].strip() for line in found]
+        return [(number, text) for number, text in enumerate(texts, start=1) if text]
+
+    @property
+    def held_out(self) -> HeldOut:
+        """The file as levels that held-out episodes play."""
+        return HeldOut(files.describe(self.path), self.check)
+
+    def find(self, seed: int) -> P:
+        """Reads the puzzle of a level seed.
+
+        Raises:
+            UserError: the file has no puzzle for the seed, or its line cannot be read.
+        """
+        if not UNSEEN <= seed < UNSEEN + len(self.lines):
+            raise UserError(
+                f"{self.path} has {len(self.lines)} {self.kind}, which are the test levels of the "
+                f"seeds from {UNSEEN} on: it has no level of seed {seed}",
+                "test_seed", "validation",
+            )  # fmt: skip
+        number, text = self.lines[seed - UNSEEN]
+        try:
+            return self.read(text)
+        except UserError as error:
+            raise UserError(
+                f"{self.path}, line {number}: {error}; correct the line, or put # before it"
+            ) from None
+
+    def check(self, level_seeds: range) -> None:
+        """Checks that the file has a puzzle for each level seed.
+
+        Raises:
+            UserError: see `find`.
+        """
+        self.find(level_seeds[0])
+        possible = UNSEEN + len(self.lines) - level_seeds[0]
+        if len(level_seeds) > possible:
+            raise UserError(
+                f"{self.path} has {self.kind} for {possible} of the {len(level_seeds)} episodes: "
+                f"play at most {possible}, or give a longer file",
+                "episodes",
+            )
+        for seed in level_seeds:
+            self.find(seed)

@@ -1,0 +1,311 @@
+"""Countdown: the verifier and the search agree with brute force; targets of tests are new."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from experiments import countdown
+from experiments.common import searches
+from leapjax.agents.base import Setup
+from leapjax.data import seeds, windows
+from leapjax.domain import blank_context
+from leapjax.domains.puzzles.countdown import problems
+from leapjax.domains.puzzles.countdown.domain import Settings, make
+from leapjax.domains.puzzles.countdown.problems import (
+    DIVIDE,
+    END,
+    LARGEST,
+    MINUS,
+    OPEN,
+    PLUS,
+    TIMES,
+    CountdownAdapter,
+    Level,
+)
+from leapjax.errors import UserError
+from leapjax.methods import find_method
+from leapjax.models.config import ModelConfig
+from leapjax.presets import find_preset
+from leapjax.running import results
+from leapjax.types import pad_token
+from tests.parameters import random_parameters
+from tests.programs import only_long
+
+same = np.testing.assert_array_equal
+
+
+def apply(a, operation, b):
+    """The result of an operation in exact arithmetic; `None` if the rules forbid it."""
+    if operation == PLUS:
+        return a + b
+    if operation == MINUS:
+        return a - b if a >= b else None
+    if operation == TIMES:
+        return a * b
+    return a // b if b > 0 and a % b == 0 else None
+
+
+def enumerate_solutions(numbers):
+    """Every solution of every target: the tokens, by brute force over all orders."""
+    if len(numbers) == 1:
+        yield []
+        return
+    for one, other in itertools.permutations(range(len(numbers)), 2):
+        rest = [n for place, n in enumerate(numbers) if place not in (one, other)]
+        for operation in (PLUS, MINUS, TIMES, DIVIDE):
+            a, b = numbers[one], numbers[other]
+            result = apply(a, operation, b)
+            if result is not None and result <= LARGEST:
+                for others in enumerate_solutions([*rest, result]):
+                    yield [a, operation, b, result, *others]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(st.integers(1, 99), min_size=2, max_size=3) | st.lists(
+    st.integers(1, 12), min_size=4, max_size=4))  # fmt: skip
+def test_the_search_finds_a_solution_where_brute_force_does(numbers):
+    reached = {tokens[-1] for tokens in enumerate_solutions(numbers)}
+    for target in range(101):
+        found = problems.solve(numbers, target)
+        assert (found is not None) == (target in reached)
+        if found is not None:
+            assert problems.is_solution(numbers, target, list(itertools.chain(*found)))
+            assert found == problems.solve(numbers[::-1], target)
+            assert all(a >= b for a, _, b, _ in found)
+
+
+@pytest.mark.parametrize("numbers", [[2, 3], [4, 4], [6, 3, 2], [5, 5, 1], [1, 1, 1]])
+def test_the_verifier_accepts_every_solution_and_nothing_else(numbers):
+    every = {tuple(tokens) for tokens in enumerate_solutions(numbers)}
+    assert all(problems.is_solution(numbers, tokens[-1], tokens) for tokens in every)
+    operations, most = (PLUS, MINUS, TIMES, DIVIDE), max(max(t[:1] + t[2:4]) for t in every)
+    equations = itertools.product(range(most + 2), operations, range(most + 2), range(most + 2))
+    for equation in equations if len(numbers) == 2 else ():
+        assert problems.is_solution(numbers, equation[-1], equation) == (equation in every)
+    rng = np.random.default_rng(0)
+    tokens = [*range(most + 2), *operations, END]
+    for solution in every:  # with one token changed
+        changed = list(solution)
+        changed[rng.integers(len(changed))] = int(rng.choice(tokens))
+        legal = problems.is_solution(numbers, changed[-1], changed)
+        assert legal == (tuple(changed) in every)
+        assert not problems.is_solution(numbers, solution[-1] + 1, solution)
+        assert not problems.is_solution(numbers, solution[-1], solution[:-1])
+
+
+@pytest.mark.parametrize("name", ["Countdown3", "Countdown4", "Countdown5"])
+def test_a_drawn_problem_has_the_solution_that_is_drawn(name):
+    level, kinds = problems.find_level(name), set()
+    for seed in range(12):
+        problem, solution = problems.draw(level, seed)
+        numbers, target = problem.numbers.tolist(), int(problem.target)
+        assert len(numbers) == level.numbers and len(solution) == level.length
+        assert min(numbers) >= 1 and max(numbers) <= 99 and 10 <= target <= 100
+        assert problems.is_solution(numbers, target, solution.tolist())
+        same(problem.written, [OPEN] * level.length)
+        kinds.add((*numbers, target))
+        again, _ = problems.draw(level, seed)
+        same(again.numbers, numbers)
+    assert len(kinds) == 12
+
+
+def test_training_validation_and_test_share_no_target():
+    first = (0, 10_000_000, seeds.VALIDATION_START, seeds.TRAINING_START)
+    test, also_test, validation, training = (set(problems.list_targets(seed)) for seed in first)
+    assert test == also_test and test | validation | training == set(range(10, 101))
+    assert len(test) == len(validation) == 8 and len(training) == 75
+    for last_digits in ({target % 10 for target in of} for of in (test, validation)):
+        assert len(last_digits) == 8
+    for seed in (*range(30), *range(seeds.TRAINING_START, seeds.TRAINING_START + 30)):
+        problem, _ = problems.draw(Level(3), seed)
+        assert int(problem.target) in (training if seed >= seeds.TRAINING_START else test)
+    collected = collect("Countdown3", 20)
+    assert {int(each.observations.target[0]) for each in collected} <= training
+
+
+def play(adapter, seed, tokens):
+    adapter.reset(seed)
+    return [adapter.step(int(token)) for token in tokens]
+
+
+def test_any_solution_is_rewarded_and_an_illegal_token_is_the_last():
+    adapter, level = CountdownAdapter(Level(3)), Level(3)
+    problem, solution = problems.draw(level, 3)
+    numbers, target = problem.numbers.tolist(), int(problem.target)
+    ways = [t for t in enumerate_solutions(numbers) if t[-1] == target]
+    assert solution.tolist() in ways and len(ways) > 1
+    for way in ways:
+        steps = play(adapter, 3, way)
+        found = [(step.reward, step.terminated, step.success) for step in steps]
+        assert found == [(0, False, False)] * 7 + [(1, True, True)]
+        same(steps[-1].observation.written, way)
+    # Legal equations that reach another number.
+    other = next(t for t in enumerate_solutions(numbers) if t[-1] != target)
+    *before, last = play(adapter, 3, other)
+    assert not any(step.terminated for step in before)
+    assert last.terminated and not last.success and last.reward == 0
+    adapter.reset(3)
+    for wrong in (PLUS, END, next(n for n in range(1, 100) if n not in numbers)):
+        adapter.reset(3)
+        step = adapter.step(wrong)
+        assert step.terminated and not step.success and step.observation.place == 0
+    result = solution.copy()
+    result[3] += 1  # the sum is wrong
+    assert [step.terminated for step in play(adapter, 3, result[:4])] == [False] * 3 + [True]
+
+
+def collect(name, count):
+    domain = make(name, Settings())
+    return domain.demonstrations.collect(count, 0, lambda done: None).demonstrations
+
+
+@functools.cache
+def reordered(numbers):
+    """The window at a place of a demonstration, its solution in another order: compiled once."""
+    data, level = collect(f"Countdown{numbers}", 4), Level(numbers)
+    steps = windows.concatenate(data, problems.repeat_solution)
+    steps = jax.tree.map(jnp.asarray, steps)
+    cut = functools.partial(windows.window, steps, context=2, horizon=level.length, end=END)
+    return data, jax.jit(lambda key, index: problems.reorder(key, cut(index)))
+
+
+@pytest.mark.parametrize("numbers", [3, 4, 5])
+@pytest.mark.parametrize("place", [0, 1, 6])
+def test_a_reordered_window_solves_the_same_problem(numbers, place):
+    (data, change), level, seen = reordered(numbers), Level(numbers), set()
+    for seed, episode in itertools.product(range(8), range(4)):
+        index = episode * level.length + place
+        window = jax.device_get(change(jax.random.key(seed), index))
+        problem, past = window.context.observation, window.context.past
+        before = data[episode].observations
+        same(problem.numbers, before.numbers[0])
+        assert (problem.target, problem.place) == (before.target[0], place)
+        rest = level.length - place
+        solution = [*problem.written[:place].tolist(), *window.actions[:rest].tolist()]
+        given, target = problem.numbers.tolist(), int(problem.target)
+        assert problems.is_solution(given, target, solution)
+        same(problem.written[place:], OPEN)
+        same(window.actions[rest:], END)
+        # The same operations on the same numbers.
+        equations = [sorted(part) for part in np.reshape(solution, (-1, 4)).tolist()]
+        old = data[episode].actions.reshape(-1, 4).tolist()
+        assert sorted(equations) == sorted(map(sorted, old))
+        for back in (1, 2):
+            if back > place:
+                assert window.context.actions[-back] == pad_token(END + 1)
+                assert not past.numbers[-back].any() and not past.written[-back].any()
+                continue
+            assert window.context.actions[-back] == solution[place - back]
+            same(past.written[-back][: place - back], solution[: place - back])
+            same(past.written[-back][place - back :], OPEN)
+            assert past.place[-back] == place - back
+        seen.add((episode, *solution))
+    assert len(seen) > 4 + (numbers > 3)  # episodes: one order for some, several for others
+
+
+def test_independent_equations_change_places_and_others_do_not():
+    level = Level(4)
+    blank = blank_context(make("Countdown4", Settings()), 0)
+
+    def orders(*equations):
+        solution = np.array(equations, np.int32).reshape(-1)
+        numbers = np.zeros(4, np.int32)
+        problem = problems.Problem(numbers, np.int32(0), np.full(12, OPEN), np.int32(0))
+        window = windows.Window(
+            blank._replace(observation=problem), solution, np.ones(12, bool), 0.0, solution
+        )
+        window = jax.tree.map(jnp.asarray, window)
+        change = jax.jit(jax.vmap(lambda key: problems.reorder(key, window).actions))
+        found = np.asarray(change(jax.random.split(jax.random.key(0), 64)))
+        assert found.shape == (64, level.length)
+        return {tuple(each[3::4].tolist()) for each in found}, len(np.unique(found, axis=0))
+
+    independent = orders((9, MINUS, 2, 7), (8, TIMES, 3, 24), (24, PLUS, 7, 31))
+    assert independent == ({(7, 24, 31), (24, 7, 31)}, 2 * 4)
+    chain = orders((9, MINUS, 2, 7), (7, TIMES, 3, 21), (21, DIVIDE, 1, 21))
+    assert chain == ({(7, 21, 21)}, 2)
+
+
+def test_the_order_of_the_given_numbers_means_nothing_to_the_network():
+    config = find_preset("countdown", "Countdown3", "leap", "leapjax")
+    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
+    domain = make("Countdown3", Settings())
+    horizon = config.planner.horizon
+    setup = Setup(domain, 0, horizon, model, config.training, config.method_settings)
+    agent = find_method("leap").make_agent(setup, None)
+    params, context = random_parameters(agent), blank_context(domain, 0)
+    problem, _ = problems.draw(Level(3), 0)
+    blank = np.full(horizon, domain.num_actions)
+
+    @jax.jit
+    def energies(problem):
+        memory = agent.energy.encode(params, context._replace(observation=problem))
+        return agent.energy.conditional(params, memory, blank, np.arange(horizon))
+
+    found = energies(problem)
+    shuffled = problem._replace(numbers=problem.numbers[::-1])
+    np.testing.assert_allclose(energies(shuffled), found, rtol=1e-4)
+    other = problem._replace(target=problem.target + 1)
+    assert np.abs(energies(other) - found)[np.isfinite(found)].max() > 1e-4
+
+
+def test_the_network_has_less_than_a_million_parameters():
+    config = find_preset("countdown", "Countdown5", "leap", "leapjax")
+    domain = make("Countdown5", Settings())
+    horizon = config.planner.horizon
+    setup = Setup(domain, 0, horizon, config.model, config.training, config.method_settings)
+    agent = find_method("leap").make_agent(setup, None)
+    params = jax.eval_shape(agent.init, jax.random.key(0)).params
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Countdown", "unknown level 'Countdown': expected Countdown<3 to 5 numbers>"),
+        ("Countdown6", "expected Countdown<3 to 5 numbers>, such as Countdown3, Countdown4"),
+        ("countdown4", "did you mean Countdown4"),
+    ],
+)
+def test_unknown_levels_are_refused(name, message):
+    with pytest.raises(UserError, match=message):
+        problems.find_level(name)
+
+
+def test_data_that_solve_no_problem_are_refused():
+    source = make("Countdown3", Settings()).demonstrations
+    (one,) = source.collect(1, 0, lambda done: None).demonstrations
+    states = one.observations
+    source.check(states, "here")
+    written = states.written.copy()
+    written[:, 7] = np.where(written[:, 7] == OPEN, OPEN, 0)
+    for wrong, message in (
+        (states._replace(numbers=states.numbers + 99), "here: numbers run from .* expected 1 to"),
+        (states._replace(written=states.written + 1), "here: written tokens run from"),
+        (jax.tree.map(lambda x: x[:5], states), "here does not write 8 tokens"),
+        (states._replace(place=states.place[::-1]), "one after the other"),
+        (states._replace(target=states.target + 1), "here does not solve its problem"),
+        (states._replace(written=written), "here does not solve its problem"),
+    ):
+        with pytest.raises(UserError, match=message):
+            source.check(wrong, "here")
+
+
+@only_long
+def test_the_program_trains_and_plans(tmp_path, monkeypatch, quick_begin):
+    monkeypatch.chdir(tmp_path)
+    (only,) = (search for search in searches.SEARCHES if search.name == "all at once")
+    monkeypatch.setattr(searches, "SEARCHES", (only,))
+    toy = "--level Countdown3 --episodes 4 --no-pictures --steps 2 --demos 4 --batch 2".split()
+    network = "--width 8 --heads 2 --layers 1".split()
+    assert countdown.main([*toy, *network]) == 0
+    assert countdown.main([*toy, *network, "--method", "bc"]) == 0
+    rows = results.read(tmp_path / "runs" / "countdown.jsonl")
+    found = [(row["method"], results.name_planner(row)) for row in rows]
+    assert found == [("leap", "N = 8, confident"), ("leap", "N = 1"), ("bc", "N = 1, confident")]
