@@ -103,7 +103,10 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
     """
     properties = ANALYSES["properties"]
     return {
-        "results": (functools.partial(babyai.compare_settings, settings=babyai.PRESETS), "babyai"),
+        "results": (
+            functools.partial(babyai.compare_settings, settings=babyai.BESIDE_CLONING),
+            "babyai",
+        ),
         "iterations": (babyai.compare_iterations, "babyai"),
         "methods": (babyai.compare_methods, "babyai"),
         "price": (functools.partial(babyai.compare_prices, measured=rows["methods"]), "babyai"),

@@ -6,6 +6,7 @@ from pathlib import Path
 from experiments import report
 from experiments.common import figures
 from experiments.tables import babyai, puzzles
+from experiments.tables.cells import format_beside, format_rate
 from leapjax.configuration import hash_config
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
@@ -44,7 +45,7 @@ def cells(table, level):
 def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_again():
     found = cells(babyai.compare_settings(ROWS, babyai.SETTINGS), "S8N7")
     assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
-    assert found[4].startswith("95.0% [") and found[4].endswith("2 seeds")
+    assert found[4] == "95.0% (90.0, 100.0), 2 seeds"
     assert found[5] == "-"
 
 
@@ -59,6 +60,15 @@ def test_settings_are_kept_apart():
     assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
 
 
+def test_an_interval_beside_the_published_number_is_marked():
+    rows = [row(rate=0.9), row(seed=1, rate=0.9), row(seed=2, rate=0.9)]
+    plain = format_rate(rows)
+    assert plain.startswith("90.0% [") and plain.endswith("], 3 seeds")
+    marks = [format_beside(rows, published).removeprefix(plain) for published in (80, 90, 99, None)]
+    assert marks == [" ↑", "", " ↓", ""]
+    assert format_rate([]) == format_beside([], 50) == "-"
+
+
 def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     rows = [
         row(rate=0.9), row(method="bc", rate=1.0), row(method="bc", seed=1, rate=0.9),
@@ -66,20 +76,20 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
         row(method="dt", steps=1, rate=1.0),  # not the preset's
     ]  # fmt: skip
     lines = babyai.compare_methods(rows).splitlines()[2:]
-    found = {line[2]: line[3:] for line in ([c.strip() for c in x.split("|")] for x in lines)}
-    assert list(found) == ["the paper", "preset paper", "preset leapjax"]  # of one level
-    assert found["the paper"][:-1] == [
-        "-", "61.5%", "63.0%", "71.5%", "63.5%", "45.0%", "81.5%", "**95.0%**",
-    ]  # fmt: skip
-    told = [cell.split("%")[0] for cell in found["preset leapjax"]]
-    assert told[:-1] == ["-", "**95.0", *"-----", "90.0"]
+    found = {line[2]: line[3:-1] for line in ([c.strip() for c in x.split("|")] for x in lines)}
+    assert len(lines) == len(found) and tuple(found) == babyai.COMPARED  # of one level
+    published = [of[0] for of in found.values()]
+    assert published == ["-", "61.5%", "63.0%", "71.5%", "63.5%", "45.0%", "81.5%", "95.0%"]
+    assert found["bc"][1].startswith("**20.0% [") and found["bc"][1].endswith("1 seed ↓**")
+    told = [of[3].split("%")[0] for of in found.values()]
+    assert told == ["-", "**95.0", *"-----", "**90.0"]  # of bc with two seeds, and of leap
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
     names, found = babyai.COMPARED, babyai.compute_success_by_method(rows)
     figures.draw_methods(found, names, tmp_path / "methods.png")
     assert (tmp_path / "methods.png").stat().st_size > 5_000
     everywhere = [row(level, method="bc", rate=0.5) for level in LEVELS]
     aggregated = babyai.compute_aggregates([*everywhere, row("PickUpLoc")])
-    assert list(aggregated) == ["LEAP, the paper's numbers", "bc, leapjax"]  # not of one level
+    assert list(aggregated) == ["LEAP, published", "bc, preset `leapjax`"]  # not of one level
     figures.draw_intervals(aggregated, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 

@@ -70,7 +70,8 @@ def draw_methods(
         axis.set_title(level, fontsize=9)
     if rates:
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        titles = [label.replace("`", "") for label in labels]
+        figure.legend(handles, titles, loc="outside lower center", ncols=len(titles))
     plots.save(figure, path)
 
 
@@ -81,13 +82,13 @@ def draw_intervals(found: dict[str, tuple[float, float, float]], path: Path) -> 
         found: score and bounds of its interval in percent, by label.
         path: file to write.
     """
-    figure, axis = plt.subplots(figsize=(6, 0.8 + 0.35 * len(found)), layout="constrained")
+    figure, axis = plt.subplots(figsize=(7, 0.8 + 0.35 * len(found)), layout="constrained")
     for place, (score, low, high) in enumerate(reversed(found.values())):
         axis.barh(place, high - low, left=low, height=0.5, color="C0", alpha=0.6)
         axis.plot([score, score], [place - 0.3, place + 0.3], color="black")
     axis.set_yticks(range(len(found)), [label.replace("`", "") for label in reversed(found)])
     axis.set(xlim=(0, 102))
-    axis.set_xlabel("interquartile mean of success (%), and its 95% interval", fontsize=9)
+    axis.set_xlabel("interquartile mean of success (%), 95% interval", fontsize=9)
     axis.grid(axis="x", alpha=0.3)
     plots.save(figure, path)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
 from experiments.common.cases import Analysis, select_rows
-from experiments.tables.cells import compute_milliseconds, format_rate, make_table
+from experiments.tables.cells import compute_milliseconds, format_beside, make_table
 from leapjax.running.results import Row
 
 ANALYSES = {
@@ -12,8 +12,9 @@ ANALYSES = {
     for program in (properties, stochastic, suboptimal, ablation)
 }
 PRESETS = ("paper", "leapjax")
-# One way for each method: LEAP executes whole plans, DT and IQL choose single actions.
-AS_THE_PAPER = ("whole plan", "leap", "sum", "dt", "iql")
+# One way for each method: LEAP executes whole plans, DT and IQL choose single actions. Sums stand
+# beside one of their parts.
+AS_THE_PAPER = ("whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql")
 OF_THE_PAPER = ("adaptation", "generalization", "composition")
 EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))
 ERRANDS = ("constraints-errand", "constraints-detour")
@@ -49,22 +50,26 @@ def compare_ways(
                 if not way.name.startswith(way.method):
                     planner = f"{way.method}: {way.name}"
                 paper = "-" if way.paper is None else f"{way.paper:.1f}%"
-                lines.append(
-                    [case.name, planner, paper, *(_format_cell(of, mine) for mine in found)]
-                )
-    return make_table(
-        " | ".join(["case", "planner", "paper", *(f"`{each}`" for each in PRESETS)]), lines
-    )
+                cells = [
+                    _format_cell(of, mine, way.paper if preset == "paper" else None)
+                    for preset, mine in zip(PRESETS, found, strict=True)
+                ]
+                lines.append([case.name, planner, paper, *cells])
+    presets = (f"preset `{each}`" for each in PRESETS)
+    return make_table(" | ".join(["case", "planner", "published", *presets]), lines)
 
 
-def _format_cell(of: Analysis, rows: Sequence[Row]) -> str:
-    """Formats the success of rows, one for each seed, with time and violations if there are any."""
-    cell = format_rate(rows)
+def _format_cell(of: Analysis, rows: Sequence[Row], published: float | None) -> str:
+    """Formats the success of rows, one for each seed, with time and violations if there are any.
+
+    Marks a success that differs from a published number, see `format_beside`.
+    """
+    cell = format_beside(rows, published)
     if rows and of.timed:
         cell += f", {compute_milliseconds(rows):.1f} ms"
     violations = sum(row["violations"] or 0 for row in rows)
     if violations:
-        cell += f", {violations / sum(row['episodes'] for row in rows):.2f} violations"
+        cell += f", {violations / sum(row['episodes'] for row in rows):.2f} violations an episode"
     return cell
 
 

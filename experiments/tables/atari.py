@@ -59,12 +59,15 @@ def compare_scores(rows: Sequence[Row], data: Mapping[str, Any]) -> str:
         papers = {title: f"{score:.1f}" for title, score in theirs.items()}
         few = data.get(name, ())
         many = data.get(name_data(name, PAPER_TRANSITIONS), ())
-        found = {"paper": papers}
-        found["ours"], found["score"] = _format_scores(rows, name, COLUMNS, few)
-        found["ours, preset `paper`"], found["its score"] = _format_scores(rows, name, LARGE, many)
-        found["the same, temperature 0.1"], found["that score"] = _format_scores(
-            rows, name, COLD, many
+        found = {"published": papers}
+        found["preset `leapjax`"], found["preset `leapjax`: raw score"] = _format_scores(
+            rows, name, COLUMNS, few
         )
+        for setting, columns_of in (("", LARGE), (", temperature 0.1", COLD)):
+            title = f"preset `paper`{setting}"
+            found[title], found[f"{title}: raw score"] = _format_scores(
+                rows, name, columns_of, many
+            )
         for what, by_title in found.items():
             if by_title:
                 lines.append([name, what, *(by_title.get(title, "-") for title in columns)])

@@ -1,13 +1,15 @@
 """The BabyAI tables: every setting of LEAP, and every method."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from experiments.paper import list_success
 from experiments.tables.cells import (
     collect_outcomes,
+    compute_interval,
     compute_mean_rate,
+    format_beside,
     format_rate,
     format_with_interval,
     make_table,
@@ -19,6 +21,12 @@ from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
 PRESETS = {"preset `paper`": PAPER, "preset `leapjax`": OURS}
+BESIDE_CLONING = {
+    "LEAP, preset `paper`": PAPER,
+    "cloning, preset `paper`": Setting("paper", "bc"),
+    "LEAP, preset `leapjax`": OURS,
+    "cloning, preset `leapjax`": Setting("leapjax", "bc"),
+}
 SETTINGS = {
     "random": Setting("leapjax", "random"),
     **PRESETS,
@@ -33,12 +41,11 @@ NOISE = {
     **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
     "plate": {"beams": 1, "temperature": 4.0},
 }
+NOISY = "preset `paper`, noise"
 BY_METHOD = {
-    "preset paper": {method: Setting("paper", method) for method in COMPARED},
-    "preset paper, noise": {
-        method: Setting("paper", method).searching(**noise) for method, noise in NOISE.items()
-    },
-    "preset leapjax": {method: Setting("leapjax", method) for method in COMPARED},
+    "preset `paper`": {method: Setting("paper", method) for method in COMPARED},
+    NOISY: {method: Setting("paper", method).searching(**noise) for method, noise in NOISE.items()},
+    "preset `leapjax`": {method: Setting("leapjax", method) for method in COMPARED},
 }
 ITERATIONS = (1, 2, 5, 10, 15, 30)  # includes T and N of every level
 ITERATED = {
@@ -85,7 +92,7 @@ def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting]) -> st
     middles = [compute_middle(rows, setting) for setting in settings.values()]
     cells = ["-" if each is None else format_with_interval(*each) for each in middles]
     lines.append(["interquartile mean", f"{compute_paper_middle():.1f}%", *cells])
-    return make_table(" | ".join(["level", "paper", *settings]), lines)
+    return make_table(" | ".join(["level", "published", *settings]), lines)
 
 
 def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
@@ -96,15 +103,15 @@ def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, flo
     paper = compute_paper_middle()
     executed = "`leapjax`, `--executed 3`"
     named = {"random": SETTINGS["random"]} | {
-        f"{method}, {preset.removeprefix('preset ')}": setting
+        f"{method}, {preset}": setting
         for preset, by_method in BY_METHOD.items()
         for method, setting in by_method.items()
         if method != "random"
     }
-    named[f"leap, {executed}"] = SETTINGS[executed]
+    named["leap, preset `leapjax`, 3 executed"] = SETTINGS[executed]
     found = {title: compute_middle(rows, setting) for title, setting in named.items()}
     known = {title: each for title, each in found.items() if each is not None}
-    return {"LEAP, the paper's numbers": (paper, paper, paper), **known}
+    return {"LEAP, published": (paper, paper, paper), **known}
 
 
 def compute_paper_middle() -> float:
@@ -152,25 +159,35 @@ def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Ro
 
 
 def compare_methods(rows: Sequence[Row]) -> str:
-    """Tabulates success rates of every method, for the paper and both presets; best in bold."""
+    """Tabulates success rates of every method, published and with both presets.
+
+    Bold cells are the best of a preset, with or without noise, and cells whose intervals overlap
+    the best's interval.
+    """
     lines = []
     for level, by_preset in group_by_method(rows).items():
-        theirs = list_success(level)
-        cells = {name: f"{percent:.1f}%" for name, percent in theirs.items()}
-        lines.append([level, "the paper", *_mark_best(theirs, cells)])
-        for preset, by_method in by_preset.items():
-            ours = {name: compute_mean_rate(of) for name, of in by_method.items()}
-            cells = {name: format_rate(of) for name, of in by_method.items()}
-            if cells:
-                lines.append([level, preset, *_mark_best(ours, cells)])
-    return make_table("level | | " + " | ".join(COMPARED), lines)
+        best = {preset: _find_best(by_method.values()) for preset, by_method in by_preset.items()}
+        best["preset `paper`"] = best[NOISY] = _find_best([best["preset `paper`"], best[NOISY]])
+        for method in COMPARED:
+            published = list_success(level).get(method)
+            cells = ["-" if published is None else f"{published:.1f}%"]
+            for preset, by_method in by_preset.items():
+                of = by_method.get(method, [])
+                cell = format_beside(of, published if preset == "preset `paper`" else None)
+                cells.append(f"**{cell}**" if of and _overlap(of, best[preset]) else cell)
+            lines.append([level, method, *cells])
+    return make_table(" | ".join(["level", "method", "published", *BY_METHOD]), lines)
 
 
-def _mark_best(rates: Mapping[str, float], cells: Mapping[str, str]) -> list[str]:
-    """Returns the cell of every method, with the best rates in bold."""
-    best = max(rates.values(), default=None)
-    bold = {name: f"**{cell}**" for name, cell in cells.items() if rates[name] == best}
-    return [{**cells, **bold}.get(name, "-") for name in COMPARED]
+def _find_best(groups: Iterable[list[Row]]) -> list[Row]:
+    """Returns the group of rows with the highest mean success; [] if all are empty."""
+    return max(filter(None, groups), key=compute_mean_rate, default=[])
+
+
+def _overlap(rows: Sequence[Row], others: Sequence[Row]) -> bool:
+    """Tells whether the intervals of two groups of rows overlap."""
+    (low, high), (other_low, other_high) = compute_interval(rows), compute_interval(others)
+    return low <= other_high and other_low <= high
 
 
 def group_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[Row]]]]:
@@ -187,9 +204,9 @@ def group_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, list[R
 
 
 def compute_success_by_method(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Computes success in percent by level, source (the paper or a preset) and method."""
+    """Computes success in percent by level, source (published or a preset) and method."""
     return {
-        level: {"the paper": list_success(level)}
+        level: {"published": list_success(level)}
         | {
             preset: {name: compute_mean_rate(of) for name, of in by_method.items()}
             for preset, by_method in by_preset.items()
@@ -215,6 +232,6 @@ def compare_prices(rows: Sequence[Row], measured: Sequence[Row]) -> str:
     methods = [name for name in COMPARED if name != "random"]
     lines = []
     for level, by_preset in group_by_method(known).items():
-        first = {name: cell(row) for name, (row,) in by_preset["preset leapjax"].items()}
+        first = {name: cell(row) for name, (row,) in by_preset["preset `leapjax`"].items()}
         lines.append([level, *(first.get(name, "-") for name in methods)])
     return make_table("level | " + " | ".join(methods), lines)

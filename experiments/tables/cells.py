@@ -11,14 +11,36 @@ Columns = Mapping[str, str | Callable[[Row], str]]
 
 
 def format_rate(rows: Sequence[Row]) -> str:
-    """Formats the mean success of rows, one for each seed, with its interval and their number."""
+    """Formats the mean success of rows, one for each seed, with its interval and their number.
+
+    Two seeds tell little about the spread of seeds, so their cell has both rates, without an
+    interval.
+    """
     if not rows:
         return "-"
-    _, (low, high) = scores.aggregate([collect_outcomes(rows)])
-    said = format_with_interval(compute_mean_rate(rows), 100 * low, 100 * high)
+    mean = compute_mean_rate(rows)
+    if len(rows) == 2:
+        low, high = sorted(compute_mean_rate([row]) for row in rows)
+        return f"{mean:.1f}% ({low:.1f}, {high:.1f}), 2 seeds"
+    said = format_with_interval(mean, *compute_interval(rows))
     if rows[0]["method"] == "rules":  # has no training seeds
         return said
     return f"{said}, {len(rows)} seed{'s' if len(rows) > 1 else ''}"
+
+
+def format_beside(rows: Sequence[Row], published: float | None) -> str:
+    """Formats a rate as `format_rate`; marks an interval above or below the published number."""
+    cell = format_rate(rows)
+    if not rows or published is None:
+        return cell
+    low, high = compute_interval(rows)
+    return cell + " ↑" * (low > published) + " ↓" * (high < published)
+
+
+def compute_interval(rows: Sequence[Row]) -> tuple[float, float]:
+    """Computes the 95% interval of the success of rows, one for each seed, in percent."""
+    _, (low, high) = scores.aggregate([collect_outcomes(rows)])
+    return 100 * low, 100 * high
 
 
 def collect_outcomes(rows: Sequence[Row]) -> scores.Outcomes:

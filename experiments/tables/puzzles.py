@@ -17,8 +17,9 @@ MINIMISED = {
 ONE_ACTION = {(f"`--method {name}`", "T"): Setting("leapjax", name) for name in ("bc", "dt")}
 PAYS_ON = ("Star3x5, learned", "Star5x10, learned", "Sudoku9x36, learned", "Sudoku9x26, rules")
 PAYING = (
-    ("all at once", "1"), ("left to right", "T"), ("Gibbs sampling, random order", "2 T"),
-    ("most certain first", "T"), ("most certain first, best of 16", "16 T"),
+    ("all at once", "1"), ("left to right", "T"), ("in random order", "T"),
+    ("Gibbs sampling, random order", "2 T"), ("most certain first", "T"),
+    ("most certain first, best of 16", "16 T"),
 )  # fmt: skip
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
 
