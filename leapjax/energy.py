@@ -344,10 +344,12 @@ def constrain(
     The conditional tries every action at one position and keeps the rest of the plan. The penalty
     is a function of complete plans, so it counts only if the rest holds no MASK. The first
     iteration, with all positions masked, ignores it; later iterations obey it. A penalty that grows
-    with the number of violations leads the search out of them one by one; +inf only filters.
+    with the number of violations leads the search out of them one by one; +inf forbids plans, but
+    gives the search no direction.
 
-    A `partial` penalty also judges incomplete plans, by the actions that they have. A plan that
-    `gibbs` or `beam_search` fills from left to right then begins in an allowed way.
+    A `partial` penalty also judges incomplete plans, by the actions that they have. Use it where
+    `gibbs` or `beam_search` fills a plan position by position: a penalty of complete plans would
+    count at the last position only.
 
     Args:
         energy: the energy to constrain.
