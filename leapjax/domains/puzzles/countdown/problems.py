@@ -83,7 +83,7 @@ def find_level(name: str) -> Level:
     Raises:
         UserError: the level does not exist.
     """
-    return Level(*read_numbers(name, r"Countdown([3-5])", "Countdown<3 to 5 numbers>", LEVELS))
+    return Level(*read_numbers(name, r"Countdown([2-5])", "Countdown<2 to 5 numbers>", LEVELS))
 
 
 def list_targets(seed: int) -> list[int]:
