@@ -27,6 +27,7 @@ from leapjax.domains.puzzles.countdown.problems import (
     TIMES,
     CountdownAdapter,
     Level,
+    write_equations,
 )
 from leapjax.errors import UserError
 from leapjax.methods import find_method
@@ -52,7 +53,7 @@ def apply(a, operation, b):
 
 
 def enumerate_solutions(numbers):
-    """Every solution of every target: the tokens, by brute force over all orders."""
+    """Every solution of every target, as equations, by brute force over all orders."""
     if len(numbers) == 1:
         yield []
         return
@@ -63,43 +64,58 @@ def enumerate_solutions(numbers):
             result = apply(a, operation, b)
             if result is not None and result <= LARGEST:
                 for others in enumerate_solutions([*rest, result]):
-                    yield [a, operation, b, result, *others]
+                    yield [(a, operation, b, result), *others]
 
 
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.integers(1, 99), min_size=2, max_size=3) | st.lists(
     st.integers(1, 12), min_size=4, max_size=4))  # fmt: skip
 def test_the_search_finds_a_solution_where_brute_force_does(numbers):
-    reached = {tokens[-1] for tokens in enumerate_solutions(numbers)}
+    reached = {equations[-1][-1] for equations in enumerate_solutions(numbers)}
     for target in range(101):
         found = problems.solve(numbers, target)
         assert (found is not None) == (target in reached)
         if found is not None:
-            assert problems.is_solution(numbers, target, list(itertools.chain(*found)))
+            assert problems.is_solution(numbers, target, write_equations(found).tolist())
             assert found == problems.solve(numbers[::-1], target)
             assert all(a >= b for a, _, b, _ in found)
 
 
 @pytest.mark.parametrize("numbers", [[2, 3], [4, 4], [6, 3, 2], [5, 5, 1], [1, 1, 1]])
 def test_the_verifier_accepts_every_solution_and_nothing_else(numbers):
-    every = {tuple(tokens) for tokens in enumerate_solutions(numbers)}
-    assert all(problems.is_solution(numbers, tokens[-1], tokens) for tokens in every)
-    operations, most = (PLUS, MINUS, TIMES, DIVIDE), max(max(t[:1] + t[2:4]) for t in every)
-    equations = itertools.product(range(most + 2), operations, range(most + 2), range(most + 2))
-    for equation in equations if len(numbers) == 2 else ():
-        assert problems.is_solution(numbers, equation[-1], equation) == (equation in every)
+    every = {tuple(equations): equations[-1][-1] for equations in enumerate_solutions(numbers)}
+    written = {tuple(write_equations(e).tolist()): target for e, target in every.items()}
+    assert len(written) == len(every)
+    if len(numbers) == 2:  # all equations of small numbers
+        small, operations = range(18), (PLUS, MINUS, TIMES, DIVIDE)
+        for equation in itertools.product(small, operations, small, small):
+            tokens = write_equations([equation]).tolist()
+            assert problems.is_solution(numbers, equation[-1], tokens) == ((equation,) in every)
     rng = np.random.default_rng(0)
-    tokens = [*range(most + 2), *operations, END]
-    for solution in every:  # with one token changed
-        changed = list(solution)
-        changed[rng.integers(len(changed))] = int(rng.choice(tokens))
-        legal = problems.is_solution(numbers, changed[-1], changed)
-        assert legal == (tuple(changed) in every)
-        assert not problems.is_solution(numbers, solution[-1] + 1, solution)
-        assert not problems.is_solution(numbers, solution[-1], solution[:-1])
+    for tokens, target in written.items():
+        assert problems.read_equations(tokens) is not None
+        assert problems.is_solution(numbers, target, tokens)
+        assert not problems.is_solution(numbers, target + 1, tokens)
+        assert not problems.is_solution(numbers, target, tokens[:-1])
+        changed = list(tokens)
+        changed[rng.integers(len(changed))] = int(rng.integers(END + 1))
+        for reached in {target, written.get(tuple(changed), target)}:
+            legal = problems.is_solution(numbers, reached, changed)
+            assert legal == (written.get(tuple(changed)) == reached)
 
 
-@pytest.mark.parametrize("name", ["Countdown3", "Countdown4", "Countdown5"])
+def test_equations_are_written_digit_by_digit():
+    equations = [(44, PLUS, 36, 80), (80, TIMES, 9, 720)]
+    tokens = write_equations(equations).tolist()
+    assert tokens == [0, 4, 4, PLUS, 0, 3, 6, 0, 8, 0, 0, 8, 0, TIMES, 0, 0, 9, 7, 2, 0]
+    assert problems.read_equations(tokens) == list(map(list, equations))
+    assert problems.read_equations(tokens[:17]) == [[44, PLUS, 36, 80], [80, TIMES, 9]]
+    assert problems.read_equations(tokens[:12]) == [[44, PLUS, 36, 80], []]
+    for wrong in ([PLUS], [0, 0, END], [0, 0, 4, 4]):
+        assert problems.read_equations(wrong) is None
+
+
+@pytest.mark.parametrize("name", ["Countdown2", "Countdown3", "Countdown4", "Countdown5"])
 def test_a_drawn_problem_has_the_solution_that_is_drawn(name):
     level, kinds = problems.find_level(name), set()
     for seed in range(12):
@@ -135,29 +151,31 @@ def play(adapter, seed, tokens):
 
 
 def test_any_solution_is_rewarded_and_an_illegal_token_is_the_last():
-    adapter, level = CountdownAdapter(Level(3)), Level(3)
+    level = Level(3)
+    adapter = CountdownAdapter(level)
     problem, solution = problems.draw(level, 3)
     numbers, target = problem.numbers.tolist(), int(problem.target)
-    ways = [t for t in enumerate_solutions(numbers) if t[-1] == target]
-    assert solution.tolist() in ways and len(ways) > 1
+    every = [(write_equations(e), e[-1][-1]) for e in enumerate_solutions(numbers)]
+    ways = [tokens for tokens, reached in every if reached == target]
+    assert any((way == solution).all() for way in ways) and len(ways) > 1
     for way in ways:
         steps = play(adapter, 3, way)
         found = [(step.reward, step.terminated, step.success) for step in steps]
-        assert found == [(0, False, False)] * 7 + [(1, True, True)]
+        assert found == [(0, False, False)] * 19 + [(1, True, True)]
         same(steps[-1].observation.written, way)
     # Legal equations that reach another number.
-    other = next(t for t in enumerate_solutions(numbers) if t[-1] != target)
-    *before, last = play(adapter, 3, other)
+    *before, last = play(adapter, 3, next(tokens for tokens, reached in every if reached != target))
     assert not any(step.terminated for step in before)
     assert last.terminated and not last.success and last.reward == 0
-    adapter.reset(3)
-    for wrong in (PLUS, END, next(n for n in range(1, 100) if n not in numbers)):
-        adapter.reset(3)
-        step = adapter.step(wrong)
+    for wrong in (PLUS, END):
+        (step,) = play(adapter, 3, [wrong])
         assert step.terminated and not step.success and step.observation.place == 0
-    result = solution.copy()
-    result[3] += 1  # the sum is wrong
-    assert [step.terminated for step in play(adapter, 3, result[:4])] == [False] * 3 + [True]
+    absent = next(n for n in range(10, 100) if n not in numbers)
+    operand = [0, absent // 10, absent % 10]  # ends the episode with its last digit
+    assert [step.terminated for step in play(adapter, 3, operand)] == [False] * 2 + [True]
+    result = solution[:10].copy()
+    result[9] = (result[9] + 1) % 10  # the arithmetic is wrong
+    assert [step.terminated for step in play(adapter, 3, result)] == [False] * 9 + [True]
 
 
 def collect(name, count):
@@ -175,10 +193,11 @@ def reordered(numbers):
     return data, jax.jit(lambda key, index: problems.reorder(key, cut(index)))
 
 
-@pytest.mark.parametrize("numbers", [3, 4, 5])
-@pytest.mark.parametrize("place", [0, 1, 6])
+@pytest.mark.parametrize("numbers", [2, 3, 4, 5])
+@pytest.mark.parametrize("place", [0, 1, -6])
 def test_a_reordered_window_solves_the_same_problem(numbers, place):
     (data, change), level, seen = reordered(numbers), Level(numbers), set()
+    place %= level.length
     for seed, episode in itertools.product(range(8), range(4)):
         index = episode * level.length + place
         window = jax.device_get(change(jax.random.key(seed), index))
@@ -193,9 +212,8 @@ def test_a_reordered_window_solves_the_same_problem(numbers, place):
         same(problem.written[place:], OPEN)
         same(window.actions[rest:], END)
         # The same operations on the same numbers.
-        equations = [sorted(part) for part in np.reshape(solution, (-1, 4)).tolist()]
-        old = data[episode].actions.reshape(-1, 4).tolist()
-        assert sorted(equations) == sorted(map(sorted, old))
+        new, old = map(problems.read_equations, (solution, data[episode].actions.tolist()))
+        assert sorted(map(sorted, new)) == sorted(map(sorted, old))
         for back in (1, 2):
             if back > place:
                 assert window.context.actions[-back] == pad_token(END + 1)
@@ -214,17 +232,18 @@ def test_independent_equations_change_places_and_others_do_not():
     blank = blank_context(make("Countdown4", Settings()), 0)
 
     def orders(*equations):
-        solution = np.array(equations, np.int32).reshape(-1)
+        solution = write_equations(equations)
         numbers = np.zeros(4, np.int32)
-        problem = problems.Problem(numbers, np.int32(0), np.full(12, OPEN), np.int32(0))
+        problem = problems.Problem(numbers, np.int32(0), np.full(30, OPEN), np.int32(0))
         window = windows.Window(
-            blank._replace(observation=problem), solution, np.ones(12, bool), 0.0, solution
+            blank._replace(observation=problem), solution, np.ones(30, bool), 0.0, solution
         )
         window = jax.tree.map(jnp.asarray, window)
         change = jax.jit(jax.vmap(lambda key: problems.reorder(key, window).actions))
         found = np.asarray(change(jax.random.split(jax.random.key(0), 64)))
         assert found.shape == (64, level.length)
-        return {tuple(each[3::4].tolist()) for each in found}, len(np.unique(found, axis=0))
+        read = [problems.read_equations(each.tolist()) for each in found]
+        return {tuple(e[-1] for e in each) for each in read}, len(np.unique(found, axis=0))
 
     independent = orders((9, MINUS, 2, 7), (8, TIMES, 3, 24), (24, PLUS, 7, 31))
     assert independent == ({(7, 24, 31), (24, 7, 31)}, 2 * 4)
@@ -268,8 +287,8 @@ def test_the_network_has_less_than_a_million_parameters():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("Countdown", "unknown level 'Countdown': expected Countdown<3 to 5 numbers>"),
-        ("Countdown6", "expected Countdown<3 to 5 numbers>, such as Countdown3, Countdown4"),
+        ("Countdown", "unknown level 'Countdown': expected Countdown<2 to 5 numbers>"),
+        ("Countdown6", "expected Countdown<2 to 5 numbers>, such as Countdown3, Countdown4"),
         ("countdown4", "did you mean Countdown4"),
     ],
 )
@@ -284,11 +303,11 @@ def test_data_that_solve_no_problem_are_refused():
     states = one.observations
     source.check(states, "here")
     written = states.written.copy()
-    written[:, 7] = np.where(written[:, 7] == OPEN, OPEN, 0)
+    written[:, 9] = np.where(written[:, 9] == OPEN, OPEN, (written[:, 9] + 1) % 10)
     for wrong, message in (
         (states._replace(numbers=states.numbers + 99), "here: numbers run from .* expected 1 to"),
         (states._replace(written=states.written + 1), "here: written tokens run from"),
-        (jax.tree.map(lambda x: x[:5], states), "here does not write 8 tokens"),
+        (jax.tree.map(lambda x: x[:5], states), "here does not write 20 tokens"),
         (states._replace(place=states.place[::-1]), "one after the other"),
         (states._replace(target=states.target + 1), "here does not solve its problem"),
         (states._replace(written=written), "here does not solve its problem"),
@@ -308,4 +327,4 @@ def test_the_program_trains_and_plans(tmp_path, monkeypatch, quick_begin):
     assert countdown.main([*toy, *network, "--method", "bc"]) == 0
     rows = results.read(tmp_path / "runs" / "countdown.jsonl")
     found = [(row["method"], results.name_planner(row)) for row in rows]
-    assert found == [("leap", "N = 8, confident"), ("leap", "N = 1"), ("bc", "N = 1, confident")]
+    assert found == [("leap", "N = 20, confident"), ("leap", "N = 1"), ("bc", "N = 1, confident")]

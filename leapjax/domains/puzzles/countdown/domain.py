@@ -12,20 +12,23 @@ from leapjax.domain import Augmentations, Domain, DomainType
 from leapjax.domains.puzzles.common import demonstrate
 from leapjax.domains.puzzles.countdown import problems
 from leapjax.domains.puzzles.countdown.problems import (
+    DIGITS,
     END,
-    LARGEST,
     LARGEST_NUMBER,
+    LENGTH,
     OPEN,
-    PARTS,
     SIGNS,
+    TARGETS,
     CountdownAdapter,
     Level,
     Problem,
 )
 from leapjax.errors import UserError
 from leapjax.models.encoder import Encoder
-from leapjax.models.transformer import embed
+from leapjax.models.transformer import dense, embed
 from leapjax.types import Context
+
+MOST = max(LARGEST_NUMBER, *TARGETS)  # of a given number or a target
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,10 +47,10 @@ class Settings:
 
 
 class ProblemTokens(Encoder):
-    """A token for each given number, for the target, and for each token that is written.
+    """A token for each given number, for the target, and for the tokens that are written.
 
     The given numbers have no order. The token of a number is the sum of embeddings of its value and
-    its digits. The digits help with numbers that are rare in training.
+    its digits.
 
     Attributes:
         numbers: how many are given.
@@ -58,42 +61,34 @@ class ProblemTokens(Encoder):
     width: int
 
     def setup(self) -> None:  # noqa: D102
-        self.value = embed(LARGEST + 1, self.width)
-        self.digits = embed(30, self.width)
-        self.sign = embed(OPEN + 1 - LARGEST, self.width)
-        self.kind = embed(3, self.width)
-        self.part = embed(PARTS, self.width)
+        self.value = embed(MOST + 1, self.width)
+        self.digits = embed(10 * DIGITS, self.width)
+        self.kind = embed(2, self.width)
+        self.written = dense(self.width)
+        self.part = embed(LENGTH, self.width)
         self.equation = embed(self.numbers - 1, self.width)
 
     def __call__(self, context: Context) -> jax.Array:
-        """Returns the tokens `[n + 1 + 4 (n - 1), D]`."""
-        problem, places = context.observation, jnp.arange(PARTS * (self.numbers - 1))
-        given, target, written = self.kind(jnp.arange(3))
-        number = problem.written <= LARGEST
-        token = jnp.where(
-            number[:, None],
-            self._embed_number(jnp.minimum(problem.written, LARGEST)),
-            self.sign(jnp.maximum(problem.written - LARGEST - 1, 0)),
-        )
+        """Returns the tokens `[n + 2, D]`."""
+        problem = context.observation
+        given, target = self.kind(jnp.arange(2))
+        written = jax.nn.one_hot(problem.written, OPEN + 1).reshape(-1)
         return jnp.concatenate([
             self._embed_number(problem.numbers) + given,
             self._embed_number(problem.target[None]) + target,
-            token + written + self._embed_places(places),
+            self.written(written)[None],
         ])  # fmt: skip
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """Encodes the part of an equation, and the equation, at each position: `[T, D]`."""
-        return self._embed_places(context.observation.place + jnp.arange(horizon))
+        """Encodes the place in an equation, and the equation, at each position: `[T, D]`."""
+        equation, place = jnp.divmod(context.observation.place + jnp.arange(horizon), LENGTH)
+        return self.part(place) + self.equation(jnp.minimum(equation, self.numbers - 2))
 
     def _embed_number(self, numbers: jax.Array) -> jax.Array:
         """Embeds numbers `[n]`: `[n, D]`."""
-        digits = jnp.stack([numbers // 100, 10 + numbers // 10 % 10, 20 + numbers % 10])
-        return self.value(numbers) + self.digits(digits).sum(0)
-
-    def _embed_places(self, places: jax.Array) -> jax.Array:
-        """Embeds places `[n]` in a solution: `[n, D]`."""
-        equation, part = jnp.divmod(places, PARTS)
-        return self.part(part) + self.equation(jnp.minimum(equation, self.numbers - 2))
+        places = jnp.arange(DIGITS)
+        digits = numbers[:, None] // 10**places % 10 + 10 * places
+        return self.value(numbers) + self.digits(digits).sum(1)
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -108,7 +103,7 @@ def make(name: str, settings: Settings) -> Domain:
     return Domain(
         level=name,
         make_adapter=make_adapter,
-        actions=(*map(str, range(LARGEST + 1)), *SIGNS.values(), "end"),
+        actions=(*map(str, range(10)), *SIGNS.values(), "end"),
         max_steps=level.length,
         blank=Problem(
             np.zeros(level.numbers, np.int32), none, np.zeros(level.length, np.int32), none
@@ -118,7 +113,7 @@ def make(name: str, settings: Settings) -> Domain:
         augmentations=Augmentations(
             [problems.reorder] if settings.augment else [], problems.repeat_solution
         ),
-        signature={"numbers": level.numbers, "largest": LARGEST},
+        signature={"numbers": level.numbers, "digits": DIGITS},
     )
 
 

@@ -27,13 +27,21 @@ TARGETS = range(10, 101)
 # their last digits differ.
 MODULUS, TEST, VALIDATION = 11, 5, 8
 
-# Tokens: 0 .. LARGEST are numbers, so that a plan spells no digits. Of the pairs of numbers and
-# target with a solution, 99% of Countdown3 and 95% of Countdown4 need no larger number.
+# Of the pairs of numbers and target with a solution, 99% of Countdown3 and 95% of Countdown4 have
+# one without larger numbers.
 LARGEST = 999
-PLUS, MINUS, TIMES, DIVIDE, END = range(LARGEST + 1, LARGEST + 6)
+DIGITS = 3  # of each number, zeros first
+
+# Tokens: 0 .. 9 are digits. A token for each number would make plans shorter, but a network then
+# learns each result by itself, and few steps of training teach it no arithmetic.
+PLUS, MINUS, TIMES, DIVIDE, END = range(10, 15)
 OPEN = END  # in observations: not written yet
 SIGNS = {PLUS: "+", MINUS: "-", TIMES: "*", DIVIDE: "/"}
-PARTS = 4  # tokens of an equation, without its "="
+A, SIGN, B, RESULT = PARTS = (
+    slice(0, DIGITS), slice(DIGITS, DIGITS + 1), slice(DIGITS + 1, 2 * DIGITS + 1),
+    slice(2 * DIGITS + 1, 3 * DIGITS + 1),
+)  # fmt: skip
+LENGTH = RESULT.stop  # tokens of an equation, without its "="
 
 Equation = tuple[int, int, int, int]  # a, operation, b, result
 
@@ -50,7 +58,7 @@ class Level(NamedTuple):
     @property
     def length(self) -> int:
         """Number of tokens of a solution."""
-        return PARTS * (self.numbers - 1)
+        return LENGTH * (self.numbers - 1)
 
 
 class Problem(NamedTuple):
@@ -59,7 +67,7 @@ class Problem(NamedTuple):
     Attributes:
         numbers: `[n]` int32, the given numbers.
         target: `[]` int32.
-        written: `[4 (n - 1)]` int32 tokens; `OPEN` where no token is written yet.
+        written: `[10 (n - 1)]` int32 tokens; `OPEN` where no token is written yet.
         place: `[]` int32, the number of written tokens.
     """
 
@@ -75,7 +83,7 @@ def find_level(name: str) -> Level:
     Raises:
         UserError: the level does not exist.
     """
-    return Level(*read_numbers(name, r"Countdown([3-5])", "Countdown<3 to 5 numbers>", LEVELS))
+    return Level(*read_numbers(name, r"Countdown([2-5])", "Countdown<2 to 5 numbers>", LEVELS))
 
 
 def list_targets(seed: int) -> list[int]:
@@ -100,6 +108,33 @@ def compute(a: int, operation: int, b: int) -> int | None:
     return result if 0 <= result <= LARGEST else None
 
 
+def write_equations(equations: Sequence[Equation]) -> np.ndarray:
+    """Writes equations as tokens `[10 k]`."""
+    powers = 10 ** np.arange(DIGITS)[::-1]
+    rows = np.array(equations, np.int32)
+    a, b, result = (rows[:, part, None] // powers % 10 for part in (0, 2, 3))
+    return np.concatenate([a, rows[:, 1:2], b, result], axis=1).reshape(-1).astype(np.int32)
+
+
+def read_equations(tokens: Sequence[int]) -> list[list[int]] | None:
+    """Reads the equations of tokens, the last perhaps unfinished: lists of a, operation, b, result.
+
+    Returns `None` if a token is a digit in place of an operation, or the reverse.
+    """
+    equations = []
+    for begun in range(0, len(tokens), LENGTH):
+        equation, parts = tokens[begun : begun + LENGTH], []
+        for part in PARTS:
+            found = equation[part]
+            wanted = SIGNS if part == SIGN else range(10)
+            if any(token not in wanted for token in found):
+                return None
+            if len(found) == part.stop - part.start:
+                parts.append(found[0] if part == SIGN else int("".join(map(str, found))))
+        equations.append(parts)
+    return equations
+
+
 def can_continue(numbers: Sequence[int], tokens: Sequence[int]) -> bool:
     """Tells whether tokens begin a solution: all equations are legal, whatever they reach.
 
@@ -107,16 +142,15 @@ def can_continue(numbers: Sequence[int], tokens: Sequence[int]) -> bool:
         numbers: the given numbers.
         tokens: of an unfinished or a finished solution.
     """
-    left = list(numbers)
-    for begun in range(0, len(tokens), PARTS):
-        equation = tokens[begun : begun + PARTS]
-        if len(equation) > 1 and equation[1] not in SIGNS:
-            return False
+    left, equations = list(numbers), read_equations(tokens)
+    if equations is None:
+        return False
+    for equation in equations:
         for operand in equation[:3:2]:
             if operand not in left:
                 return False
             left.remove(operand)
-        if len(equation) == PARTS:
+        if len(equation) == len(PARTS):
             a, operation, b, result = equation
             if compute(a, operation, b) != result:
                 return False
@@ -126,8 +160,10 @@ def can_continue(numbers: Sequence[int], tokens: Sequence[int]) -> bool:
 
 def is_solution(numbers: Sequence[int], target: int, tokens: Sequence[int]) -> bool:
     """Tells whether tokens are a complete solution; a problem may have several."""
-    complete = len(tokens) == PARTS * (len(numbers) - 1)
-    return complete and can_continue(numbers, tokens) and tokens[-1] == target
+    if len(tokens) != LENGTH * (len(numbers) - 1) or not can_continue(numbers, tokens):
+        return False
+    equations = read_equations(tokens)
+    return equations is not None and equations[-1][-1] == target
 
 
 class Last(NamedTuple):
@@ -205,7 +241,7 @@ def draw(level: Level, seed: int) -> tuple[Problem, np.ndarray]:
         equations = solve(numbers.tolist(), target)
         if equations is not None:
             blank = np.full(level.length, OPEN, np.int32)
-            solution = np.array(equations, np.int32).reshape(-1)
+            solution = write_equations(equations)
             for array in (numbers, blank, solution):
                 array.setflags(write=False)  # the cache shares them
             return Problem(numbers, np.int32(target), blank, np.int32(0)), solution
@@ -233,13 +269,14 @@ class CountdownAdapter(PuzzleAdapter[Problem]):
         numbers, tokens = problem.numbers.tolist(), written[: place + 1].tolist()
         if not can_continue(numbers, tokens):
             return problem, False
-        complete = len(tokens) == self.level.length
         after = problem._replace(written=written, place=np.int32(place + 1))
-        return after, tokens[-1] == problem.target if complete else None
+        if len(tokens) < self.level.length:
+            return after, None
+        return after, is_solution(numbers, int(problem.target), tokens)
 
 
 def repeat_solution(demonstration: Demonstration) -> np.ndarray:
-    """Returns the solution for every step, for augmentation: `[n, 4 (n - 1)]`."""
+    """Returns the solution for every step, for augmentation: `[n, T]`."""
     return repeat(demonstration.observations.written[-1], demonstration)
 
 
@@ -251,15 +288,16 @@ def reorder(key: jax.Array, window: Window) -> Window:
     """
     operand_key, order_key = jax.random.split(key)
     problem = window.context.observation
-    equations = window.extras.astype(jnp.int32).reshape(-1, PARTS)
-    commutes = (equations[:, 1] == PLUS) | (equations[:, 1] == TIMES)
+    equations = window.extras.astype(jnp.int32).reshape(-1, LENGTH)
+    commutes = ((equations[:, SIGN] == PLUS) | (equations[:, SIGN] == TIMES))[:, 0]
     exchanged = commutes & jax.random.bernoulli(operand_key, shape=commutes.shape)
-    turned = equations[:, jnp.array([2, 1, 0, 3])]
+    turned = jnp.concatenate([equations[:, part] for part in (B, SIGN, A, RESULT)], axis=1)
     equations = jnp.where(exchanged[:, None], turned, equations)
     moved = jax.random.bernoulli(order_key, shape=commutes.shape)
     for place in range(len(commutes) - 1):
         pair = equations[place : place + 2]
-        uses = (pair[1, 0] == pair[0, 3]) | (pair[1, 2] == pair[0, 3])
+        first, second = pair
+        uses = (second[A] == first[RESULT]).all() | (second[B] == first[RESULT]).all()
         pair = jnp.where(moved[place] & ~uses, pair[::-1], pair)
         equations = equations.at[place : place + 2].set(pair)
     solution = equations.reshape(-1)

@@ -28,7 +28,8 @@ class Settings:
         augment: Turn every training window into a window of another board, by symmetries that keep
             the rules.
         boards: Text file of boards that the held-out episodes play in order, in place of drawn
-            boards. A line is a board, row by row; 0 or a dot is an open cell.
+            boards. A line is a board, row by row; 0 or a dot is an open cell. Blank lines and text
+            after # are skipped.
     """
 
     augment: bool = True
