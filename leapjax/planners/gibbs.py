@@ -36,12 +36,12 @@ def gibbs(
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
     energy = guard_shapes(energy)
-    run = functools.partial(_run_chain, energy, params, memory, config=config)
+    run_chain = functools.partial(_run_chain, energy, params, memory, config=config)
 
     if config.restarts == 1:
-        chains = jax.tree.map(lambda leaf: leaf[None], run(key))
+        chains = jax.tree.map(lambda leaf: leaf[None], run_chain(key))
     else:
-        chains = jax.vmap(run)(jax.random.split(key, config.restarts))
+        chains = jax.vmap(run_chain)(jax.random.split(key, config.restarts))
     traces, valid, passes = chains.trace, chains.valid.all(), chains.passes.sum()
     candidates = traces if config.keep == "best" else traces[:, -1:]  # [R, C, T]
     choices = candidates.shape[0] * candidates.shape[1]
@@ -52,12 +52,15 @@ def gibbs(
         valid &= ~jnp.any(is_undefined(energies))
         passes += choices * config.horizon
     actions = candidates.reshape(choices, -1)[best]
-    trace = traces[best // candidates.shape[1]]
+    run = best // candidates.shape[1]
+    trace = traces[run]
     satisfied = energy.violation(params, memory, actions) <= 0
     plan = Plan(actions, trace, satisfied, valid, passes)
     if config.score and energies is not None:
         plan = plan._replace(energy=energies[best])
-    if config.score_trace:
+    if config.score_trace and config.keep == "best" and energies is not None:
+        plan = plan._replace(trace_energies=energies.reshape(traces.shape[:2])[run])
+    elif config.score_trace:
         scores = compute_totals(energy, params, memory, trace)
         plan = plan._replace(
             trace_energies=scores,
