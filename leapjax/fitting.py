@@ -36,7 +36,8 @@ def make_domain(name: str, level: str, settings: Any = None) -> Domain:
     """Makes one level of a domain, for `leapjax.fit` and `leapjax.evaluate`.
 
     Args:
-        name: name of the domain: "babyai", "gymnasium", "atari", "stars" or "sudoku".
+        name: name of the domain: "babyai", "gymnasium", "atari", "stars", "sudoku",
+            "countdown" or "satisfiability".
         level: name of the level, such as "GoToLocalS7N5"; for Gymnasium, id of an environment.
         settings: options of encoder and augmentation, as in the module of the domain; `None` for
             the options that preset `leapjax` has for LEAP on this level.

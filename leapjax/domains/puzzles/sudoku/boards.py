@@ -76,7 +76,8 @@ def find_level(name: str) -> Level:
     if level.fewest < FEWEST_CLUES[side] or level.most > level.cells:
         raise UserError(
             f"level {name}: clues must be in {FEWEST_CLUES[side]} .. {level.cells}; boards with "
-            "fewer clues take too long to draw"
+            "fewer clues take too long to draw: give a file of boards instead",
+            "boards",
         )
     return level
 
