@@ -234,7 +234,11 @@ def make_agent(specification: Specification, domain: Domain, mesh: Mesh | None =
 
 
 def describe_identity(specification: Specification) -> str:
-    """Describes a run as JSON, to seal its checkpoints; leaves out settings with their default."""
+    """Describes a run as JSON, to seal its checkpoints; leaves out settings with their default.
+
+    Raises:
+        UserError: a setting is a function, which no file can hold.
+    """
     defaults = {name: type(getattr(specification, name))() for name in GROUPS}
     plain = dataclasses.asdict(dataclasses.replace(specification, **defaults))
     values = dataclasses.asdict(specification)
@@ -242,7 +246,14 @@ def describe_identity(specification: Specification) -> str:
     changed["training"] = drop_unnamed(changed["training"])
     if not specification.statistics:  # so that older checkpoints keep their seal
         del values["statistics"]
-    return json.dumps(values | changed, sort_keys=True)
+    return json.dumps(values | changed, sort_keys=True, default=_refuse_function)
+
+
+def _refuse_function(value: Any) -> Any:
+    raise UserError(
+        f"{value} cannot be saved: a file holds names and numbers; give the planner a strategy by "
+        "name, such as fill='confident', and your own when you plan (compile_planner)"
+    )
 
 
 def drop_unnamed(training: Mapping[str, Any]) -> dict[str, Any]:

@@ -84,6 +84,14 @@ def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
     assert not set(names("--mood", "angry")) & set(before[0])
 
 
+def test_a_strategy_of_ones_own_is_not_saved():
+    chosen = parse()
+    specification = specify(chosen, 0, make_domain(chosen))
+    own = GibbsConfig(5, 5, fill=lambda energies, key: energies[:, 0])
+    with pytest.raises(UserError, match="a strategy by name, such as fill='confident'"):
+        pretrained.describe_identity(dataclasses.replace(specification, planner=own))
+
+
 def test_the_settings_of_a_row_can_be_read_back():
     chosen = parse("--heads", "2", "--masking", "each", "--clutter", "0.2", "--steps", "7")
     row = list_settings(chosen, seed=0)
