@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import BeamConfig, find_selection, make_commitment
-from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
+from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
 
@@ -56,7 +56,7 @@ def beam_search(
         )
     energy = guard_shapes(energy)
     actions, width, horizon = energy.num_actions, config.beams, config.horizon
-    mask, everywhere = mask_token(actions), jnp.arange(horizon)
+    mask = mask_token(actions)
     select, commitment = find_selection(config.fill), make_commitment(config)
 
     def grow(plan: jax.Array, select_key: jax.Array) -> tuple[jax.Array, ...]:
@@ -67,17 +67,22 @@ def beam_search(
             at, the energies `[A]` there, and whether all energies are defined.
         """
         open_ = plan == mask
-        energies = energy.conditional(
-            params, memory, plan, jnp.where(open_, everywhere, jnp.argmax(open_))
-        )
-        where, chosen = choose_open(energies, open_, select(energies, select_key), commitment)
-        branch = where[jnp.maximum(chosen.sum() - 1, 0)]
-        sure = jnp.zeros(horizon, bool).at[where].set(chosen).at[branch].set(False)
-        filled = jnp.where(sure, jnp.argmin(energies, axis=-1).astype(jnp.int32), plan)
-        paid = jnp.where(sure, energies.min(axis=-1), 0).sum()
+        if config.fill == "sequential" and not commitment.adapts:
+            # The next position does not depend on energies, so the pass scores no other.
+            branch, filled, paid = jnp.argmax(open_), plan, jnp.zeros(())
+            energies = energy.conditional(params, memory, plan, branch[None])
+            branches = energies[0]
+        else:
+            energies = score_open(energy, params, memory, plan)
+            where, chosen = choose_open(energies, open_, select(energies, select_key), commitment)
+            branch = where[jnp.maximum(chosen.sum() - 1, 0)]
+            sure = jnp.zeros(horizon, bool).at[where].set(chosen).at[branch].set(False)
+            filled = jnp.where(sure, jnp.argmin(energies, axis=-1).astype(jnp.int32), plan)
+            paid = jnp.where(sure, energies.min(axis=-1), 0).sum()
+            branches = energies[branch]
         # A complete plan has one continuation: itself.
         same = jnp.where(jnp.arange(actions) == plan[branch], 0.0, jnp.inf)
-        branches = jnp.where(open_.any(), energies[branch], same)
+        branches = jnp.where(open_.any(), branches, same)
         return filled, paid, branch, branches, ~jnp.any(is_undefined(energies))
 
     def extend(
@@ -117,12 +122,12 @@ def beam_search(
     # One key per pass draws beams; one key ranks positions, the same in every pass.
     draw_keys, select_key = jax.random.split(key, horizon), jax.random.fold_in(key, 1)
     start = _Beams(blank, sums, -sums, -sums, missing)
-    beams, passes, trace, valid = jax.lax.while_loop(
+    beams, done, trace, valid = jax.lax.while_loop(
         is_incomplete,
         extend,
         (start, jnp.zeros((), jnp.int32), blank[:1].repeat(horizon, 0), jnp.array(True)),
     )
-    passes = passes * width
+    passes = done * width
     judged = beams.sums
     if config.judge == "energy":
         judged = compute_totals(energy, params, memory, beams.plans)
@@ -130,9 +135,11 @@ def beam_search(
         passes += width * horizon
     found = jnp.lexsort((judged, beams.dead))[0]
     best = beams.plans[found]
-    trace = jnp.where(everywhere[:, None] < passes // width - 1, trace, best)
+    trace = jnp.where(jnp.arange(horizon)[:, None] < done - 1, trace, best)
     plan = Plan(best, trace, violate(best) <= 0, valid, passes)
-    if config.score:
+    if config.score and config.judge == "energy":
+        plan = plan._replace(energy=judged[found])
+    elif config.score:
         total = energy.total(params, memory, best)
         plan = plan._replace(
             energy=total, valid=valid & ~is_undefined(total), passes=passes + horizon

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
-from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
+from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open, compute_probabilities
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
@@ -139,9 +139,7 @@ def _run_chain(
         """Fills open positions; the others keep their actions."""
         plan, done, trace, valid = state
         open_ = plan.actions == mask
-        # One pass scores all open positions. A query would mask a filled position, so an open one
-        # takes its place.
-        energies = query(plan.actions, jnp.where(open_, everywhere, jnp.argmax(open_)))
+        energies = score_open(energy, params, memory, plan.actions)
         ranks = select(energies, fill_key)
         where, chosen = choose_open(energies, open_, ranks, commitment)
         drawn, defined = draw(plan, where, energies[where], fill_noise[done])

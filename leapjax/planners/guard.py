@@ -1,10 +1,10 @@
-"""Evaluates an energy with checks of its results, and totals of many plans in little memory."""
+"""Evaluates an energy: with checks, at open positions, and for many plans in little memory."""
 
 import jax
 import jax.numpy as jnp
 
 from leapjax.checks import check_floats, check_kind
-from leapjax.types import Energy, Params, PyTree
+from leapjax.types import Energy, Params, PyTree, mask_token
 
 SCORED_TOGETHER = 8  # totals of one context at a time: each may hold T copies of a plan
 
@@ -39,6 +39,18 @@ def guard_shapes(energy: Energy) -> Energy:
         return check_floats("violation of the energy", found, ())
 
     return energy._replace(conditional=conditional, total=total, violation=violation)
+
+
+def score_open(energy: Energy, params: Params, memory: PyTree, plan: jax.Array) -> jax.Array:
+    """Returns the energies `[T, A]` of every action at the open positions, in one pass.
+
+    A query masks its position, so an open position takes the place of each filled one. Ignore
+    the rows of filled positions.
+    """
+    open_ = plan == mask_token(energy.num_actions)
+    return energy.conditional(
+        params, memory, plan, jnp.where(open_, jnp.arange(plan.shape[0]), jnp.argmax(open_))
+    )
 
 
 def compute_totals(energy: Energy, params: Params, memory: PyTree, plans: jax.Array) -> jax.Array:
