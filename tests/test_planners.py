@@ -28,7 +28,7 @@ from tests.enumerable import (
     plan_counts,
     random_table,
 )
-from tests.quick import quick_jit
+from tests.quick import many_plans, quick_jit
 
 HORIZON, ACTIONS = 3, 3
 PLANS = all_plans(HORIZON, ACTIONS)
@@ -41,13 +41,6 @@ CHAINS = 5000
 assert_equal = np.testing.assert_array_equal
 assert_close = functools.partial(np.testing.assert_allclose, rtol=1e-4)
 REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: a sampler that is wrong, one that may be right
-
-
-@functools.cache
-def many_plans(energy, config):
-    """The planner for a batch of keys in one context, compiled once."""
-    planner = bind(energy, config)
-    return quick_jit(jax.vmap(planner, (None, 0, None)))
 
 
 def plans_of(energy, config, params=TABLE, context=NO_TILT, chains=CHAINS, seed=0):

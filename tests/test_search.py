@@ -30,7 +30,7 @@ from tests.enumerable import (
     plan_counts,
     random_table,
 )
-from tests.quick import quick_jit
+from tests.quick import many_plans, quick_jit
 
 HORIZON, ACTIONS = 3, 3
 PLANS = all_plans(HORIZON, ACTIONS)
@@ -45,17 +45,12 @@ def compile_one(energy, config):
     return quick_jit(bind(energy, config))
 
 
-@functools.cache
-def compile_many(energy, config):
-    return quick_jit(jax.vmap(bind(energy, config), (None, 0, None)))
-
-
 def plan_for(config, energy=ENUMERABLE, params=None, context=NO_TILT, chains=None, seed=0):
     """Makes a plan with one key, or plans with `chains` keys."""
     key = jax.random.key(seed)
     if chains is None:
         return jax.tree.map(np.asarray, compile_one(energy, config)(params, key, context))
-    plans = compile_many(energy, config)(params, jax.random.split(key, chains), context)
+    plans = many_plans(energy, config)(params, jax.random.split(key, chains), context)
     return jax.tree.map(np.asarray, plans)
 
 
