@@ -21,10 +21,10 @@ from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_pla
 if TYPE_CHECKING:
     import gymnasium as gym
 
-    from leapjax.models.config import ModelConfig
+    from leapjax.models.config import ModelConfig, Sizes
     from leapjax.models.encoder import Encoder
 
-EncoderMaker = Callable[["ModelConfig", int], "Encoder"]  # (model, K) -> encoder
+EncoderMaker = Callable[["ModelConfig", "Sizes"], "Encoder"]  # (model, sizes) -> encoder
 Encoders = Mapping[str, EncoderMaker]  # by architecture
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # Statistics of training data, kept in checkpoints: [array of an observation][column][number].
@@ -196,7 +196,7 @@ class Domain(NamedTuple):
         actions: names of the actions; the last ends a plan.
         max_steps: steps of the longest episode.
         blank: an observation of zeros, as NumPy arrays: shapes and types.
-        encoders: by architecture, (model, K) -> encoder of contexts.
+        encoders: by architecture, (model, sizes) -> encoder of contexts.
         demonstrations: how demonstrations are made and checked.
         augmentations: random changes of training windows.
         scaling: scaling of returns and observations.

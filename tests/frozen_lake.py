@@ -63,7 +63,7 @@ def make(level: str, settings: Settings) -> Domain:
         actions=("left", "down", "right", "up", "end"),
         max_steps=100,
         blank=np.zeros((), np.int64),
-        encoders=dict.fromkeys(("paper", "leapjax"), lambda model, context: Cell(model.width)),
+        encoders=dict.fromkeys(("paper", "leapjax"), lambda model, sizes: Cell(model.width)),
         demonstrations=Demonstrations(functools.partial(collect_solved, make_adapter, solve)),
     )
 

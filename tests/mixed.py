@@ -40,8 +40,8 @@ class Places(Encoder):
 
 DOMAIN = toy.DOMAIN._replace(
     encoders={
-        "leapjax": lambda model, context: Place(model.width),
-        "paper": lambda model, context: Places(model.width),
+        "leapjax": lambda model, sizes: Place(model.width),
+        "paper": lambda model, sizes: Places(model.width),
     },
     augmentations=Augmentations(),
 )

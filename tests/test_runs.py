@@ -39,7 +39,7 @@ class StateTokens(Encoder):
 
 
 DOMAIN = toy.DOMAIN._replace(
-    encoders={**toy.DOMAIN.encoders, "paper": lambda model, context: StateTokens(model.width)}
+    encoders={**toy.DOMAIN.encoders, "paper": lambda model, sizes: StateTokens(model.width)}
 )
 
 
@@ -118,6 +118,6 @@ def test_where_runs_win_nothing_they_are_refused():
     ):
         with pytest.raises(UserError, match="4 consecutive windows: only LEAP with architecture"):
             method.make_agent(made, None)
-    encoders = {"paper": lambda model, context: babyai.StateTokens(7, model.width)}
+    encoders = {"paper": lambda model, sizes: babyai.StateTokens(7, model.width)}
     with pytest.raises(UserError, match="4 consecutive windows without repeated states"):
         leap.make_agent(setup(domain=DOMAIN._replace(encoders=encoders), repeat_state=False))

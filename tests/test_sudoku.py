@@ -1,5 +1,6 @@
 """Sudoku: boards have one solution, whatever is done to them; its rules as an energy."""
 
+import copy
 import functools
 import hashlib
 import itertools
@@ -24,6 +25,9 @@ from leapjax.domains.puzzles.sudoku.domain import BoardTokens, Settings, make
 from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.energy import compose
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig, Sizes
+from leapjax.models.masked import build_masked_model
+from leapjax.models.plans import make_attention_mask
 from leapjax.planners import GibbsConfig
 from leapjax.pretrained import describe_identity
 from leapjax.running import results
@@ -31,6 +35,7 @@ from leapjax.running.command_line import parse
 from leapjax.types import pad_token
 from tests.parameters import random_like
 from tests.programs import only_long
+from tests.quick import quick_jit
 
 SMALL, LARGE = Level(4, 6, 6), Level(9, 36, 36)
 LEVELS = pytest.mark.parametrize("level", [SMALL, LARGE], ids=str)
@@ -206,7 +211,7 @@ def at(cell, digits):
 
 
 def test_a_position_of_a_plan_is_the_cell_that_it_fills():
-    module, digits = BoardTokens(4, width=8), np.arange(16) % 5
+    module, digits = BoardTokens(4, width=8, whole=False), np.arange(16) % 5
     params = random_like(jax.eval_shape(module.init, jax.random.key(0), at(0, digits)))
     encode = functools.partial(module.apply, params, horizon=16, method="encode_positions")
     places = jax.jit(
@@ -217,9 +222,42 @@ def test_a_position_of_a_plan_is_the_cell_that_it_fills():
     whole = np.asarray(places(0))
     np.testing.assert_array_equal(whole, tokens[:16])  # what the network sees of a cell
     assert len(np.unique(whole, axis=0)) == 16
-    for cell in (1, 7, 15):  # later in an episode a plan begins there, and ends beyond the board
-        np.testing.assert_array_equal(places(cell)[: 16 - cell], whole[cell:])
-    assert np.isfinite(places(16)).all()  # a solved board
+    for cell in (1, 7, 15, 16):  # later in an episode the plan begins there; 16: a solved board
+        np.testing.assert_array_equal(places(cell), np.roll(whole, -cell, axis=0))
+
+
+@pytest.mark.parametrize("cell", [0, 6])
+def test_each_head_sees_rows_columns_boxes_or_the_whole_plan(cell):
+    config, everywhere = ModelConfig(layers=1, heads=4, width=16), np.arange(16)
+    module = build_masked_model(config, Sizes(5, 0, 16, 16), BoardTokens(4, 16, whole=True))
+    board = boards.Board(everywhere.astype(np.int32) % 5, np.int32(cell))
+    context = at(cell, board.digits)._replace(observation=board)
+
+    def score(module, plan):
+        memory = module.encode(context)
+        assert memory.known[0].keys.shape[0] == 1  # the positions of the plan show the cells
+        return module.logits(memory, plan, everywhere)[:, :4]
+
+    init = functools.partial(module.init, method=score)
+    params = random_like(jax.eval_shape(init, jax.random.key(0), everywhere % 4))
+    plans = np.where(np.eye(17, 16, -1), 3, 2)  # plan k + 1 differs at position k
+    scores = quick_jit(jax.vmap(functools.partial(module.apply, method=score), (None, 0)))
+    cells = (cell + everywhere) % 16
+    for head in range(4):
+        heard = copy.deepcopy(params)
+        value = heard["params"]["transformer"]["blocks_0"]["value"]
+        for leaf in value.values():
+            leaf[..., everywhere // 4 != head] = 0  # no other head says anything
+        seen = scores(heard, plans)
+        differs = np.abs(seen[1:] - seen[0]).max(axis=-1) > 1e-6  # [changed, position]
+        kind = groups(4).reshape(3, 4, 4)[head] if head < 3 else [everywhere]
+        together = [[any({a, b} <= {*group} for group in kind) for a in cells] for b in cells]
+        np.testing.assert_array_equal(differs, together)
+
+
+def test_too_few_heads_for_the_groups_are_refused():
+    with pytest.raises(UserError, match="2 heads: .* use at least 4 heads"):
+        make_attention_mask(ModelConfig(heads=2), 3, groups=jnp.ones((3, 3, 3), bool))
 
 
 def broken(digits, side):
@@ -391,7 +429,7 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
     monkeypatch.setattr(searches, "SEARCHES", (only,))
     monkeypatch.setattr(searches, "BEST_OF_MANY", only)
     toy = "--level Sudoku4x8 --episodes 8 --no-pictures".split()
-    network = "--steps 2 --demos 2 --batch 2 --width 8 --heads 2 --layers 1".split()
+    network = "--steps 2 --demos 2 --batch 2 --width 8 --heads 4 --layers 1".split()
     assert sudoku.main([*toy, *network]) == 0
     (folder,) = (tmp_path / "runs").glob("sudoku-*")
     assert sudoku.main([*toy, "--checkpoint", str(folder), "--rules", "1"]) == 0

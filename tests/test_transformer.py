@@ -46,8 +46,8 @@ def gelu(x):
 
 
 def oracle(params, x, mask):
-    """Outputs at every token, where token i attends to token j if `mask[i, j]`."""
-    params = params["params"]
+    """Outputs at every token: token i attends to j if `mask[i, j]`, or `mask[head, i, j]`."""
+    params, mask = params["params"], np.broadcast_to(mask, (HEADS, len(x), len(x)))
     x = x.astype(np.float64)
     size = WIDTH // HEADS
     for index in range(LAYERS):
@@ -58,7 +58,7 @@ def oracle(params, x, mask):
         for head in range(HEADS):
             part = slice(head * size, (head + 1) * size)
             for i in range(len(x)):
-                seen = np.flatnonzero(mask[i])
+                seen = np.flatnonzero(mask[head, i])
                 scores = keys[seen, part] @ queries[i, part] / np.sqrt(size)
                 weights = np.exp(scores - scores.max())
                 attended[i, part] = weights / weights.sum() @ values[seen, part]
@@ -89,7 +89,8 @@ JOINED = np.concatenate([FIXED, X])
 
 def test_attention_equals_the_oracle():
     mask = some_mask(TOKENS, TOKENS)
-    for given, seen in ((None, np.ones_like(mask)), (mask, mask)):
+    of_heads = np.stack([mask.T, mask])
+    for given, seen in ((None, np.ones_like(mask)), (of_heads, of_heads), (mask, mask)):
         expected = oracle(PARAMS, X, seen)
         np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE, given), expected, **CLOSE)
     for other in (mask.T, np.ones_like(mask)):  # rows look, columns are looked at

@@ -58,7 +58,7 @@ DOMAIN = Domain(
     actions=("left", "right", "wait", "end"),
     max_steps=FARTHEST,
     blank=np.zeros(3, np.float32),
-    encoders={"leapjax": lambda model, context: Token(model.width)},
+    encoders={"leapjax": lambda model, sizes: Token(model.width)},
     augmentations=Augmentations([mirror]),
 )
 

@@ -115,7 +115,7 @@ class Setup(NamedTuple):
                 f"{self.domain.level} has no encoder for architecture {name!r}: "
                 f"expected one of {', '.join(self.domain.encoders)}"
             )
-        return self.domain.encoders[name](self.model, self.context)
+        return self.domain.encoders[name](self.model, self.sizes)
 
     def make_policy(self, *heads: tuple[str, int], conditioned: bool = False) -> PolicyModel:
         """Makes the network of a method that chooses one action at a time.

@@ -51,6 +51,15 @@ class Encoder(nn.Module):
         del context, horizon
         return None
 
+    def group_positions(self, context: Context, horizon: int) -> jax.Array | None:
+        """Returns which positions of a plan belong together: booleans `[G, T, T]`.
+
+        A head of the network's attention then sees one of the G kinds of groups; every further head
+        sees all positions. By default it returns `None`, and all heads see all positions.
+        """
+        del context, horizon
+        return None
+
     def place_actions(self, tokens: jax.Array, positions: PyTree) -> jax.Array:
         """Returns the tokens `[T, D]` of a plan's actions at their positions; by default the sum.
 

@@ -19,10 +19,12 @@ class Prefix(NamedTuple):
     Attributes:
         known: keys and values of the context's tokens, per layer.
         positions: positions of a plan, as the encoder's `place_actions` takes them.
+        groups: booleans `[G, T, T]` from the encoder's `group_positions`, or `None`.
     """
 
     known: list[KeysValues]
     positions: PyTree
+    groups: jax.Array | None = None
 
 
 class PrefixModel(nn.Module):
@@ -33,7 +35,8 @@ class PrefixModel(nn.Module):
     conditioned on the return to go has an additional context token.
 
     The encoder may encode the positions of a plan (`encode_positions`); otherwise this network
-    learns an embedding of each. The encoder also puts actions at their positions (`place_actions`).
+    learns an embedding of each. The encoder also puts actions at their positions (`place_actions`),
+    and may say which positions belong together (`group_positions`).
 
     Attributes:
         config: size of the network.
@@ -85,7 +88,8 @@ class PrefixModel(nn.Module):
         positions = self.context.encode_positions(context, self.sizes.horizon)
         if positions is None:
             positions = self.position(jnp.arange(self.sizes.horizon))
-        return Prefix(known, positions)
+        groups = self.context.group_positions(context, self.sizes.horizon)
+        return Prefix(known, positions, groups)
 
     def logits(
         self,
@@ -106,6 +110,6 @@ class PrefixModel(nn.Module):
         tokens = self.context.place_actions(self.action(actions), memory.positions)
         x = self.drop(tokens, deterministic=deterministic)
         cached = memory.known[0].keys.shape[0]
-        mask = make_attention_mask(self.config, self.sizes.horizon, cached)
+        mask = make_attention_mask(self.config, self.sizes.horizon, cached, memory.groups)
         h = self.transformer(x, positions, memory.known, mask, deterministic=deterministic)
         return forbid_early_end(self.head(h), positions)

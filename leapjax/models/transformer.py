@@ -109,8 +109,8 @@ class Block(nn.Module):
         Args:
             x: tokens `[Q, D]`.
             memory: keys and values of the M tokens to attend to.
-            mask: booleans `[Q, M]`, True where a token (row) attends to a token (column); `None`
-                for full attention.
+            mask: booleans `[Q, M]`, or `[heads, Q, M]`, True where a token (row) attends to a token
+                (column); `None` for full attention.
             deterministic: whether to leave out dropout.
         """
         queries = self._heads(self.query(self.norm_attention(x)))
@@ -187,7 +187,8 @@ class Transformer(nn.Module):
             queried: indices `[Q]` of the tokens to return.
             prefix: keys and values of the prefix, from `prefix`; `None` without a prefix.
             mask: booleans `[tokens, prefix + tokens]`, True where a token (row) attends to a token
-                (column), see `causal_mask`; `None` for full attention.
+                (column), see `causal_mask`; `[heads, tokens, prefix + tokens]` for a mask of each
+                head; `None` for full attention.
             deterministic: whether to leave out dropout.
         """
         for index, block in enumerate(self.blocks):
@@ -198,7 +199,7 @@ class Transformer(nn.Module):
                 )
             if index == self.layers - 1:
                 x = x[queried]
-                mask = None if mask is None else mask[queried]
+                mask = None if mask is None else mask[..., queried, :]
             x = block(x, memory, mask, deterministic)
         return self.norm(x)
 

@@ -25,7 +25,7 @@ from leapjax.domains.atari.games import FRAME_SKIP, GAMES, HEIGHT, MAX_STEPS, WI
 from leapjax.environments import Adapter
 from leapjax.errors import UserError
 from leapjax.extras import report_missing
-from leapjax.models.config import ModelConfig
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 
 LONGEST = 5_000  # most decisions of a game in the demonstrations and with preset `leapjax`
@@ -78,12 +78,12 @@ def make(name: str, settings: Settings) -> Domain:
 
         return AtariAdapter(game, settings.sticky, settings.max_steps)
 
-    def state_tokens(model: ModelConfig, context: int) -> Encoder:
-        del context
+    def state_tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        del sizes
         return StateTokens(model.width, settings.features, model.dtype)
 
-    def current_tokens(model: ModelConfig, context: int) -> Encoder:
-        del context
+    def current_tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        del sizes
         return CurrentTokens(model.width, settings.features, TOKENS, model.dtype)
 
     mirror = functools.partial(mirror_window, mirror=game.mirror, actions=game.actions)

@@ -23,7 +23,7 @@ from leapjax.domains.babyai.levels import Level
 from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.errors import UserError
-from leapjax.models.config import ModelConfig
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 
 
@@ -38,8 +38,8 @@ def make(name: str, options: Settings) -> Domain:
         side = max(env.width, env.height)
         longest = levels.longest_episode(level, env)
 
-    def state_tokens(model: ModelConfig, context: int) -> Encoder:
-        del context
+    def state_tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        del sizes
         if model.width % NORM_GROUPS:
             raise UserError(
                 f"width {model.width} is not a multiple of {NORM_GROUPS}, the groups of "
@@ -47,8 +47,8 @@ def make(name: str, options: Settings) -> Domain:
             )
         return StateTokens(side, model.width, model.dtype)
 
-    def context_tokens(model: ModelConfig, context: int) -> Encoder:
-        del context
+    def context_tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        del sizes
         return ContextTokens(options, model.width, model.dtype)
 
     return Domain(

@@ -25,7 +25,7 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.domains.gymnasium.recorded import check_environment, describe_environment
 from leapjax.environments import GymnasiumAdapter, Transition, find_criterion
 from leapjax.errors import UserError, did_you_mean, first_line
-from leapjax.models.config import ModelConfig
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.types import PyTree
 
@@ -186,8 +186,8 @@ def _describe(env: gym.Env, name: str, options: Settings) -> Domain:
         check_precision(space, observations, where)
 
     def make_encoders(statistics: Statistics) -> Encoders:
-        def tokens(num_actions: int, model: ModelConfig, context: int) -> Encoder:
-            del context
+        def tokens(num_actions: int, model: ModelConfig, sizes: Sizes) -> Encoder:
+            del sizes
             return StateTokens(parts, model.width, num_actions, model.dtype, statistics)
 
         return {

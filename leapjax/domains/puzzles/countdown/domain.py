@@ -108,7 +108,7 @@ def make(name: str, settings: Settings) -> Domain:
         blank=Problem(
             np.zeros(level.numbers, np.int32), none, np.zeros(level.length, np.int32), none
         ),
-        encoders={"leapjax": lambda model, context: ProblemTokens(level.numbers, model.width)},
+        encoders={"leapjax": lambda model, sizes: ProblemTokens(level.numbers, model.width)},
         demonstrations=demonstrate(make_adapter, functools.partial(check_problems, level=level)),
         augmentations=Augmentations(
             [problems.reorder] if settings.augment else [], problems.repeat_solution

@@ -163,7 +163,7 @@ def make(name: str, settings: Settings) -> Domain:
             np.zeros((), np.int32),
         ),
         encoders={
-            "leapjax": lambda model, context: FormulaTokens(
+            "leapjax": lambda model, sizes: FormulaTokens(
                 size.variables, model.width, settings.rounds, model.attention == "full", model.dtype
             )
         },

@@ -15,7 +15,7 @@ from leapjax.domains.puzzles.common import demonstrate
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.graphs import Graph, StarAdapter
 from leapjax.errors import UserError
-from leapjax.models.config import ModelConfig
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import dense
 from leapjax.types import Context
@@ -105,8 +105,8 @@ def make(name: str, settings: Settings) -> Domain:
         np.zeros((star.nodes - 1, 2), np.int32), np.zeros((), np.int32), np.zeros((), np.int32)
     )
 
-    def tokens(model: ModelConfig, context: int) -> Encoder:
-        del context
+    def tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        del sizes
         if settings.neighbours and model.attention == "causal":
             raise UserError(
                 "neighbours with attention 'causal': there a token may not hold a later action; "

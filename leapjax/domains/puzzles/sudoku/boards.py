@@ -85,11 +85,11 @@ def find_level(name: str) -> Level:
 @functools.cache
 def find_peers(side: int) -> np.ndarray:
     """Finds the pairs of cells that share a row, a column or a box: `[cells, cells]` bool."""
-    shared = np.logical_or.reduce([group[:, None] == group for group in _find_groups(side)])
+    shared = np.logical_or.reduce([group[:, None] == group for group in find_groups(side)])
     return shared & ~np.eye(side**2, dtype=bool)
 
 
-def _find_groups(side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_groups(side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Finds the row, the column and the box of each cell: arrays `[cells]`."""
     row, column = np.divmod(np.arange(side**2), side)
     box = side_of_box(side)
@@ -234,9 +234,7 @@ def _list_peers(side: int) -> list[list[int]]:
 @functools.cache
 def _list_groups(side: int) -> list[list[int]]:
     """Lists the cells of each row, column and box."""
-    return [
-        np.flatnonzero(group == n).tolist() for group in _find_groups(side) for n in range(side)
-    ]
+    return [np.flatnonzero(group == n).tolist() for group in find_groups(side) for n in range(side)]
 
 
 # All planners are measured on the same boards. `typed`, as 5.0 is not the seed 5.

@@ -15,6 +15,7 @@ from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Board, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.rules import rules
 from leapjax.errors import UserError
+from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.encoder import Encoder
 from leapjax.models.transformer import embed
 from leapjax.types import Context
@@ -40,18 +41,21 @@ class Settings:
 
 
 class BoardTokens(Encoder):
-    """A token for each cell, and a token for the cell that is written next.
+    """A token for the cell that is written next, and a token for each cell.
 
     `encode_positions` gives each action of a plan its cell, so the network need not learn for each
-    position which cells share its row, column or box.
+    position which cells share its row, column or box. A plan of the whole board then shows every
+    cell and its digit, so its context leaves the tokens of cells out.
 
     Attributes:
         side: of the board, in cells.
         width: D, of a token.
+        whole: whether plans have an action for each cell.
     """
 
     side: int
     width: int
+    whole: bool
 
     def setup(self) -> None:  # noqa: D102
         self.row = embed(self.side, self.width)
@@ -61,15 +65,23 @@ class BoardTokens(Encoder):
         self.task = embed(1, self.width)
 
     def __call__(self, context: Context) -> jax.Array:
-        """Tokens `[cells + 1, D]`."""
-        here = self._groups(context.observation.cell[None])
-        task = self.task(jnp.zeros(1, jnp.int32))
-        return jnp.concatenate([self._cells(context), task + here])
+        """Tokens `[1, D]` for whole plans, otherwise `[cells + 1, D]`."""
+        here = self.task(jnp.zeros(1, jnp.int32)) + self._groups(context.observation.cell[None])
+        return here if self.whole else jnp.concatenate([self._cells(context), here])
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
-        """Encodes the cells that a plan fills, with their content: `[T, D]`."""
+        """Encodes the cells that a plan fills, with their content: `[T, D]`.
+
+        After the last cell come the cells before the first, which are full: plans end before them.
+        """
         ahead = context.observation.cell + jnp.arange(horizon)
-        return self._cells(context)[jnp.minimum(ahead, self.side**2 - 1)]
+        return self._cells(context)[ahead % self.side**2]
+
+    def group_positions(self, context: Context, horizon: int) -> jax.Array:
+        """Groups cells by row, by column and by box: `[3, T, T]`."""
+        ahead = context.observation.cell + jnp.arange(horizon)
+        groups = jnp.stack(boards.find_groups(self.side))[:, ahead % self.side**2]
+        return groups[:, :, None] == groups[:, None]
 
     def _cells(self, context: Context) -> jax.Array:
         """Encodes all cells with their digits: `[cells, D]`."""
@@ -77,9 +89,9 @@ class BoardTokens(Encoder):
 
     def _groups(self, cells: jax.Array) -> jax.Array:
         """Encodes row, column and box of cells `[n]`, clipped to the last cell: `[n, D]`."""
-        row, column = jnp.divmod(jnp.minimum(cells, self.side**2 - 1), self.side)
-        box = boards.side_of_box(self.side)
-        return self.row(row) + self.column(column) + self.box(row // box * box + column // box)
+        cells = jnp.minimum(cells, self.side**2 - 1)
+        row, column, box = jnp.stack(boards.find_groups(self.side))[:, cells]
+        return self.row(row) + self.column(column) + self.box(box)
 
 
 def make(name: str, settings: Settings) -> Domain:
@@ -97,13 +109,17 @@ def make(name: str, settings: Settings) -> Domain:
         read = functools.partial(boards.read_board, side=side)
         file = PuzzleFile(settings.boards, "boards", read)
     turn = functools.partial(boards.transform, side=side)
+
+    def tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
+        return BoardTokens(side, model.width, whole=sizes.horizon >= level.cells)
+
     return Domain(
         level=name,
         make_adapter=functools.partial(make_adapter, file.find if file else draw_board),
         actions=(*(str(1 + digit) for digit in range(side)), "end"),
         max_steps=level.cells,
         blank=Board(np.zeros(level.cells, np.int32), np.zeros((), np.int32)),
-        encoders={"leapjax": lambda model, context: BoardTokens(side, model.width)},
+        encoders={"leapjax": tokens},
         demonstrations=demonstrate(
             functools.partial(make_adapter, draw_board),  # training never sees the file
             functools.partial(check_boards, side=side),
