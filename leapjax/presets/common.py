@@ -95,6 +95,7 @@ def configure(
     training: Mapping[str, Any],
     planner: PlannerConfig,
     domain_settings: Any,
+    network: Mapping[str, Any] = {},
     **others: Any,
 ) -> AnyConfig:
     """Makes a configuration; the preset decides only the network and its training.
@@ -108,6 +109,7 @@ def configure(
         training: changes of the preset's training.
         planner: how the method finds plans.
         domain_settings: settings of the domain.
+        network: changes of our network.
         others: further fields of `Config`.
     """
     ours = preset == "leapjax"
@@ -117,7 +119,7 @@ def configure(
         method=method,
         preset=preset,
         demos=demonstrations(method, demos),
-        model=(our_model if ours else paper_model)(method),
+        model=our_model(method, **network) if ours else paper_model(method),
         training=(our_training if ours else paper_training)(method, **training),
         planner=planner,
         method_settings=settings(method, masking="random" if ours else "each"),

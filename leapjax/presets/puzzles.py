@@ -21,6 +21,7 @@ class Puzzle(NamedTuple):
         demonstrations: number of demonstrations.
         settings: settings of the domain.
         training: changes of the preset's training.
+        network: changes of our network.
     """
 
     domain: str
@@ -29,6 +30,7 @@ class Puzzle(NamedTuple):
     demonstrations: int
     settings: Any
     training: Mapping[str, Any]
+    network: Mapping[str, Any] = {}
 
 
 def make_presets(describe: Callable[[str, str], Puzzle]) -> tuple[Preset, Preset]:
@@ -60,6 +62,7 @@ def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
         preset,
         demos=puzzle.demonstrations,
         training=training,
+        network={} if method in common.UNTRAINED else puzzle.network,
         planner=common.search(method, puzzle.length, puzzle.length, fill="confident"),
         domain_settings=puzzle.settings,
         episodes=EPISODES,
