@@ -19,7 +19,7 @@ def describe(name: str, method: str) -> Puzzle:
         training = {"steps": 2000, "batch": 64, "learning_rate": 1e-3}
         return Puzzle("sudoku", name, level.cells, 500, Settings(), training)
     steps = 1500 if level.fewest == level.most else 8000
-    training = {"steps": steps, "batch": 32, "learning_rate": 1e-3, "microbatch": 8}
+    training = {"steps": steps, "batch": 32, "learning_rate": 2e-3, "microbatch": 8}
     network = {"layers": 8, "width": 96}
     return Puzzle("sudoku", name, level.cells, 3000, Settings(), training, network)
 
