@@ -23,7 +23,7 @@ def crossing(context, actions):  # a constraint: how often a plan steps onto the
 
 
 energy = leap.constrain(leap.from_total(encode, total, num_actions=5), crossing)
-config = leap.GibbsConfig(horizon=12, iterations=120, temperature=0.5, restarts=16, score=True)
+config = leap.GibbsConfig(horizon=12, iterations=60, temperature=0.5, restarts=16, score=True)
 plan = leap.compile_planner(energy, config)
 
 starts = jnp.stack([jnp.zeros(256, jnp.int32), jnp.arange(256) % 3], axis=1)

@@ -87,8 +87,9 @@ def backtrack(literals: np.ndarray, size: Size) -> Solved:
     return Solved(values, steps)
 
 
-def compare(size: Size, seeds: Sequence[int]) -> Table:
+def compare(level: str, seeds: Sequence[int]) -> Table:
     """Solves the formulas of some level seeds with each solver: success, steps and time."""
+    size = formulas.find_level(level)
     drawn = [formulas.draw(size, seed)[0] for seed in seeds]
     solvers: dict[str, Callable[[np.ndarray, int], Solved]] = {
         f"WalkSAT, at most {FLIPS} flips": lambda literals, seed: walk(literals, size, seed),

@@ -15,7 +15,7 @@ from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
 from leapjax.models.encoder import Encoder
 from tests import mixed
-from tests.parameters import random_state
+from tests.parameters import random_state, scaled_like
 from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.test_models import SIDE, random_context
@@ -66,7 +66,7 @@ def test_states_are_encoded_as_each_is_alone(differentiated, monkeypatch, past=3
     monkeypatch.setattr(state_tokens, "AT_A_TIME", 16)
     encoder, batch = state_tokens.StateTokens(SIDE, 16).add_later_state(), contexts(past)
     one = jax.tree.map(lambda leaf: leaf[0], batch)
-    params = quick_jit(encoder.init)(jax.random.key(0), one)
+    params = scaled_like(jax.eval_shape(encoder.init, jax.random.key(0), one))
     weights = np.random.default_rng(0).normal(size=(4, past + 2, 16)).astype(np.float32)
 
     @jax.jit  # of the largest of equal cells, which is taken is a matter of rounding

@@ -312,7 +312,8 @@ COUNTS = ("-1", "0", "2", "100000", "2147483647", "2147483648", "922337203685477
 NUMBERS = ("-1", "0", "0.5", "nan", "inf", "-inf", "1e39", "1e308", "9" * 5000)
 LEVELS = {
     "babyai": "GoToLocalS7N5", "stars": "Star3x5", "sudoku": "Sudoku4x6",
-    "gymnasium": "FrozenLake-v1", "atari": "Breakout",
+    "countdown": "Countdown3", "satisfiability": "Nae20x42", "gymnasium": "FrozenLake-v1",
+    "atari": "Breakout",
 }  # fmt: skip
 
 

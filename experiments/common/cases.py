@@ -529,12 +529,14 @@ def select_rows(
 
 def make_table(rows: Sequence[Row]) -> Table:
     """Tabulates rows for a terminal; below them, means over training seeds if there are several."""
-    shown = Table("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "paper")
+    shown = Table(
+        *("case", "way", "method", "seed", "N = 1", "success [95%]", "ms per plan", "published")
+    )
 
     def named(row: Row) -> tuple[str, ...]:
         return row["case"], row["way"], f"{row['method']} ({row['preset']})"
 
-    def paper(row: Row) -> str:
+    def published(row: Row) -> str:
         found = row["paper_success"]
         return "-" if found is None else f"{found:.1f}%"
 
@@ -546,10 +548,10 @@ def make_table(rows: Sequence[Row]) -> Table:
             "" if first is None else f"{first / row['episodes']:.1%}",
             results.format_rate(row),
             f"{1e3 / row['plans_per_second']:.2f}",
-            paper(row),
+            published(row),
         )
     shown.add_section()
     for group in results.group_seeds(rows, named):
         mean = results.format_rate_over_seeds(group)
-        shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", paper(group[0]))
+        shown.add_row(*named(group[0]), f"mean of {len(group)}", "", mean, "", published(group[0]))
     return shown

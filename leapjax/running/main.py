@@ -8,7 +8,7 @@ import jax
 from rich.console import Console
 
 from leapjax import files, processes
-from leapjax.configuration import AnyConfig, hash_config
+from leapjax.configuration import AnyConfig, choose_episode_seeds, hash_config
 from leapjax.errors import UserError
 from leapjax.running import jax_setup, results, shell
 from leapjax.running.command_line import parse
@@ -50,6 +50,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
         console.print(results.make_success_table(rows), results.make_time_table(rows))
     if failure is not None:
         raise failure
+    compare(experiment, configs, console)
 
 
 def finish(
@@ -100,6 +101,16 @@ def complete(run: Run, versions: Mapping[str, str]) -> results.Row:
     planner = add_rules(run, planner)
     episodes = evaluate(run, planner)
     return record(run, planner, episodes, versions)
+
+
+def compare(experiment: Experiment, configs: Sequence[AnyConfig], console: Console) -> None:
+    """Prints how solvers that learn nothing do on the levels that were played, each level once."""
+    if experiment.compare is None:
+        return
+    played = {config.play or config.level: choose_episode_seeds(config) for config in configs}
+    for level, seeds in played.items():
+        console.print(f"{level}, solvers that learn nothing:")
+        console.print(experiment.compare(level, seeds))
 
 
 def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:

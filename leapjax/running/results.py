@@ -317,8 +317,8 @@ def group_seeds(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row
 
 def summarize(row: Row) -> str:
     """Summarises a row in one line."""
-    paper = "" if row.get("paper_success") is None else f", paper {row['paper_success']}%"
-    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{paper}"]
+    published = "" if row.get("paper_success") is None else f", published {row['paper_success']}%"
+    parts = [f"success {format_success(row)}", f"mean length {row['mean_length']:.1f}{published}"]
     if "criterion" not in row:
         return ", ".join(parts)
     total = f"mean return {format_return(row)}"
@@ -360,7 +360,7 @@ def name_planner(row: Row) -> str:
 
 
 def make_success_table(rows: Sequence[Row]) -> Table:
-    """Makes a table of success rates beside the paper's, and of means over several training seeds.
+    """Makes a table of success rates beside the published ones, and of means over seeds.
 
     The mean return comes first if the user did not give the criterion of success of some row.
     """
@@ -372,27 +372,27 @@ def make_success_table(rows: Sequence[Row]) -> Table:
         measures = dict(reversed(measures.items()))
     criteria = sorted({f"success: {row['criterion']}" for row in rows if "criterion" in row})
     result = Table(
-        *("level", "method", "planner", "seed", *measures, "length", "paper"),
+        *("level", "method", "planner", "seed", *measures, "length", "published"),
         caption="\n".join(criteria) or None,
     )
 
     def named(row: Row) -> tuple[str, ...]:
         return row["level"], f"{row['method']} ({row['preset']})", name_planner(row)
 
-    def paper(row: Row) -> str:
+    def published(row: Row) -> str:
         found = row.get("paper_success")
         return "-" if found is None else f"{found:.1f}%"
 
     for row in rows:
         said = (measure(row) for measure, _ in measures.values())
         length = f"{row['mean_length']:.1f}"
-        result.add_row(*named(row), str(row["seed"]), *said, length, paper(row))
+        result.add_row(*named(row), str(row["seed"]), *said, length, published(row))
     result.add_section()
     for group in group_seeds(rows, named):
         said = (measure(group) for _, measure in measures.values())
         length = f"{statistics.fmean(row['mean_length'] for row in group):.1f}"
         seeds = f"mean of {len(group)}"
-        result.add_row(*named(group[0]), seeds, *said, length, paper(group[0]))
+        result.add_row(*named(group[0]), seeds, *said, length, published(group[0]))
     return result
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
+from rich.table import Table
 
 from leapjax import files, processes
 from leapjax.configuration import (
@@ -36,6 +37,7 @@ class Experiment(NamedTuple):
         searches: (configuration) -> configurations that plan in other ways with the trained
             parameters; each makes a row. `None` if the experiment has a single way.
         animate: (planner, run, level seeds, path); draws how plans are refined and executed.
+        compare: (level, level seeds) -> table of solvers that learn nothing, on the same levels.
         iterations: whether to draw success against the number of iterations.
         config: `Config`, or a subclass with the program's own names of options.
         paper: (level, method) -> the paper's success, in percent, or `None`. The field is `None` if
@@ -47,6 +49,7 @@ class Experiment(NamedTuple):
     domain: str
     searches: Callable[[AnyConfig], Sequence[AnyConfig]] | None = None
     animate: "Callable[[Pretrained, Run, Sequence[int], Path], None] | None" = None
+    compare: Callable[[str, Sequence[int]], Table] | None = None
     iterations: bool = True
     config: type[AnyConfig] = Config
     paper: Callable[[str, str], float | None] | None = None
