@@ -18,7 +18,7 @@ from leapjax.running.results import Row
 
 
 def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
-    """Draws success rates against planning iterations, a panel for each level.
+    """Draws success rates against planning passes, a panel for each level.
 
     Args:
         rows: rows by level, label of the line, and number of iterations.

@@ -12,36 +12,46 @@ class Search(NamedTuple):
 
     Attributes:
         name: title in tables.
-        passes: passes of the model in units of the horizon T; 0 for a single pass.
+        passes: passes of the model, at most, in units of the horizon T; 0 for a single pass.
         options: fields of `GibbsConfig`, without the number of iterations.
+        reopened: share of the positions that a round reopens.
     """
 
     name: str
     passes: int
     options: Mapping[str, Any]
+    reopened: float = 0.0
 
     @property
     def cost(self) -> str:
-        """All passes of the model, restarts included: "1", "T" or "n T"."""
+        """All passes of the model, restarts included: "1", "T", "n T" or, at most, "≤ n T"."""
         passes = self.passes * self.options.get("restarts", 1)
-        return {0: "1", 1: "T"}.get(passes, f"{passes} T")
+        most = "≤ " * bool({"certainty", "entropy_bound"} & {*self.options})
+        return most + {0: "1", 1: "T"}.get(passes, f"{passes} T")
 
     def of(self, horizon: int) -> dict[str, Any]:
         """Returns the fields of `GibbsConfig` for plans of `horizon` actions."""
         plain = {"fill": "together", "order": "random"}
-        return {**plain, **self.options, "iterations": max(1, self.passes * horizon)}
+        rounds = {"reopened": round(self.reopened * horizon)} if self.reopened else {}
+        return {**plain, **self.options, **rounds, "iterations": max(1, self.passes * horizon)}
 
 
 SEARCHES = (
     Search("all at once", 0, {}),
     Search("left to right", 1, {"fill": "sequential"}),
     Search("in random order", 1, {"fill": "random"}),
-    *(Search("Gibbs sampling, random order", n, {}) for n in (1, 2, 4)),
-    *(Search("Gibbs sampling, left to right", n, {"order": "sequential"}) for n in (1, 2, 4)),
-    *(Search("Gibbs sampling, least certain first", n, {"order": "uncertain"}) for n in (1, 2, 4)),
+    *(Search("Gibbs sampling, random order", n, {}) for n in (1, 2)),
     Search("most certain first", 1, {"fill": "confident"}),
     Search("most certain first, by margin", 1, {"fill": "margin"}),
     Search("most certain first, then Gibbs", 2, {"fill": "confident", "order": "uncertain"}),
+    Search("all that are certain", 1, {"fill": "confident", "certainty": 0.999}),
+    Search("as many as are independent", 1, {"fill": "confident", "entropy_bound": 0.01}),
+    Search(
+        "all that are certain, doubtful ones again",
+        4,
+        {"fill": "confident", "certainty": 0.999, "temperature": 1.0},
+        reopened=0.5,
+    ),
 )
 # Only for rules, which score a plan in one pass. A learned energy needs T passes more.
 BEST_OF_MANY = Search(

@@ -19,6 +19,7 @@ PAYS_ON = ("Star3x5, learned", "Star5x10, learned", "Sudoku9x36, learned", "Sudo
 PAYING = (
     ("all at once", "1"), ("left to right", "T"), ("in random order", "T"),
     ("Gibbs sampling, random order", "2 T"), ("most certain first", "T"),
+    ("all that are certain", "≤ T"), ("all that are certain, doubtful ones again", "≤ 4 T"),
     ("most certain first, best of 16", "16 T"),
 )  # fmt: skip
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
@@ -64,14 +65,19 @@ def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[
 
 
 def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
-    """Adds up the rows with a learned energy, by level, name of the search and passes."""
+    """Adds up the rows with a learned energy, by level, name of the search and passes.
+
+    Older rows do not say how many passes a plan took: theirs took as many as there are iterations.
+    """
     added: dict[str, dict[str, dict[int, Row]]] = {}
     planned = [row for row in rows if row["method"] == "leap"]
     for level, ways in group_by_search(planned).items():
         for name, _, of in ways if level.endswith(LEARNED) else []:
             if of:
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
-                added.setdefault(level, {}).setdefault(name, {})[of[0]["iterations"]] = sums
+                taken = [row.get("passes", row["iterations"]) for row in of]
+                mean = round(sum(taken) / len(taken), 1)
+                added.setdefault(level, {}).setdefault(name, {})[mean] = sums
     return added
 
 
