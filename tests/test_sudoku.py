@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import babyai, sudoku
+from experiments import babyai, sudoku, sudoku_mixture
 from experiments.common import searches
 from leapjax import files
 from leapjax.batching import compile_planner
@@ -462,3 +462,22 @@ def test_rules_that_cannot_be_had_are_one_line(program, arguments, message, caps
     assert program.main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_a_mixture_adds_digits_of_the_solution_to_boards_of_17_givens(tmp_path, capsys):
+    source, target = write_boards(tmp_path, *[SEVENTEEN] * 40), tmp_path / "mixture.txt"
+    assert sudoku_mixture.main([str(source), str(target), "--count", "36"]) == 0
+    made = np.array([read_digits(line) for line in target.read_text().split()])
+    clues, (solution,) = read_digits(SEVENTEEN), boards.find_solutions(read_digits(SEVENTEEN))
+    assert_equal = np.testing.assert_array_equal
+    assert_equal((made > 0).sum(1), [*range(17, 35)] * 2)
+    assert_equal(made[:, clues > 0], np.tile(clues[clues > 0], (36, 1)))
+    assert_equal(made[made > 0], np.tile(solution, (36, 1))[made > 0])
+    assert len(np.unique(made[17::18], axis=0)) == 2  # other cells each time
+    assert sudoku_mixture.main([str(source), str(target), "--count", "41"]) == 2
+    assert "has 40 boards: expected at least 41" in capsys.readouterr().err
+    more = target.read_text().split()[1]
+    assert (
+        sudoku_mixture.main([str(write_boards(tmp_path, more)), str(target), "--count", "1"]) == 2
+    )
+    assert "line 3: 18 givens, expected 17" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from leapjax.running import plots
 from leapjax.running.results import Row
 
 
-def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: Path) -> None:
+def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[float, Row]]], path: Path) -> None:
     """Draws success rates against planning passes, a panel for each level.
 
     Args:
@@ -38,7 +38,7 @@ def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[int, Row]]], path: P
         axis.set_title(level, fontsize=9)
         axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
         ticks = sorted({count for by_count in by_label.values() for count in by_count})
-        axis.set_xticks(ticks, [str(count) for count in ticks])
+        axis.set_xticks(ticks, [f"{count:g}" for count in ticks])
         axis.minorticks_off()
     columns = max(1, min(len(rows), 4, len(labels)))
     figure.set_figheight(figure.get_figheight() + 0.2 * len(labels) / columns)

@@ -146,13 +146,15 @@ def compare_iterations(rows: Sequence[Row]) -> str:
     return make_table("level | preset | " + " | ".join(f"N = {n}" for n in ITERATIONS), lines)
 
 
-def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]]]:
     """Groups the rows of training seed 0 by level, title of the setting, and N."""
     first = select([row for row in rows if row["seed"] == 0], LEVELS, BY_ITERATIONS)
-    found: dict[str, dict[str, dict[int, Row]]] = {}
+    found: dict[str, dict[str, dict[float, Row]]] = {}
     for level in LEVELS:
         for title in ITERATED:
-            by_count = {n: of[0] for n in ITERATIONS if (of := first[level, (title, n)])}
+            by_count: dict[float, Row] = {
+                n: of[0] for n in ITERATIONS if (of := first[level, (title, n)])
+            }
             if len(by_count) > 1:  # a single N does not show the effect of iterations
                 found.setdefault(level, {})[title] = by_count
     return found

@@ -64,18 +64,18 @@ def group_by_search(rows: Sequence[Row]) -> dict[str, list[tuple[str, str, list[
     return found
 
 
-def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[int, Row]]]:
+def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]]]:
     """Adds up the rows with a learned energy, by level, name of the search and passes.
 
     Older rows do not say how many passes a plan took: theirs took as many as there are iterations.
     """
-    added: dict[str, dict[str, dict[int, Row]]] = {}
+    added: dict[str, dict[str, dict[float, Row]]] = {}
     planned = [row for row in rows if row["method"] == "leap"]
     for level, ways in group_by_search(planned).items():
         for name, _, of in ways if level.endswith(LEARNED) else []:
             if of:
                 sums = {key: sum(row[key] for row in of) for key in ("successes", "episodes")}
-                taken = [row.get("passes", row["iterations"]) for row in of]
+                taken = [float(row.get("passes") or row["iterations"]) for row in of]
                 mean = round(sum(taken) / len(taken), 1)
                 added.setdefault(level, {}).setdefault(name, {})[mean] = sums
     return added

@@ -151,7 +151,15 @@ class PuzzleFile(Generic[P]):
                 f"seeds from {UNSEEN} on: it has no level of seed {seed}",
                 "test_seed", "validation",
             )  # fmt: skip
-        number, text = self.lines[seed - UNSEEN]
+        return self.read_line(seed - UNSEEN)
+
+    def read_line(self, place: int) -> P:
+        """Reads the puzzle at a place of `lines`.
+
+        Raises:
+            UserError: its line cannot be read.
+        """
+        number, text = self.lines[place]
         try:
             return self.read(text)
         except UserError as error:
