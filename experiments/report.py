@@ -19,7 +19,7 @@ from leapjax.files import read_text, write_text
 from leapjax.running import results, shell, startup
 from leapjax.running.results import Row
 
-DOCUMENTS = ("README.md", "docs/performance.md", "docs/reproduction.md")
+DOCUMENTS = ("README.md", "docs/performance.md", "docs/reproduction.md", "docs/search.md")
 PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
@@ -112,6 +112,7 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
         "price": (functools.partial(babyai.compare_prices, measured=rows["methods"]), "babyai"),
         "search-pays": (puzzles.compare_searches, "puzzles"),
         "arms": (puzzles.compare_arms, "puzzles"),
+        "hard-boards": (puzzles.compare_boards, "puzzles"),
         "atari": (functools.partial(atari.compare_scores, data=rows["atari-data"]), "atari"),
         "atari-data": (atari.describe_data, "atari-data"),
         "atari-energy": (atari.compare_energies, "atari-energy"),

@@ -43,14 +43,13 @@ SEARCHES = (
     *(Search("Gibbs sampling, random order", n, {}) for n in (1, 2)),
     Search("most certain first", 1, {"fill": "confident"}),
     Search("most certain first, by margin", 1, {"fill": "margin"}),
-    Search("most certain first, then Gibbs", 2, {"fill": "confident", "order": "uncertain"}),
     Search("all that are certain", 1, {"fill": "confident", "certainty": 0.999}),
     Search("as many as are independent", 1, {"fill": "confident", "entropy_bound": 0.01}),
     Search(
         "all that are certain, doubtful ones again",
         4,
         {"fill": "confident", "certainty": 0.999, "temperature": 1.0},
-        reopened=0.5,
+        reopened=0.75,
     ),
 )
 # Only for rules, which score a plan in one pass. A learned energy needs T passes more.

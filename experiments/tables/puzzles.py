@@ -2,9 +2,12 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from experiments.common.searches import BEST_OF_MANY, SEARCHES
 from experiments.tables.cells import format_rate, make_table
 from experiments.tables.settings import Setting, select
+from leapjax.configuration import list_settings
 from leapjax.presets import find_preset
 from leapjax.running.results import Row
 
@@ -22,13 +25,15 @@ PAYING = (
     ("all that are certain", "≤ T"), ("all that are certain, doubtful ones again", "≤ 4 T"),
     ("most certain first, best of 16", "16 T"),
 )  # fmt: skip
+HARD = "Sudoku9x31-42"  # level in training; its planners also play boards of a file
+TRAINED = ("demos", "model", "training", "method_settings")  # settings of a planner
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
 
 
 def is_used(row: Row) -> bool:
     """Tells whether today's code makes such a row; tables and figures do not show every row."""
     return bool(group_by_search([row])) or any(
-        of for _, by_count in group_by_arms([row]) for of in by_count
+        of for _, by_count in [*group_by_arms([row]), *group_by_boards([row])] for of in by_count
     )
 
 
@@ -79,6 +84,53 @@ def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]
                 mean = round(sum(taken) / len(taken), 1)
                 added.setdefault(level, {}).setdefault(name, {})[mean] = sums
     return added
+
+
+def compare_boards(rows: Sequence[Row]) -> str:
+    """Tabulates passes and success on boards like those of training, and on boards of a file."""
+    lines = [
+        [name, *(_average_passes(of) for of in by_boards[1:2]), *map(format_rate, by_boards)]
+        for name, by_boards in group_by_boards(rows)
+        if any(by_boards)
+    ]
+    return make_table(
+        "search | passes, 17 to 34 givens | 31 to 42 givens | 17 to 34 givens | "
+        "17 to 34 givens, with rules",
+        lines,
+    )
+
+
+def _average_passes(rows: Sequence[Row]) -> str:
+    return f"{np.mean([row['passes'] for row in rows]):.0f}" if rows else "-"
+
+
+def group_by_boards(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
+    """Groups rows of `HARD` by search, and by boards: drawn; of a file; of a file, with rules."""
+    config = find_preset("sudoku", HARD, "leap", "leapjax")
+    settings = list_settings(config, seed=0)
+    trained = [
+        row for row in rows
+        if (row["level"], row["method"]) == (HARD, "leap")
+        and all(row["configuration"][key] == settings[key] for key in TRAINED)
+    ]  # fmt: skip
+    found = []
+    for search in SEARCHES:
+        planner = settings["planner"] | search.of(config.planner.horizon)
+        of = [
+            row
+            for row in trained
+            if settings["planner"] | row["configuration"]["planner"] == planner
+        ]
+        boards = [
+            [
+                row for row in of
+                if bool(row["configuration"]["domain_settings"].get("boards")) == from_file
+                and row["configuration"]["rules"] == rules
+            ]
+            for from_file, rules in ((False, 0.0), (True, 0.0), (True, 1.0))
+        ]  # fmt: skip
+        found.append((search.name, boards))
+    return found
 
 
 def compare_arms(rows: Sequence[Row]) -> str:

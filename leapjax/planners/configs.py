@@ -72,9 +72,10 @@ class GibbsConfig:
         keep: Which plan of the trace to return: the "last", or the "best". The energies of the
             whole trace cost N * T more passes.
         reopened: Doubtful positions that a round after the fill masks and fills again; 0 resamples
-            instead. Rounds follow while passes are left, until the average action has at least
-            probability `certainty` with half of the plan masked. The planner returns the plan of
-            least doubt. Judging a plan costs 2 passes.
+            instead. Rounds draw at `temperature`; the first plan takes the likeliest actions.
+            Rounds follow while passes are left, until the average action has at least probability
+            `certainty` with half of the plan masked. The planner returns the plan of least doubt.
+            Judging a plan costs 2 passes.
     """
 
     horizon: int = 5

@@ -137,10 +137,12 @@ def _run_chain(
             age = age.at[where].set(jnp.floor(age[where]) + 1 + chosen[:, 0] / 2)
         return _Plan(plan.actions.at[where].set(drawn), age), ~jnp.any(is_undefined(energies))
 
-    def fill_open(plan: _Plan, key: jax.Array) -> tuple[_Plan, jax.Array, jax.Array, jax.Array]:
+    def fill_open(
+        plan: _Plan, key: jax.Array, temperature: float
+    ) -> tuple[_Plan, jax.Array, jax.Array, jax.Array]:
         """Fills all open positions; returns the plan, passes, trace, and whether all is defined."""
         most = horizon if commitment.adapts else config.resampled
-        noise = config.temperature * draw_noise(key, filling, most)
+        noise = temperature * draw_noise(key, filling, most)
         trace = jnp.tile(plan.actions, (filling, 1))
         plan, passes, trace, valid = jax.lax.while_loop(
             lambda state: jnp.any(state[0].actions == mask),
@@ -177,7 +179,7 @@ def _run_chain(
 
     def refill(plan: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Fills the open positions of a plan, as `reopen` wants it."""
-        filled, passes, _, valid = fill_open(_Plan(plan), key)
+        filled, passes, _, valid = fill_open(_Plan(plan), key, config.temperature)
         return filled.actions, passes, valid
 
     blank = jnp.full((horizon,), mask, jnp.int32)
@@ -191,7 +193,9 @@ def _run_chain(
         plan, begun_valid = draw(plan, everywhere, query(blank, everywhere), noise)
         begun = plan.actions[None]
     else:
-        plan, passes, begun, begun_valid = fill_open(plan, start_key)
+        greedy = config.reopened > 0  # the first plan; rounds draw
+        temperature = 0.0 if greedy else config.temperature
+        plan, passes, begun, begun_valid = fill_open(plan, start_key, temperature)
 
     if config.reopened:
         begun = jnp.concatenate([begun, jnp.tile(plan.actions, (later, 1))])
