@@ -1,13 +1,14 @@
 """Tables and plots say what the rows say."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 from experiments import report
 from experiments.common import figures
 from experiments.tables import babyai, puzzles
 from experiments.tables.cells import format_beside, format_rate
-from leapjax.configuration import hash_config
+from leapjax.configuration import hash_config, list_settings
 from leapjax.domains.babyai.levels import LEVELS
 from leapjax.presets import find_preset
 from tests.programs import with_options
@@ -104,6 +105,31 @@ def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
         "iterations": config.planner.iterations, "train_steps": config.training.steps,
         "hash": hash_config(config, seed),
     }  # fmt: skip
+
+
+def board_row(rate, passes=81, boards=None, **options):
+    """A row of the planner that plays boards of a file."""
+    config = with_options(find_preset("sudoku", puzzles.HARD, "leap", "leapjax"), options)
+    settings = json.loads(json.dumps(list_settings(config, 0)))
+    settings["domain_settings"]["boards"] = boards
+    row = puzzle_row(puzzles.HARD, rate=rate)
+    return row | {"configuration": settings, "passes": passes, "hash": f"{rate}{passes}"}
+
+
+def test_hard_boards_stand_beside_those_of_training():
+    rows = [
+        board_row(0.9), board_row(0.6, boards="hard.txt 1234"),
+        board_row(0.7, boards="hard.txt 1234", rules=1.0),
+        board_row(0.5, passes=29.6, boards="hard.txt 1234", certainty=0.999),
+        board_row(0.8, boards="hard.txt 1234", layers=2),  # another network
+    ]  # fmt: skip
+    assert [report.is_used(row) for row in rows] == [True] * 4 + [False]
+    lines = [[cell.strip().split(" ")[0] for cell in line.split("|")[1:-1]]
+             for line in puzzles.compare_boards(rows).splitlines()[2:]]  # fmt: skip
+    assert lines == [
+        ["most", "81", "90.0%", "60.0%", "70.0%"],
+        ["all", "30", "-", "50.0%", "-"],
+    ]
 
 
 def test_ways_to_search_stand_beside_each_other(tmp_path):
