@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import leapjax as leap
-from experiments import babyai, publish
+from experiments import babyai, publish, sudoku
 from leapjax import pretrained, weights
 from leapjax.errors import UserError
 from leapjax.running import results
@@ -128,14 +128,18 @@ def test_the_command_line_plays_published_planners(published, tmp_path, capsys):
         assert said in capsys.readouterr().err
 
 
-LEVELS = sorted(path.name for path in pretrained.PUBLISHED.iterdir())
+LEVELS = {
+    path.name: pretrained.read_specification(path).domain
+    for path in sorted(pretrained.PUBLISHED.iterdir())
+}
+PROGRAMS = {"babyai": babyai, "sudoku": sudoku}
 
 
 def test_what_is_published_is_of_todays_presets():
     assert len(LEVELS) > 4
-    for level in LEVELS:
-        (config,) = parse("babyai", ["--level", level, "--pretrained"])
-        (preset,) = parse("babyai", ["--level", level])
+    for level, domain in LEVELS.items():
+        (config,) = parse(domain, ["--level", level, "--pretrained"])
+        (preset,) = parse(domain, ["--level", level])
         assert config == dataclasses.replace(preset, checkpoint=config.checkpoint, pretrained=True)
         leap.load(level)
 
@@ -144,9 +148,10 @@ def test_what_is_published_is_of_todays_presets():
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_published_planner_has_the_successes_of_its_row(level, tmp_path, monkeypatch):
     """On the machine that the rows are from; on another one bits may differ."""
-    rows = results.read(ROOT / "results" / "babyai.jsonl")
+    domain = LEVELS[level]
+    rows = results.read(ROOT / "results" / f"{domain}.jsonl")
     monkeypatch.chdir(tmp_path)
-    assert babyai.main(["--level", level, "--pretrained", "--no-pictures"]) == 0
-    (found,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    assert PROGRAMS[domain].main(["--level", level, "--pretrained", "--no-pictures"]) == 0
+    (found,) = results.read(tmp_path / "runs" / f"{domain}.jsonl")
     (row,) = (row for row in rows if row["hash"] == found["hash"])
     assert found["successes"] == row["successes"]

@@ -1,6 +1,5 @@
 """Search with an energy: positions by certainty, beams in any order, dead ends, local terms."""
 
-import dataclasses
 import functools
 import itertools
 
@@ -22,7 +21,6 @@ from leapjax import (
 )
 from leapjax.planners import FILLS, bind
 from leapjax.planners.positions import Commitment, choose_open, most_certain
-from leapjax.planners.reopening import doubt
 from leapjax.types import mask_token
 from tests.enumerable import (
     all_plans,
@@ -178,68 +176,6 @@ def test_passes_count_every_conditional_and_every_total():
         (BeamConfig(HORIZON, 4, judge="energy", score=True), 8 * HORIZON),
     ):
         assert plan_for(config, params=table).passes == expected, config
-
-
-# Reopening.
-
-
-def test_doubt_is_the_energy_of_each_half_without_that_half():
-    table, plan = random_table(0, 4, 2), np.array([0, 1, 1, 0])
-    energy = enumerable_energy(4, 2)
-    memory = energy.encode(table, np.zeros((4, 2), np.float32))
-    expected = []
-    for pair in ((0, 1), (0, 2), (0, 3)):
-        value = np.zeros(4)
-        for half in (pair, tuple({0, 1, 2, 3} - {*pair})):
-            hidden = plan.copy()
-            hidden[list(half)] = mask_token(2)
-            value[list(half)] = [
-                energy.conditional(table, memory, jnp.array(hidden), jnp.array([t]))[0, plan[t]]
-                for t in half
-            ]
-        expected.append(value)
-    find = quick_jit(jax.vmap(functools.partial(doubt, energy, table, memory), (0, None)))
-    found = np.asarray(find(jax.random.split(jax.random.key(0), 60), jnp.array(plan)))
-    same = np.isclose(found[:, None], expected, rtol=1e-4).all(axis=2)
-    assert_equal(same.sum(axis=1), 1)  # each key has one of the three pairs of halves
-    assert (same.sum(axis=0) > 5).all()
-
-
-def test_reopening_finds_the_plan_of_least_doubt():
-    """With two positions that is the plan of least pseudo-likelihood energy."""
-    energy, tilt, improved = enumerable_energy(2, 3), np.zeros((2, 3), np.float32), 0
-    filled = GibbsConfig(2, 2, fill="confident", temperature=1.0)
-    for seed in range(4):
-        joint = joint_probabilities(random_table(seed, 2, 3))
-        likelihood = joint / joint.sum(0) * joint / joint.sum(1, keepdims=True)
-        best = np.unravel_index(likelihood.argmax(), (3, 3))
-        table = np.log(joint).astype(np.float32)
-        first = plan_for(filled, energy, table, tilt, chains=40)
-        config = dataclasses.replace(filled, iterations=120, reopened=2)
-        found = plan_for(config, energy, table, tilt, chains=40)
-        assert_equal(found.actions, np.tile(best, (40, 1)))
-        improved += (first.actions != best).any(1).sum()
-    assert improved > 40
-
-
-@pytest.mark.parametrize("certainty", [1.0, 0.7, 0.0])
-def test_reopening_takes_the_passes_it_is_given_or_stops_when_certain(certainty):
-    config = GibbsConfig(
-        HORIZON, 20, fill="confident", temperature=1.0, certainty=certainty, reopened=2
-    )
-    passes = set()
-    for seed in range(3):
-        plans = plan_for(config, params=random_table(seed, HORIZON, ACTIONS), chains=50)
-        assert plans.valid.all() and (plans.actions < ACTIONS).all()
-        assert_equal(plans.trace[:, -1], plans.actions)
-        passes |= {*plans.passes.tolist()}
-    assert max(passes) <= 20
-    if certainty == 1:
-        assert passes == {3 + 2 + 3 * 4}  # a fourth round of 2 + 2 passes would be too many
-    elif certainty == 0:
-        assert passes == {1 + 2}
-    else:
-        assert min(passes) <= 5 < max(passes)
 
 
 # Beams in any order.
@@ -411,10 +347,6 @@ def test_more_terms_at_a_position_than_the_degree_are_an_error():
         (lambda: GibbsConfig(5, 5, fill="margin", entropy_bound=-1.0), "entropy_bound"),
         (lambda: GibbsConfig(5, 5, keep="first"), "unknown keep 'first'"),
         (lambda: GibbsConfig(5, 5, cool_to=-1.0), "temperature"),
-        (lambda: GibbsConfig(5, 9, reopened=2), "another fill than 'together'"),
-        (lambda: GibbsConfig(5, 10, fill="margin", reopened=2), "up to 11 passes"),
-        (lambda: GibbsConfig(5, 99, fill="margin", reopened=6), "reopened"),
-        (lambda: GibbsConfig(5, 99, fill="margin", reopened=2, cool_to=0.0), "order and cool_to"),
         (lambda: BeamConfig(5, fill="together"), "unknown fill 'together'"),
         (lambda: BeamConfig(5, judge="length"), "unknown judge 'length'"),
         (lambda: BeamConfig(5, temperature=1.0, entropy_bound=0.1), "use one of the two"),

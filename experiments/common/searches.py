@@ -14,13 +14,11 @@ class Search(NamedTuple):
         name: title in tables.
         passes: passes of the model, at most, in units of the horizon T; 0 for a single pass.
         options: fields of `GibbsConfig`, without the number of iterations.
-        reopened: share of the positions that a round reopens.
     """
 
     name: str
     passes: int
     options: Mapping[str, Any]
-    reopened: float = 0.0
 
     @property
     def cost(self) -> str:
@@ -32,8 +30,7 @@ class Search(NamedTuple):
     def of(self, horizon: int) -> dict[str, Any]:
         """Returns the fields of `GibbsConfig` for plans of `horizon` actions."""
         plain = {"fill": "together", "order": "random"}
-        rounds = {"reopened": round(self.reopened * horizon)} if self.reopened else {}
-        return {**plain, **self.options, **rounds, "iterations": max(1, self.passes * horizon)}
+        return {**plain, **self.options, "iterations": max(1, self.passes * horizon)}
 
 
 SEARCHES = (
@@ -45,12 +42,6 @@ SEARCHES = (
     Search("most certain first, by margin", 1, {"fill": "margin"}),
     Search("all that are certain", 1, {"fill": "confident", "certainty": 0.999}),
     Search("as many as are independent", 1, {"fill": "confident", "entropy_bound": 0.01}),
-    Search(
-        "all that are certain, doubtful ones again",
-        4,
-        {"fill": "confident", "certainty": 0.999, "temperature": 1.0},
-        reopened=0.75,
-    ),
 )
 # Only for rules, which score a plan in one pass. A learned energy needs T passes more.
 BEST_OF_MANY = Search(

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from leapjax.checks import check_at_least, check_number, check_types
 from leapjax.planners.positions import SELECTIONS, Commitment, Select
-from leapjax.planners.reopening import HALVES
 
 # The files and command lines that hold a configuration name a strategy; programs may pass a
 # function of their own.
@@ -71,11 +70,6 @@ class GibbsConfig:
             default the temperature is constant.
         keep: Which plan of the trace to return: the "last", or the "best". The energies of the
             whole trace cost N * T more passes.
-        reopened: Doubtful positions that a round after the fill masks and fills again; 0 resamples
-            instead. Rounds draw at `temperature`; the first plan takes the likeliest actions.
-            Rounds follow while passes are left, until the average action has at least probability
-            `certainty` with half of the plan masked. The planner returns the plan of least doubt.
-            Judging a plan costs 2 passes.
     """
 
     horizon: int = 5
@@ -91,7 +85,6 @@ class GibbsConfig:
     entropy_bound: float = 0.0
     cool_to: float | None = None
     keep: str = "last"
-    reopened: int = 0
 
     def __post_init__(self) -> None:
         check_types(self, strategies=("fill",))
@@ -111,36 +104,6 @@ class GibbsConfig:
                 f"fill {self.fill!r} chooses {self.resampled} of {self.horizon} actions in a pass, "
                 f"so it needs {self.fill_iterations} iterations, got {self.iterations}"
             )
-        check_at_least(self, 0, "reopened", most=self.horizon)
-        if self.reopened:
-            self._check_reopening()
-
-    def _check_reopening(self) -> None:
-        """Checks the options of a planner that reopens plans.
-
-        Raises:
-            ValueError: an option contradicts it, or leaves no pass for a round.
-        """
-        if self.fill == "together":
-            raise ValueError(
-                "reopened fills positions again one after the other: use another fill than "
-                "'together', such as 'confident'"
-            )
-        if self.order != "random" or self.cool_to is not None:
-            raise ValueError(
-                "reopened replaces the resampling that order and cool_to are about: drop one"
-            )
-        least = self.fill_iterations + self.refill_iterations + 2 * HALVES
-        if self.iterations < least:
-            raise ValueError(
-                f"filling a plan, judging it and a round that reopens {self.reopened} positions "
-                f"take up to {least} passes: iterations must be as many, got {self.iterations}"
-            )
-
-    @property
-    def refill_iterations(self) -> int:
-        """The passes after which no reopened position is MASK, at most."""
-        return -(-self.reopened // self.resampled)
 
     @property
     def fill_iterations(self) -> int:

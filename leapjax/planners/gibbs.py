@@ -1,7 +1,6 @@
 """Gibbs sampling over action tokens (paper, algorithm 1): fill a plan, then resample it."""
 
 import functools
-import math
 from typing import NamedTuple
 
 import jax
@@ -10,7 +9,6 @@ import jax.numpy as jnp
 from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
 from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open, compute_probabilities
-from leapjax.planners.reopening import Reopened, reopen
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 
@@ -22,8 +20,7 @@ def gibbs(
     The first iterations fill every position (see `GibbsConfig.fill`). An energy that does not
     accept MASK starts from uniform actions instead, the first of them possible. Each later
     iteration masks P positions, reads the energy of every action there, and draws actions with
-    probability proportional to `exp(-energy / temperature)`. With `GibbsConfig.reopened` later
-    rounds mask many doubtful positions, and fill them as the first plan was filled.
+    probability proportional to `exp(-energy / temperature)`.
 
     Filling one position at a time, at temperature 1 and with the conditionals of a joint
     distribution, draws from that joint by the chain rule. The next position may depend on the
@@ -103,13 +100,12 @@ class _Chain(NamedTuple):
 def _run_chain(
     energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
 ) -> _Chain:
-    """Fills a plan, and then resamples or reopens it."""
+    """Fills a plan, and then resamples it."""
     horizon, filling = config.horizon, config.fill_iterations
     later = config.iterations - filling
     order_key, noise_key, start_key = jax.random.split(key, 3)
     everywhere = jnp.arange(horizon)
     mask = mask_token(energy.num_actions)
-    commitment, rank_key = make_commitment(config), jax.random.fold_in(start_key, 1)
 
     # The noise of all iterations is drawn here: a draw inside the loop costs more.
     def draw_noise(k: jax.Array, *shape: int) -> jax.Array:
@@ -137,32 +133,16 @@ def _run_chain(
             age = age.at[where].set(jnp.floor(age[where]) + 1 + chosen[:, 0] / 2)
         return _Plan(plan.actions.at[where].set(drawn), age), ~jnp.any(is_undefined(energies))
 
-    def fill_open(
-        plan: _Plan, key: jax.Array, temperature: float
-    ) -> tuple[_Plan, jax.Array, jax.Array, jax.Array]:
-        """Fills all open positions; returns the plan, passes, trace, and whether all is defined."""
-        most = horizon if commitment.adapts else config.resampled
-        noise = temperature * draw_noise(key, filling, most)
-        trace = jnp.tile(plan.actions, (filling, 1))
-        plan, passes, trace, valid = jax.lax.while_loop(
-            lambda state: jnp.any(state[0].actions == mask),
-            functools.partial(fill, noise),
-            (plan, jnp.zeros((), jnp.int32), trace, jnp.array(True)),
-        )
-        trace = jnp.where(jnp.arange(filling)[:, None] < passes, trace, plan.actions)
-        return plan, passes, trace, valid
-
     def fill(
-        noise: jax.Array,
         state: tuple[_Plan, jax.Array, jax.Array, jax.Array],
     ) -> tuple[_Plan, jax.Array, jax.Array, jax.Array]:
         """Fills open positions; the others keep their actions."""
         plan, done, trace, valid = state
         open_ = plan.actions == mask
         energies = score_open(energy, params, memory, plan.actions)
-        ranks = find_selection(config.fill)(energies, rank_key)
+        ranks = select(energies, fill_key)
         where, chosen = choose_open(energies, open_, ranks, commitment)
-        drawn, defined = draw(plan, where, energies[where], noise[done])
+        drawn, defined = draw(plan, where, energies[where], fill_noise[done])
         changed = jnp.zeros(horizon, bool).at[where].set(chosen)
         plan = jax.tree.map(lambda new, old: jnp.where(changed, new, old), drawn, plan)
         return plan, done + 1, trace.at[done].set(plan.actions), valid & defined
@@ -177,11 +157,6 @@ def _run_chain(
         plan, defined = draw(plan, where, query(plan.actions, where), noise)
         return plan, (plan.actions, defined)
 
-    def refill(plan: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Fills the open positions of a plan, as `reopen` wants it."""
-        filled, passes, _, valid = fill_open(_Plan(plan), key, config.temperature)
-        return filled.actions, passes, valid
-
     blank = jnp.full((horizon,), mask, jnp.int32)
     plan = _Plan(blank, jnp.zeros(horizon) if config.order == "uncertain" else None)
     passes: jax.Array = jnp.ones((), jnp.int32)
@@ -193,19 +168,17 @@ def _run_chain(
         plan, begun_valid = draw(plan, everywhere, query(blank, everywhere), noise)
         begun = plan.actions[None]
     else:
-        greedy = config.reopened > 0  # the first plan; rounds draw
-        temperature = 0.0 if greedy else config.temperature
-        plan, passes, begun, begun_valid = fill_open(plan, start_key, temperature)
-
-    if config.reopened:
-        begun = jnp.concatenate([begun, jnp.tile(plan.actions, (later, 1))])
-        first = Reopened(plan.actions, begun, begun_valid, passes)
-        enough = -horizon * math.log(max(config.certainty, 1e-300))
-        found = reopen(
-            energy, params, memory, noise_key, first, refill,
-            count=config.reopened, longest=config.refill_iterations, enough=enough,
-        )  # fmt: skip
-        return _Chain(found.trace, found.valid, found.passes)
+        select, commitment = find_selection(config.fill), make_commitment(config)
+        fill_key = jax.random.fold_in(start_key, 1)
+        most = horizon if commitment.adapts else config.resampled
+        fill_noise = config.temperature * draw_noise(start_key, filling, most)
+        begun = jnp.tile(blank, (filling, 1))
+        plan, passes, begun, begun_valid = jax.lax.while_loop(
+            lambda state: jnp.any(state[0].actions == mask),
+            fill,
+            (plan, jnp.zeros((), jnp.int32), begun, jnp.array(True)),
+        )
+        begun = jnp.where(jnp.arange(filling)[:, None] < passes, begun, plan.actions)
 
     positions = _order_positions(order_key, config, later)  # [N - F, P]
     last = config.temperature if config.cool_to is None else config.cool_to
