@@ -144,7 +144,7 @@ def test_the_classifier_can_search_where_presets_fill_plans_action_by_action(dom
     assert found["leap"].planner.fill == "confident"
     ways = list_searches(found["classifier"])
     assert {way.planner.fill for way in ways} == {"together"}
-    assert len(list_searches(found["leap"])) > len(ways) > 5
+    assert len(list_searches(found["leap"])) > len(ways) > 1
 
 
 def test_every_program_is_known_by_name(capsys):

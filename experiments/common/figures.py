@@ -37,7 +37,10 @@ def draw_iterations(rows: Mapping[str, Mapping[str, Mapping[float, Row]]], path:
             )  # fmt: skip
         axis.set_title(level, fontsize=9)
         axis.set(xscale="log", ylim=(0, 102), xlabel="passes N")
-        ticks = sorted({count for by_count in by_label.values() for count in by_count})
+        ticks: list[float] = []  # a label takes room
+        for count in sorted({count for by_count in by_label.values() for count in by_count}):
+            if not ticks or count > 1.4 * ticks[-1]:
+                ticks.append(count)
         axis.set_xticks(ticks, [f"{count:g}" for count in ticks])
         axis.minorticks_off()
     columns = max(1, min(len(rows), 4, len(labels)))
