@@ -9,7 +9,8 @@ from leapjax.presets.puzzles import Puzzle, make_presets
 def describe(name: str, method: str) -> Puzzle:
     """Returns the numbers of a level.
 
-    On two cores 9 by 9 boards train for seven minutes, and boards of a range of clues for forty.
+    On one core 9 by 9 boards train for a quarter of an hour, and boards of a range of clues for 70
+    minutes.
 
     Raises:
         UserError: the level is unknown.
