@@ -16,7 +16,7 @@ import numpy as np
 
 from leapjax.environments import Adapter, Criterion
 from leapjax.errors import UserError
-from leapjax.types import Context, Demonstration, Energy, PyTree, Window, to_plain_dicts
+from leapjax.types import Context, Demonstration, Energy, PyTree, Turned, Window, to_plain_dicts
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -28,6 +28,7 @@ EncoderMaker = Callable[["ModelConfig", "Sizes"], "Encoder"]  # (model, sizes) -
 Encoders = Mapping[str, EncoderMaker]  # by architecture
 Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # Statistics of training data, kept in checkpoints: [array of an observation][column][number].
+Turn = Callable[..., Turned]  # (key, context, horizon=T) -> turned context
 Augmentation = Callable[[jax.Array, Window], Window]  # (key, window) -> changed window
 
 
@@ -202,6 +203,8 @@ class Domain(NamedTuple):
         scaling: scaling of returns and observations.
         rules: energy with parameters `()` that is lowest for plans that obey known rules; `None`
             without such rules.
+        turn: (key, context, horizon=T) -> the context after a random symmetry of the task, for the
+            restarts of LEAP (see `leapjax.energy.symmetric`); `None` without symmetries.
         signature: JSON values that a checkpoint and the level must agree on.
         held_out: levels of a file, which `make_adapter` then plays; `None` if it draws levels.
         made_from: (name in `leapjax.domains`, settings), from which `make_domain` made the level;
@@ -218,6 +221,7 @@ class Domain(NamedTuple):
     augmentations: Augmentations = Augmentations()
     scaling: Scaling = Scaling()
     rules: Energy | None = None
+    turn: Turn | None = None
     signature: Mapping[str, Any] = {}
     held_out: HeldOut | None = None
     made_from: tuple[str, Any] | None = None

@@ -26,8 +26,10 @@ from leapjax.types import (
     Energy,
     Params,
     PyTree,
+    Turned,
     check_num_actions,
     mask_token,
+    no_turn,
     no_violation,
 )
 
@@ -328,11 +330,16 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
             result += energy.violation(p, own_memory, actions)
         return result
 
+    def turn(params: Params, key: jax.Array, memory: PyTree) -> PyTree:
+        parts = zip(energies, params, memory, strict=True)
+        return tuple(energy.turn(p, key, own_memory) for energy, p, own_memory in parts)
+
     accepts_mask = all(energies[i].accepts_mask for i in active)
     free = all(energy.violation is no_violation for energy in energies)
+    still = all(energy.turn is no_turn for energy in energies)
     return Energy(
         encode, conditional, total, num_actions, accepts_mask,
-        no_violation if free else violation,
+        no_violation if free else violation, no_turn if still else turn,
     )  # fmt: skip
 
 
@@ -399,7 +406,14 @@ def constrain(
         mine = jnp.maximum(judge_if_complete(context, actions), 0.0)
         return energy.violation(params, inner, actions) + mine
 
-    return energy._replace(encode=encode, conditional=conditional, total=total, violation=violation)
+    def turn(params: Params, key: jax.Array, memory: PyTree) -> PyTree:
+        inner, context = memory
+        return energy.turn(params, key, inner), context
+
+    return energy._replace(
+        encode=encode, conditional=conditional, total=total, violation=violation,
+        turn=no_turn if energy.turn is no_turn else turn,
+    )  # fmt: skip
 
 
 def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
@@ -413,6 +427,76 @@ def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
         return energy.encode(params, function(context))
 
     return check_kind(energy, Energy)._replace(encode=encode)
+
+
+class _View(NamedTuple):
+    """The memory of a symmetric energy.
+
+    Attributes:
+        context: the original context.
+        memory: of the energy within, for the context as it is turned.
+        places: see `Turned`; `None` for the original context.
+        names: see `Turned`.
+    """
+
+    context: PyTree
+    memory: PyTree
+    places: jax.Array | None = None
+    names: jax.Array | None = None
+
+
+def symmetric(energy: Energy, draw: Callable[[jax.Array, PyTree], Turned]) -> Energy:
+    """Makes an energy that planners can read in other forms of the same context.
+
+    A trained energy is rarely wrong in the same way about a board and about the board with its rows
+    exchanged. So each restart of `gibbs` turns the context by a symmetry of its own, and the plan
+    that the energy judges best is returned. Plans keep the positions and actions of the original
+    context.
+
+    Args:
+        energy: energy within.
+        draw: (key, context) -> the context after a random symmetry. Every plan that solves the
+            original context, renamed, must solve the turned one.
+    """
+    num_actions = check_kind(energy, Energy).num_actions
+
+    def encode(params: Params, context: PyTree) -> _View:
+        return _View(context, energy.encode(params, context))
+
+    def turn(params: Params, key: jax.Array, view: _View) -> _View:
+        turned = draw(key, view.context)
+        return _View(
+            view.context, energy.encode(params, turned.context), turned.places, turned.names
+        )
+
+    def rename(view: _View, actions: jax.Array) -> jax.Array:
+        """Returns a plan `[T]` as the turned context has it; MASK stays MASK."""
+        if view.places is None or view.names is None:
+            return actions
+        named = jnp.take_along_axis(view.names, actions[:, None] % num_actions, axis=1)[:, 0]
+        return jnp.where(actions < num_actions, named, actions)[view.places]
+
+    def conditional(
+        params: Params, view: _View, actions: jax.Array, positions: jax.Array
+    ) -> jax.Array:
+        actions, positions = _check_query(actions, positions, num_actions)
+        if view.places is None or view.names is None:
+            return energy.conditional(params, view.memory, actions, positions)
+        there = jnp.argsort(view.places)[positions]
+        energies = energy.conditional(params, view.memory, rename(view, actions), there)
+        return jnp.take_along_axis(energies, view.names[positions], axis=1)
+
+    def total(params: Params, view: _View, actions: jax.Array) -> jax.Array:
+        actions = _check_plan(actions, num_actions)
+        return energy.total(params, view.memory, rename(view, actions))
+
+    def violation(params: Params, view: _View, actions: jax.Array) -> jax.Array:
+        return energy.violation(params, view.memory, rename(view, actions))
+
+    return energy._replace(
+        encode=encode, conditional=conditional, total=total, turn=turn,
+        violation=no_violation if energy.violation is no_violation else violation,
+    )  # fmt: skip
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:

@@ -133,6 +133,30 @@ def no_violation(params: Params, memory: PyTree, actions: jax.Array) -> jax.Arra
     return jnp.zeros(())
 
 
+def no_turn(params: Params, key: jax.Array, memory: PyTree) -> PyTree:
+    """Returns the same memory: the energy knows no symmetry of its contexts."""
+    del params, key
+    return memory
+
+
+class Turned(NamedTuple):
+    """A context in another form: the same task after a symmetry, such as rows in another order.
+
+    Position t of a plan for the turned context has the action that a plan for the original context
+    has at position `places[t]`, under another name.
+
+    Attributes:
+        context: the turned context.
+        places: `[T]` int32, a permutation of the positions.
+        names: `[T, A]` int32: action a at position t of the original plan has the name
+            `names[t, a]` in the turned one. Each row is a permutation of the actions.
+    """
+
+    context: PyTree
+    places: jax.Array
+    names: jax.Array
+
+
 class Energy(NamedTuple):
     """An energy over plans: pure functions of one trajectory, which callers `vmap`.
 
@@ -150,6 +174,8 @@ class Energy(NamedTuple):
         violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
             positive; +inf for a plan that is forbidden. For a plan that holds MASK: positive only
             if every way to complete it breaks a constraint.
+        turn: (params, key, memory) -> memory of the same context after a random symmetry, see
+            `leapjax.energy.symmetric`. Plans and energies keep their form.
     """
 
     encode: Callable[[Params, PyTree], PyTree]
@@ -158,6 +184,7 @@ class Energy(NamedTuple):
     num_actions: int
     accepts_mask: bool = True
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
+    turn: Callable[[Params, jax.Array, PyTree], PyTree] = no_turn
 
 
 def mask_token(num_actions: int) -> int:

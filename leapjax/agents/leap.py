@@ -1,6 +1,7 @@
 """LEAP: it trains a masked language model on demonstrations, and plans by Gibbs sampling."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.update import make_init, make_update
 from leapjax.checks import check_types
 from leapjax.data import windows
-from leapjax.energy import pseudo_likelihood
+from leapjax.energy import pseudo_likelihood, symmetric
 from leapjax.errors import UserError
 from leapjax.models.masked import MaskedModel, build_masked_model
 from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pad_token
@@ -84,6 +85,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return forbid_end(result)
 
     energy = pseudo_likelihood(make_encode(setup, encode), logits, sizes.num_actions)
+    turn = setup.domain.turn
+    if turn is not None:
+        energy = symmetric(energy, functools.partial(turn, horizon=sizes.horizon))
 
     def window_loss(
         params: Params, extra: PyTree, window: Window, tokens: jax.Array, key: jax.Array
@@ -169,7 +173,8 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = make_init(setup, module, touch, optimizer)
-    encode_next = make_encode_next(setup, module, encode)
+    # A memory of `encode_next` holds no context that could be turned.
+    encode_next = make_encode_next(setup, module, encode) if turn is None else None
     return Agent(init, batch, update, energy, encode_next)
 
 

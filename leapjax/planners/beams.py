@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.planners.configs import BeamConfig, find_selection, make_commitment
-from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
+from leapjax.planners.guard import guard_shapes, is_undefined, map_few, score_open
+from leapjax.planners.judges import find_judge
 from leapjax.planners.positions import choose_open
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
 
@@ -54,6 +55,7 @@ def beam_search(
             "beam search begins plans that it ends later, and this energy scores complete plans "
             "only (accepts_mask is False): use another planner"
         )
+    judge = None if config.judge == "sum" else find_judge(config.judge, energy)
     energy = guard_shapes(energy)
     actions, width, horizon = energy.num_actions, config.beams, config.horizon
     mask = mask_token(actions)
@@ -129,10 +131,13 @@ def beam_search(
     )
     passes = done * width
     judged = beams.sums
-    if config.judge == "energy":
-        judged = compute_totals(energy, params, memory, beams.plans)
+    if judge is not None:
+        judge_key = jax.random.fold_in(key, 2)
+        judged = map_few(
+            lambda plan: judge.score(energy, params, memory, judge_key, plan), beams.plans
+        )
         valid &= ~jnp.any(is_undefined(judged))
-        passes += width * horizon
+        passes += width * judge.count_passes(horizon)
     found = jnp.lexsort((judged, beams.dead))[0]
     best = beams.plans[found]
     trace = jnp.where(jnp.arange(horizon)[:, None] < done - 1, trace, best)

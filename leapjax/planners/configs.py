@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from leapjax.checks import check_at_least, check_number, check_types
+from leapjax.planners.judges import JUDGES
 from leapjax.planners.positions import SELECTIONS, Commitment, Select
 
 # The files and command lines that hold a configuration name a strategy; programs may pass a
@@ -18,7 +19,6 @@ HOTTEST = 1e30  # a limit so that temperature times noise stays finite
 FILLS = ("together", *SELECTIONS)
 ORDERS = ("random", "sequential", "uncertain")
 KEPT = ("last", "best")
-JUDGES = ("sum", "energy")
 
 
 def check_temperature(temperature: float) -> None:
@@ -58,7 +58,8 @@ class GibbsConfig:
             goes from left to right, and "uncertain" takes positions that were least certain when
             they were chosen. It resamples each once before it resamples any again.
         temperature: Temperature at which actions are drawn; 0 takes the most likely action.
-        restarts: R, independent plans; the planner returns the plan of least energy.
+        restarts: R, plans at most; the planner returns the one that the judge likes best. If the
+            energy knows symmetries, each restart sees the context turned.
         score: Also return the energy of the plan, for T more passes.
         score_trace: Also return the energy after every iteration, for N * T more passes.
         certainty: A filling pass also fills each next position whose likeliest action has at least
@@ -68,8 +69,11 @@ class GibbsConfig:
             fills P positions.
         cool_to: Temperature of the last iteration; it changes linearly after the first plan. By
             default the temperature is constant.
-        keep: Which plan of the trace to return: the "last", or the "best". The energies of the
-            whole trace cost N * T more passes.
+        keep: Which plan of the trace to return: the "last", or the "best", for which the judge
+            scores the whole trace.
+        judge: What compares plans. "energy" takes the least total energy, for T passes a plan.
+            "halves" takes the least energy of actions with half of the plan in view, for 4 passes.
+        enough: Restarts stop once the judge gives a plan at most this, in nats. By default all run.
     """
 
     horizon: int = 5
@@ -85,6 +89,8 @@ class GibbsConfig:
     entropy_bound: float = 0.0
     cool_to: float | None = None
     keep: str = "last"
+    judge: str = "energy"
+    enough: float | None = None
 
     def __post_init__(self) -> None:
         check_types(self, strategies=("fill",))
@@ -99,6 +105,11 @@ class GibbsConfig:
             check_temperature(self.cool_to)
         check_name("order", self.order, ORDERS)
         check_name("keep", self.keep, KEPT)
+        check_name("judge", self.judge, tuple(JUDGES))
+        if self.enough is not None:
+            check_number("enough", self.enough)
+            if self.restarts == 1:
+                raise ValueError("enough stops restarts, and there is one plan: set restarts")
         if self.iterations < self.fill_iterations:
             raise ValueError(
                 f"fill {self.fill!r} chooses {self.resampled} of {self.horizon} actions in a pass, "
@@ -109,6 +120,11 @@ class GibbsConfig:
     def fill_iterations(self) -> int:
         """The passes after which no position is MASK, at most."""
         return 1 if self.fill == "together" else -(-self.horizon // self.resampled)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether there are several plans to compare."""
+        return self.restarts > 1 or self.keep == "best"
 
 
 def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None:
@@ -196,7 +212,7 @@ class BeamConfig:
         fill: Which open position a beam chooses next, as in `GibbsConfig`. By default beams go from
             left to right; in other orders each beam takes a position of its own.
         judge: Which complete beam to return. "sum" takes the least sum of the conditional energies
-            of its choices, "energy" the least total energy, for W * T more passes.
+            of its choices; "energy" and "halves" as in `GibbsConfig`.
         certainty: As in `GibbsConfig`: a pass also fills each next position that is so certain. The
             beam branches at the last of them.
         entropy_bound: As in `GibbsConfig`; the beam branches at the last position.
@@ -216,7 +232,7 @@ class BeamConfig:
         check_at_least(self, 1, "horizon", "beams")
         check_temperature(self.temperature)
         check_fill(self, tuple(SELECTIONS))
-        check_name("judge", self.judge, JUDGES)
+        check_name("judge", self.judge, ("sum", *JUDGES))
         if self.temperature and make_commitment(self).adapts:
             raise ValueError(
                 "certainty and entropy_bound take the most likely actions, and a temperature "

@@ -1,6 +1,5 @@
 """Gibbs sampling over action tokens (paper, algorithm 1): fill a plan, then resample it."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -9,7 +8,8 @@ import jax.numpy as jnp
 from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
 from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open, compute_probabilities
-from leapjax.types import Energy, Params, Plan, PyTree, mask_token
+from leapjax.planners.restarts import Chain, find_best_chain
+from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_turn
 
 
 def gibbs(
@@ -36,38 +36,37 @@ def gibbs(
             "complete plans only (accepts_mask is False): use fill 'together'"
         )
     energy = guard_shapes(energy)
-    run_chain = functools.partial(_run_chain, energy, params, memory, config=config)
 
-    if config.restarts == 1:
-        chains = jax.tree.map(lambda leaf: leaf[None], run_chain(key))
-    else:
-        chains = jax.vmap(run_chain)(jax.random.split(key, config.restarts))
-    traces, valid, passes = chains.trace, chains.valid.all(), chains.passes.sum()
-    candidates = traces if config.keep == "best" else traces[:, -1:]  # [R, C, T]
-    choices = candidates.shape[0] * candidates.shape[1]
-    best, energies = jnp.zeros((), int), None
-    if choices > 1 or config.score:
-        energies = compute_totals(energy, params, memory, candidates.reshape(choices, -1))
-        best = jnp.argmin(energies)
-        valid &= ~jnp.any(is_undefined(energies))
-        passes += choices * config.horizon
-    actions = candidates.reshape(choices, -1)[best]
-    run = best // candidates.shape[1]
-    trace = traces[run]
+    def run(key: jax.Array, memory: PyTree) -> Chain:
+        return _run_chain(energy, params, memory, key, config)
+
+    chain = find_best_chain(energy, params, key, memory, config, run)
+    best = jnp.argmin(chain.scores)
+    actions = (chain.trace if config.keep == "best" else chain.trace[-1:])[best]
     satisfied = energy.violation(params, memory, actions) <= 0
-    plan = Plan(actions, trace, satisfied, valid, passes)
-    if config.score and energies is not None:
-        plan = plan._replace(energy=energies[best])
-    if config.score_trace and config.keep == "best" and energies is not None:
-        plan = plan._replace(trace_energies=energies.reshape(traces.shape[:2])[run])
+    plan = Plan(actions, chain.trace, satisfied, chain.valid, chain.passes)
+    # The judge knows the energies, unless it is another or saw the context turned.
+    known = config.judge == "energy" and not (config.restarts > 1 and energy.turn is not no_turn)
+    if config.score and known and config.is_judged:
+        plan = plan._replace(energy=chain.scores[best])
+    elif config.score:
+        plan, totals = _score(energy, params, memory, plan, actions[None])
+        plan = plan._replace(energy=totals[0])
+    if config.score_trace and known and config.keep == "best":
+        plan = plan._replace(trace_energies=chain.scores)
     elif config.score_trace:
-        scores = compute_totals(energy, params, memory, trace)
-        plan = plan._replace(
-            trace_energies=scores,
-            valid=plan.valid & ~jnp.any(is_undefined(scores)),
-            passes=passes + trace.size,
-        )
+        plan, totals = _score(energy, params, memory, plan, chain.trace)
+        plan = plan._replace(trace_energies=totals)
     return plan
+
+
+def _score(
+    energy: Energy, params: Params, memory: PyTree, plan: Plan, plans: jax.Array
+) -> tuple[Plan, jax.Array]:
+    """Computes the total energies `[C]` of plans `[C, T]`; a `Plan` with their cost comes first."""
+    totals = compute_totals(energy, params, memory, plans)
+    valid = plan.valid & ~jnp.any(is_undefined(totals))
+    return plan._replace(valid=valid, passes=plan.passes + plans.size), totals
 
 
 class _Plan(NamedTuple):
@@ -83,23 +82,9 @@ class _Plan(NamedTuple):
     age: jax.Array | None = None
 
 
-class _Chain(NamedTuple):
-    """The result of a chain.
-
-    Attributes:
-        trace: actions `[N, T]` after every iteration.
-        valid: `[]` bool: every energy was defined.
-        passes: `[]` int32.
-    """
-
-    trace: jax.Array
-    valid: jax.Array
-    passes: jax.Array
-
-
 def _run_chain(
     energy: Energy, params: Params, memory: PyTree, key: jax.Array, config: GibbsConfig
-) -> _Chain:
+) -> Chain:
     """Fills a plan, and then resamples it."""
     horizon, filling = config.horizon, config.fill_iterations
     later = config.iterations - filling
@@ -186,7 +171,8 @@ def _run_chain(
     noise = temperatures * draw_noise(noise_key, later, config.resampled)  # [N - F, P, A]
     plan, (trace, valid) = jax.lax.scan(resample, plan, (positions, noise))
     trace = jnp.concatenate([begun, trace])
-    return _Chain(trace, begun_valid & valid.all(), passes + later)
+    scores = jnp.zeros(config.iterations if config.keep == "best" else 1)
+    return Chain(trace, begun_valid & valid.all(), passes + later, scores)
 
 
 def _draw_uniform_plan(

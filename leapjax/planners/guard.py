@@ -1,5 +1,7 @@
 """Evaluates an energy: with checks, at open positions, and for many plans in little memory."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -54,11 +56,12 @@ def score_open(energy: Energy, params: Params, memory: PyTree, plan: jax.Array) 
 
 
 def compute_totals(energy: Energy, params: Params, memory: PyTree, plans: jax.Array) -> jax.Array:
-    """Returns the total energies `[C]` of plans `[C, T]`, computed a few at a time."""
+    """Returns the total energies `[C]` of plans `[C, T]`."""
+    return map_few(lambda plan: energy.total(params, memory, plan), plans)
 
-    def total(actions: jax.Array) -> jax.Array:
-        return energy.total(params, memory, actions)
 
-    if plans.shape[0] <= SCORED_TOGETHER:
-        return jax.vmap(total)(plans)
-    return jax.lax.map(total, plans, batch_size=SCORED_TOGETHER)
+def map_few(function: Callable[..., jax.Array], *inputs: jax.Array) -> jax.Array:
+    """Maps a function over the rows of arrays `[C, ...]`, a few at a time."""
+    if inputs[0].shape[0] <= SCORED_TOGETHER:
+        return jax.vmap(function)(*inputs)
+    return jax.lax.map(lambda row: function(*row), inputs, batch_size=SCORED_TOGETHER)

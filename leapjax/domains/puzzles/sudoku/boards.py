@@ -18,7 +18,7 @@ from leapjax.checks import check_range, check_seed
 from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
 from leapjax.domains.puzzles.names import read_numbers
 from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, Window
+from leapjax.types import Array, Context, Demonstration, Turned, Window
 
 LEVELS = ("Sudoku4x6", "Sudoku9x36")
 FEWEST_CLUES = {4: 4, 9: 22}  # it takes ten seconds to draw a board with 21
@@ -362,14 +362,10 @@ def make_puzzles(demonstration: Demonstration) -> Puzzle:
 def transform(key: jax.Array, window: Window, side: int) -> Window:
     """Turns a window into a window of another board, by random symmetries of the rules.
 
-    They permute digits, bands, rows in a band, stacks and columns in a stack, and may exchange rows
-    and columns. The new board is read row by row too, up to the same cell.
+    The new board is read row by row too, up to the same cell.
     """
-    digit_key, row_key, column_key, turn_key = jax.random.split(key, 4)
-    names = jnp.append(0, 1 + jax.random.permutation(digit_key, side))
-    rows, columns = _keep_boxes(row_key, side), _keep_boxes(column_key, side)
-    places = rows[:, None] * side + columns  # [side, side]
-    places = jnp.where(jax.random.bernoulli(turn_key), places, places.T).reshape(-1)
+    places, digits = _draw_symmetry(key, side)
+    names = jnp.append(0, 1 + digits)
     clues, solution = (
         names[board[places].astype(jnp.int32)].astype(jnp.int32) for board in window.extras
     )
@@ -378,6 +374,41 @@ def transform(key: jax.Array, window: Window, side: int) -> Window:
         return Board(jnp.where(jnp.arange(side**2) < cell, solution, clues), cell)
 
     return rewrite(window, window.context.observation.cell, solution - 1, observe, end=side)
+
+
+def turn(key: jax.Array, context: Context, side: int, horizon: int) -> Turned:
+    """Turns a board by random symmetries of the rules, for plans that write the whole board.
+
+    A plan that begins behind the first cell, or is shorter, would write other cells of the turned
+    board. Then the board stays as it is.
+    """
+    board, cells = context.observation, side**2
+    places, names = jnp.arange(horizon), jnp.arange(side + 1)
+    if horizon >= cells:
+        order, digits = _draw_symmetry(key, side)
+        whole = board.cell == 0
+        places = places.at[:cells].set(jnp.where(whole, order, places[:cells]))
+        names = names.at[:side].set(jnp.where(whole, digits, names[:side]))
+        digits = jnp.append(0, 1 + names[:side])[board.digits[places[:cells]]]
+        context = context._replace(observation=board._replace(digits=digits.astype(jnp.int32)))
+    return Turned(context, places, jnp.tile(names, (horizon, 1)))
+
+
+def _draw_symmetry(key: jax.Array, side: int) -> tuple[jax.Array, jax.Array]:
+    """Draws a symmetry of the rules.
+
+    Digits, bands, rows in a band, stacks and columns in a stack change places; rows and columns may
+    be exchanged.
+
+    Returns:
+        The cell `[cells]` that comes to each place, and the new name `[side]` of each digit, less
+        one.
+    """
+    digit_key, row_key, column_key, turn_key = jax.random.split(key, 4)
+    rows, columns = _keep_boxes(row_key, side), _keep_boxes(column_key, side)
+    places = rows[:, None] * side + columns  # [side, side]
+    places = jnp.where(jax.random.bernoulli(turn_key), places, places.T).reshape(-1)
+    return places, jax.random.permutation(digit_key, side)
 
 
 def _keep_boxes(key: jax.Array, side: int) -> jax.Array:

@@ -108,7 +108,7 @@ def make(name: str, settings: Settings) -> Domain:
     if settings.boards is not None:
         read = functools.partial(boards.read_board, side=side)
         file = PuzzleFile(settings.boards, "boards", read)
-    turn = functools.partial(boards.transform, side=side)
+    transform = functools.partial(boards.transform, side=side)
 
     def tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
         return BoardTokens(side, model.width, whole=sizes.horizon >= level.cells)
@@ -124,8 +124,9 @@ def make(name: str, settings: Settings) -> Domain:
             functools.partial(make_adapter, draw_board),  # training never sees the file
             functools.partial(check_boards, side=side),
         ),
-        augmentations=Augmentations([turn] if settings.augment else [], boards.make_puzzles),
+        augmentations=Augmentations([transform] if settings.augment else [], boards.make_puzzles),
         rules=rules(side),
+        turn=functools.partial(boards.turn, side=side),
         signature={"side": side},  # any number of clues
         held_out=file.held_out if file else None,
     )
