@@ -15,15 +15,19 @@ from leapjax import (
     Energy,
     Factors,
     GibbsConfig,
+    compose,
     constrain,
     from_factors,
     from_total,
 )
+from leapjax.energy import symmetric
 from leapjax.planners import FILLS, bind
+from leapjax.planners.judges import SPLITS, sum_halves
 from leapjax.planners.positions import Commitment, choose_open, most_certain
-from leapjax.types import mask_token
+from leapjax.types import Turned, mask_token
 from tests.enumerable import (
     all_plans,
+    conditional_by_counting,
     enumerable_energy,
     fit_p_value,
     joint_probabilities,
@@ -173,16 +177,154 @@ def test_passes_count_every_conditional_and_every_total():
         (GibbsConfig(HORIZON, 7, score=True), 7 + HORIZON),
         (GibbsConfig(HORIZON, 7, restarts=4, score=True), 4 * (7 + HORIZON)),
         (GibbsConfig(HORIZON, 7, keep="best", score_trace=True), 7 + 7 * HORIZON),
+        (GibbsConfig(HORIZON, 7, restarts=4, judge="halves"), 4 * (7 + 2 * SPLITS)),
         (BeamConfig(HORIZON, 4, judge="energy", score=True), 8 * HORIZON),
+        (BeamConfig(HORIZON, 4, judge="halves"), 4 * HORIZON + 4 * 2 * SPLITS),
     ):
         assert plan_for(config, params=table).passes == expected, config
+
+
+# Judges and restarts.
+
+
+def test_halves_sum_the_conditionals_of_each_action_given_the_other_half():
+    horizon, actions = 4, 2
+    energy = enumerable_energy(horizon, actions)
+    table, tilt = random_table(2, horizon, actions), np.zeros((horizon, actions), np.float32)
+    joint, memory = joint_probabilities(table), energy.encode(table, tilt)
+    halves = [set(half) for half in itertools.combinations(range(horizon), horizon // 2)]
+
+    def cost(plan, hidden):
+        tokens = np.where(np.isin(np.arange(horizon), [*hidden]), actions, plan)
+        return -sum(np.log(conditional_by_counting(joint, tokens, t)[plan[t]]) for t in hidden)
+
+    found = set()
+    for seed, plan in itertools.product(range(4), all_plans(horizon, actions)[[0, 5, 14]]):
+        score = float(sum_halves(energy, table, memory, jax.random.key(seed), jnp.asarray(plan)))
+        splits = [cost(plan, half) + cost(plan, {*range(horizon)} - half) for half in halves]
+        sums = [a + b for a, b in itertools.product(splits, repeat=SPLITS)]
+        assert np.isclose(sums, score, rtol=1e-4).any()
+        found.add(round(score, 4))
+    assert len(found) > 3  # keys draw different halves
+
+
+def test_halves_forbid_what_the_energy_forbids():
+    forbidden = from_total(lambda params, context: None, None, 3)._replace(
+        conditional=lambda params, memory, actions, positions: (
+            jnp.full((positions.shape[0], 3), 1.0).at[:, 2].set(jnp.inf)
+        ),
+        accepts_mask=True,
+    )
+    for plan, expected in (([0, 1, 0], SPLITS * 3 * np.log(2)), ([0, 2, 0], np.inf)):
+        score = sum_halves(forbidden, None, None, jax.random.key(0), jnp.array(plan))
+        assert_close(score, expected, rtol=1e-5)
+
+
+def mislead():
+    """An energy that begins with a wrong action, unless the context is turned.
+
+    The context is the right plan: three different actions. The energy is sure that an empty plan
+    begins with 0. With another action in view it knows the right one.
+    """
+
+    def conditional(params, memory, actions, positions):
+        def score(position):
+            alone = (actions == 3) | (jnp.arange(3) == position)
+            right = jnp.where((position == 0) & alone.all(), 0, memory[position])
+            return 4.0 * (jnp.arange(3) != right)
+
+        return jax.vmap(score)(positions)
+
+    def total(params, memory, actions):
+        return 4.0 * (actions != memory).sum()
+
+    return Energy(lambda params, context: jnp.asarray(context), conditional, total, 3)
+
+
+def permute(key, context):
+    """Turns a context of three different numbers: other places, other names."""
+    place_key, name_key = jax.random.split(key)
+    places = jax.random.permutation(place_key, 3)
+    names = jax.random.permutation(name_key, 3)
+    return Turned(names[context[places]], places, jnp.tile(names, (3, 1)))
+
+
+TURNING = symmetric(mislead(), permute)
+
+
+def test_a_turned_energy_is_that_of_the_renamed_plan():
+    context, inner = jnp.array([2, 0, 1]), mislead()
+    rng = np.random.default_rng(0)
+    for seed in range(5):
+        key = jax.random.key(seed)
+        turned, memory = permute(key, context), TURNING.turn((), key, TURNING.encode((), context))
+        places, names = np.asarray(turned.places), np.asarray(turned.names[0])
+        plan = rng.integers(0, 4, 3)  # 3 is MASK
+        there = np.append(names, 3)[plan[places]]
+        expected = inner.conditional((), turned.context, jnp.asarray(there), jnp.arange(3))
+        found = TURNING.conditional((), memory, jnp.asarray(plan), jnp.arange(3))
+        for here, (position, action) in enumerate(itertools.product(range(3), repeat=2)):
+            other = expected[np.flatnonzero(places == position)[0], names[action]]
+            assert found[here // 3, action] == other
+        complete = jnp.asarray(rng.integers(0, 3, 3))
+        expected = inner.total((), turned.context, jnp.asarray(names)[complete[places]])
+        assert_close(TURNING.total((), memory, complete), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("enough", [None, 0.5])
+@pytest.mark.parametrize("judge", ["energy", "halves"])
+def test_restarts_see_the_context_turned(judge, enough):
+    context = jnp.array([2, 0, 1])  # untouched, the energy writes 0 at position 0
+    options = {"fill": "confident", "judge": judge, "score": True}
+    alone = GibbsConfig(3, 3, **options)
+    assert plan_for(alone, TURNING, context=context).actions[0] == 0
+    many = GibbsConfig(3, 3, restarts=24, enough=enough, **options)
+    unturned = plan_for(many, mislead(), context=context)
+    assert unturned.actions[0] == 0
+    plan = plan_for(many, TURNING, context=context)
+    assert_equal(plan.actions, context)
+    # The energy is that of the plan where nothing is turned.
+    assert_close(plan.energy, mislead().total((), context, jnp.asarray(plan.actions)), rtol=1e-6)
+
+
+def test_the_parts_of_an_energy_are_turned_together():
+    context = jnp.array([2, 0, 1])
+    both = compose([TURNING, mislead()], [1.0, 0.5])
+    bound = constrain(both, lambda context, plan: jnp.where(plan[0] == 1, 1.0, 0.0))
+    key = jax.random.key(3)
+    memory, _ = bound.turn(((), ()), key, bound.encode(((), ()), context))
+    assert memory[1] is not None and memory[0].places is not None
+    expected = TURNING.turn((), key, TURNING.encode((), context))
+    assert_equal(memory[0].places, expected.places)
+    assert_equal(memory[1], context)  # the other part knows no symmetry
+
+
+def test_restarts_stop_when_a_plan_is_good_enough():
+    table = random_table(1, HORIZON, ACTIONS)
+    options = {"temperature": 1.0, "restarts": 8, "score": True}
+    all_ = plan_for(GibbsConfig(HORIZON, 4, **options), params=table, chains=300)
+    never = plan_for(GibbsConfig(HORIZON, 4, enough=-1.0, **options), params=table, chains=300)
+    assert_equal(never.actions, all_.actions)
+    assert_equal(never.passes, all_.passes)
+    enough = 1e-3 - np.log(joint_probabilities(table).max())
+    some = plan_for(GibbsConfig(HORIZON, 4, enough=enough, **options), params=table, chains=300)
+    stopped = some.passes < all_.passes
+    assert stopped.any() and not stopped.all()
+    assert (some.energy[stopped] <= enough).all() and (
+        some.energy[~stopped] >= all_.energy.min()
+    ).all()
+    one = 4 + HORIZON  # passes of a restart and its judge
+    assert (some.passes % one == 0).all() and (some.passes >= one).all()
+    assert (
+        some.energy[some.passes == all_.passes] == all_.energy[some.passes == all_.passes]
+    ).all()
 
 
 # Beams in any order.
 
 
 @pytest.mark.parametrize("fill", [fill for fill in FILLS if fill != "together"])
-@pytest.mark.parametrize("judge", ["sum", "energy"])
+@pytest.mark.parametrize("judge", ["sum", "energy", "halves"])
 def test_wide_beams_find_the_mode_in_any_order(fill, judge):
     for seed in range(6):
         table = random_table(seed, HORIZON, ACTIONS)
@@ -347,6 +489,9 @@ def test_more_terms_at_a_position_than_the_degree_are_an_error():
         (lambda: GibbsConfig(5, 5, fill="margin", entropy_bound=-1.0), "entropy_bound"),
         (lambda: GibbsConfig(5, 5, keep="first"), "unknown keep 'first'"),
         (lambda: GibbsConfig(5, 5, cool_to=-1.0), "temperature"),
+        (lambda: GibbsConfig(5, 5, judge="sum"), "unknown judge 'sum'"),
+        (lambda: GibbsConfig(5, 5, enough=0.1), "set restarts"),
+        (lambda: GibbsConfig(5, 5, restarts=2, enough=np.nan), "enough"),
         (lambda: BeamConfig(5, fill="together"), "unknown fill 'together'"),
         (lambda: BeamConfig(5, judge="length"), "unknown judge 'length'"),
         (lambda: BeamConfig(5, temperature=1.0, entropy_bound=0.1), "use one of the two"),

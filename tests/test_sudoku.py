@@ -23,7 +23,7 @@ from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.boards import Level, SudokuAdapter
 from leapjax.domains.puzzles.sudoku.domain import BoardTokens, Settings, make
 from leapjax.domains.puzzles.sudoku.rules import rules
-from leapjax.energy import compose
+from leapjax.energy import compose, symmetric
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig, Sizes
 from leapjax.models.masked import build_masked_model
@@ -322,6 +322,43 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     assert share(energy, (), certain) > 0.9 and share(energy, (), refined) > 0.9
     both = compose([energy, energy], [0.5, 0.5])
     assert share(both, ((), ()), certain) == share(energy, (), certain)
+
+
+def test_a_turned_board_has_the_same_solutions_under_other_names():
+    turn = functools.partial(boards.turn, side=4)
+    energy = symmetric(rules(4), functools.partial(turn, horizon=18))  # two actions after the end
+    clues, solution = boards.draw(SMALL, 1)
+    context, seen, rng = at(0, clues), set(), np.random.default_rng(0)
+    plan = np.append(solution - 1, [4, 4])
+    memory = energy.encode((), context)
+    where, empty = jnp.arange(16), np.flatnonzero(clues == 0)
+    for seed in range(8):
+        key = jax.random.key(seed)
+        turned = jax.tree.map(np.asarray, turn(key, context, horizon=18))
+        (found,) = boards.find_solutions(turned.context.observation.digits)
+        np.testing.assert_array_equal(
+            found - 1, turned.names[turned.places, plan[turned.places]][:16]
+        )
+        seen.add(tuple(turned.context.observation.digits))
+        # The rules know no rows by number: they do not change when the board is turned.
+        tried = np.where(rng.random(18) < 0.4, 5, np.append(rng.integers(0, 4, 16), [0, 0]))  # MASK
+        for tokens in (plan, tried):
+            before, after = (
+                energy.conditional((), view, jnp.asarray(tokens), where)
+                for view in (memory, energy.turn((), key, memory))
+            )
+            np.testing.assert_allclose(before[empty], after[empty], rtol=1e-6)
+    assert len(seen) == 8
+
+
+@pytest.mark.parametrize(("cell", "horizon"), [(3, 16), (0, 8)])
+def test_plans_of_a_part_of_a_board_are_not_turned(cell, horizon):
+    clues, solution = boards.draw(SMALL, 1)
+    context = at(cell, np.where(np.arange(16) < cell, solution, clues))
+    turned = boards.turn(jax.random.key(0), context, side=4, horizon=horizon)
+    jax.tree.map(np.testing.assert_array_equal, turned.context, context)
+    np.testing.assert_array_equal(turned.places, np.arange(horizon))
+    np.testing.assert_array_equal(turned.names, np.tile(np.arange(5), (horizon, 1)))
 
 
 def write_boards(folder, *lines):

@@ -157,8 +157,10 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
     # The planner makes plans in one batch, and scores restarts and candidates a few at a time, with
     # T passes each.
     many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
-    scored = (many > 1 and not hasattr(search, "beams")) or search.score
-    scored |= getattr(search, "judge", "") == "energy" or getattr(search, "keep", "") == "best"
+    if getattr(search, "enough", None) is not None:
+        many = 1  # one restart after the other
+    judged = getattr(search, "judge", "energy") == "energy" and getattr(search, "is_judged", True)
+    scored = judged or search.score
     passes = max(many, min(many, SCORED_TOGETHER) * horizon if scored else 1)
     plans = min(PLANS_TOGETHER, config.episodes)
     choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
