@@ -1,10 +1,12 @@
 """The ways to search with one trained energy, for plans that are executed whole."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from leapjax.configuration import AnyConfig, change
+from leapjax.configuration import AnyConfig, change, make_domain
 from leapjax.planners import GibbsConfig
+from leapjax.presets.puzzles import TURNED
 
 
 class Search(NamedTuple):
@@ -29,8 +31,8 @@ class Search(NamedTuple):
 
     def of(self, horizon: int) -> dict[str, Any]:
         """Returns the fields of `GibbsConfig` for plans of `horizon` actions."""
-        plain = {"fill": "together", "order": "random"}
-        return {**plain, **self.options, "iterations": max(1, self.passes * horizon)}
+        iterations = max(1, self.passes * horizon)
+        return dataclasses.asdict(GibbsConfig(horizon, iterations, **self.options))
 
 
 SEARCHES = (
@@ -42,6 +44,7 @@ SEARCHES = (
     Search("most certain first, by margin", 1, {"fill": "margin"}),
     Search("all that are certain", 1, {"fill": "confident", "certainty": 0.999}),
     Search("as many as are independent", 1, {"fill": "confident", "entropy_bound": 0.01}),
+    Search("restarts on turned puzzles", 1, TURNED),
 )
 # Only for rules, which score a plan in one pass. A learned energy needs T passes more.
 BEST_OF_MANY = Search(
@@ -58,6 +61,8 @@ def list_searches(config: AnyConfig) -> list[AnyConfig]:
     if not isinstance(config.planner, GibbsConfig) or config.planner.horizon == 1:
         return []
     every = (*SEARCHES, BEST_OF_MANY) if config.method == "rules" else SEARCHES
+    if config.method != "leap" or make_domain(config).turn is None:  # no symmetries
+        every = tuple(search for search in every if search.options != TURNED)
     if config.method == "classifier":  # scores only complete plans
         every = tuple(search for search in every if "fill" not in search.options)
     return [change(config, planner=search.of(config.planner.horizon)) for search in every]

@@ -72,7 +72,7 @@ class GibbsConfig:
         keep: Which plan of the trace to return: the "last", or the "best", for which the judge
             scores the whole trace.
         judge: What compares plans. "energy" takes the least total energy, for T passes a plan.
-            "halves" takes the least energy of actions with half of the plan in view, for 4 passes.
+            "halves" takes the least energy of actions with half of the plan in view, for 6 passes.
         enough: Restarts stop once the judge gives a plan at most this, in nats. By default all run.
     """
 

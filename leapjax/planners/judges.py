@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from leapjax.planners.guard import score_open
 from leapjax.types import Energy, Params, PyTree, mask_token
 
-SPLITS = 2  # random splits of a plan into two halves
+SPLITS = 3  # random splits of a plan into two halves
 
 
 class Judge(NamedTuple):

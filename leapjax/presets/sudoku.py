@@ -3,7 +3,7 @@
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.domain import Settings
 from leapjax.presets.common import UNTRAINED
-from leapjax.presets.puzzles import Puzzle, make_presets
+from leapjax.presets.puzzles import TURNED, Puzzle, make_presets
 
 
 def describe(name: str, method: str) -> Puzzle:
@@ -18,12 +18,12 @@ def describe(name: str, method: str) -> Puzzle:
     level = boards.find_level(name)
     if level.side == 4:
         training = {"steps": 2000, "batch": 64, "learning_rate": 1e-3}
-        return Puzzle("sudoku", name, level.cells, 500, Settings(), training)
+        return Puzzle("sudoku", name, level.cells, 500, Settings(), training, search=TURNED)
     steps = 1500 if level.fewest == level.most else 8000
     rate = 1e-3 if method in UNTRAINED else 2e-3  # names the rows of rules, which do not learn
     training = {"steps": steps, "batch": 32, "learning_rate": rate, "microbatch": 8}
     network = {"layers": 8, "width": 96}
-    return Puzzle("sudoku", name, level.cells, 3000, Settings(), training, network)
+    return Puzzle("sudoku", name, level.cells, 3000, Settings(), training, network, TURNED)
 
 
 paper, leapjax = make_presets(describe)
