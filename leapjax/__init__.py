@@ -44,7 +44,7 @@ if TYPE_CHECKING:
         interval_over_seeds,
         wilson_interval,
     )
-    from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState
+    from leapjax.types import Agent, Context, Demonstration, Energy, Plan, TrainState, Turned
     from leapjax.version import __version__ as __version__
 
 __all__ = [
@@ -64,6 +64,7 @@ __all__ = [
     "PureEnvironment",
     "ShootingConfig",
     "TrainState",
+    "Turned",
     "UserError",
     "aggregate",
     "autoregressive",
@@ -88,6 +89,7 @@ __all__ = [
     "pseudo_likelihood",
     "random_shooting",
     "single_action",
+    "symmetric",
     "view",
     "wilson_interval",
 ]
@@ -107,6 +109,7 @@ _DEFINED = {
         "neutral",
         "pseudo_likelihood",
         "single_action",
+        "symmetric",
         "view",
     ),
     "leapjax.errors": ("UserError",),
@@ -130,7 +133,9 @@ _DEFINED = {
         "interval_over_seeds",
         "wilson_interval",
     ),
-    "leapjax.types": ("Agent", "Context", "Demonstration", "Energy", "Plan", "TrainState"),
+    "leapjax.types": (
+        "Agent", "Context", "Demonstration", "Energy", "Plan", "TrainState", "Turned",
+    ),  # fmt: skip
     "leapjax.version": ("__version__",),
 }
 _PLACES = {name: module for module, names in _DEFINED.items() for name in names}
