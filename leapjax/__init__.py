@@ -134,8 +134,14 @@ _DEFINED = {
         "wilson_interval",
     ),
     "leapjax.types": (
-        "Agent", "Context", "Demonstration", "Energy", "Plan", "TrainState", "Turned",
-    ),  # fmt: skip
+        "Agent",
+        "Context",
+        "Demonstration",
+        "Energy",
+        "Plan",
+        "TrainState",
+        "Turned",
+    ),
     "leapjax.version": ("__version__",),
 }
 _PLACES = {name: module for module, names in _DEFINED.items() for name in names}

@@ -1,6 +1,5 @@
 """Planners for batches: cut into chunks of a few sizes, jitted, and split over devices."""
 
-import contextlib
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -121,48 +120,8 @@ class CompiledPlanner:
             ValueError: as in `__call__`.
             NotANumber: as in `__call__`.
         """
-        leaves = jax.tree.leaves((params, keys, contexts))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            raise UserError(
-                "a compiled planner was called inside of jit, vmap or grad, where it sees no "
-                "numbers: call it outside, or use leap.gibbs (or the planner of its "
-                "configuration) there, with jax.vmap over keys and what energy.encode returns"
-            )
-        if not hasattr(keys, "dtype"):
-            if not isinstance(keys, Sequence) or isinstance(keys, str):
-                raise UserError(f"keys must be an array, one for each context, got {keys!r}")
-            if not len(keys):
-                raise ValueError("no contexts to plan for")
-            keys = jnp.stack([jnp.asarray(key) for key in keys])
-        typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
-        if keys.ndim != (1 if typed else 2):
-            raise ValueError(
-                f"keys of shape {keys.shape}: expected one for each context, as "
-                "jax.random.split(key, B) makes them"
-            )
-        batch = keys.shape[0]
-        if batch == 0:
-            raise ValueError("no contexts to plan for")
-        if any(leaf.shape[0] != batch for leaf in jax.tree.leaves(cache)):
-            raise UserError(f"the cache must have a row for each of the {batch} contexts")
-        for path, leaf in jax.tree.leaves_with_path(contexts):
-            if np.ndim(leaf) == 0 or leaf.shape[0] != batch:
-                raise ValueError(
-                    f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
-                    f"dimension must be the number of keys, {batch}"
-                )
-            if not isinstance(leaf, jax.Array) and not _is_real(np.asarray(leaf).dtype):
-                raise ValueError(
-                    f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
-                    "numbers: encode it first"
-                )
-        check_fit("context", contexts)
-        # Slice with NumPy: JAX would compile a program for each slice of a device array.
-        if typed:
-            kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
-        else:
-            kind = _name_kind(keys)
-        inputs = jax.tree.map(np.asarray, (keys, contexts, cache))
+        kind, inputs = _check_inputs(params, keys, contexts, cache)
+        batch = inputs[0].shape[0]
         chunks = split_batch(batch, self.chunk_sizes)
         placed = self._place(params, {self._meshes[size] for _, size, _ in chunks})
         plans = []
@@ -207,8 +166,6 @@ class CompiledPlanner:
     def compile(self, params: Params, context: PyTree, batch: int = 1, again: bool = True) -> None:
         """Compiles the programs for up to `batch` plans, so that later calls start at once.
 
-        It plans once for each chunk size, and drops the plans.
-
         Args:
             params: parameters of the energy; only their shapes and types matter.
             context: context of one plan, without a leading `[B]`; only shapes and types matter.
@@ -222,10 +179,14 @@ class CompiledPlanner:
         for size in self.sizes_up_to(check_integer("batch", batch, 1)):
             contexts = jax.tree.map(lambda leaf, n=size: np.stack([np.asarray(leaf)] * n), context)
             keys = plan_keys(0, np.arange(size), np.zeros(size, int))
-            with contextlib.suppress(NotANumber):  # the numbers may be made up
-                _, cache = self.plan_next(params, keys, contexts, None)
-                if again and cache is not None:
-                    self.plan_next(params, keys, contexts, cache)
+            kind, inputs = _check_inputs(params, keys, contexts, None)
+            mesh = self._meshes[size]
+            placed, program = self._place(params, {mesh})[mesh.size], self._programs[mesh.size]
+            first = program.lower(kind, placed, *inputs)
+            first.compile()  # a call then finds the program
+            cache = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), first.out_info[1])
+            if again and cache is not None:
+                program.lower(kind, placed, *inputs[:2], cache).compile()
 
     def sizes_up_to(self, batch: int) -> list[int]:
         """Lists the chunk sizes that batches of at most `batch` plans can need."""
@@ -292,6 +253,62 @@ def split_batch(batch: int, sizes: Sequence[int]) -> list[tuple[int, int, int]]:
         chunks.append((start, size, min(size, left)))
         start += size
     return chunks
+
+
+def _check_inputs(
+    params: Params, keys: Array, contexts: PyTree, cache: PyTree
+) -> tuple[str, tuple[Array, PyTree, PyTree]]:
+    """Checks the arguments of `CompiledPlanner.plan_next`.
+
+    Returns:
+        The kind of the keys, and raw keys, contexts and cache as NumPy arrays.
+
+    Raises:
+        ValueError: as in `CompiledPlanner.__call__`.
+    """
+    leaves = jax.tree.leaves((params, keys, contexts))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        raise UserError(
+            "a compiled planner was called inside of jit, vmap or grad, where it sees no "
+            "numbers: call it outside, or use leap.gibbs (or the planner of its "
+            "configuration) there, with jax.vmap over keys and what energy.encode returns"
+        )
+    if not hasattr(keys, "dtype"):
+        if not isinstance(keys, Sequence) or isinstance(keys, str):
+            raise UserError(f"keys must be an array, one for each context, got {keys!r}")
+        if not len(keys):
+            raise ValueError("no contexts to plan for")
+        keys = jnp.stack([jnp.asarray(key) for key in keys])
+    typed = jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
+    if keys.ndim != (1 if typed else 2):
+        raise ValueError(
+            f"keys of shape {keys.shape}: expected one for each context, as "
+            "jax.random.split(key, B) makes them"
+        )
+    batch = keys.shape[0]
+    if batch == 0:
+        raise ValueError("no contexts to plan for")
+    if any(leaf.shape[0] != batch for leaf in jax.tree.leaves(cache)):
+        raise UserError(f"the cache must have a row for each of the {batch} contexts")
+    for path, leaf in jax.tree.leaves_with_path(contexts):
+        if np.ndim(leaf) == 0 or leaf.shape[0] != batch:
+            raise ValueError(
+                f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
+                f"dimension must be the number of keys, {batch}"
+            )
+        if not isinstance(leaf, jax.Array) and not _is_real(np.asarray(leaf).dtype):
+            raise ValueError(
+                f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
+                "numbers: encode it first"
+            )
+    check_fit("context", contexts)
+    # Slice with NumPy: JAX would compile a program for each slice of a device array.
+    if typed:
+        kind, keys = str(jax.random.key_impl(keys)), jax.random.key_data(keys)
+    else:
+        kind = _name_kind(keys)
+    inputs = jax.tree.map(np.asarray, (keys, contexts, cache))
+    return kind, inputs
 
 
 def _is_real(dtype: np.dtype) -> bool:

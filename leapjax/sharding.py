@@ -169,7 +169,7 @@ def choose_core_options(mesh: Mesh) -> dict[str, Any] | None:
     return {"xla_cpu_multi_thread_eigen": False} if on_cores else None
 
 
-def split_batches(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+def split_batches(function: Callable[..., Any], mesh: Mesh) -> jax.stages.Wrapped:
     """Jits `(static, params, *batches) -> batch`, so that each device computes its own rows."""
 
     def program(static: Hashable, params: PyTree, *batches: PyTree) -> PyTree:

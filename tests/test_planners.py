@@ -560,21 +560,28 @@ def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunk
     assert rows == list(range(batch))
 
 
-def test_after_compiling_ahead_nothing_is_traced():
+def test_after_compiling_ahead_nothing_is_traced_or_compiled(caplog):
     traced = []
 
     def encode(params, context):
         traced.append(context)
         return ENUMERABLE.encode(params, context)
 
-    planner = compile_planner(ENUMERABLE._replace(encode=encode), GIBBS, (1, 4, 16))
+    def plan(planner, batch):
+        contexts = np.broadcast_to(NO_TILT, (batch, *NO_TILT.shape))
+        planner(TABLE, jax.random.split(jax.random.key(0), batch), contexts)
+
+    energy = ENUMERABLE._replace(encode=encode)
+    planner = compile_planner(energy, GIBBS, (1, 4, 16))
     planner.compile(TABLE, NO_TILT, 20)
     before = len(traced)
     assert before
-    for batch in (1, 3, 4, 15, 20):
-        contexts = np.broadcast_to(NO_TILT, (batch, *NO_TILT.shape))
-        planner(TABLE, jax.random.split(jax.random.key(0), batch), contexts)
-    assert len(traced) == before
+    with jax.log_compiles():
+        for batch in (1, 3, 4, 15, 20):
+            plan(planner, batch)
+        assert len(traced) == before and "program" not in caplog.text
+        plan(compile_planner(energy, GIBBS, (1, 4, 16)), 1)
+    assert len(traced) > before and "program" in caplog.text
 
 
 def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
