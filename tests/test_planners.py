@@ -584,6 +584,22 @@ def test_after_compiling_ahead_nothing_is_traced_or_compiled(caplog):
     assert len(traced) > before and "program" in caplog.text
 
 
+def test_plans_with_a_cache_are_compiled_ahead_too(caplog):
+    def encode_next(params, context, cache):
+        seen = jnp.zeros((), int) if cache is None else cache
+        return ENUMERABLE.encode(params, context), seen + 1
+
+    planner = compile_planner(ENUMERABLE, GIBBS, (4,), encode_next=encode_next)
+    planner.compile(TABLE, NO_TILT, 4)
+    contexts, cache = np.broadcast_to(NO_TILT, (4, *NO_TILT.shape)), None
+    keys = jax.random.split(jax.random.key(0), 4)
+    with jax.log_compiles():
+        for step in (1, 2, 3):
+            _, cache = planner.plan_next(TABLE, keys, contexts, cache)
+            assert_equal(cache, np.full(4, step))
+    assert "program" not in caplog.text
+
+
 def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
     episodes, replans = np.array([3, 0, 3, 1]), np.array([0, 2, 1, 2])
     data = np.asarray(jax.random.key_data(plan_keys(7, episodes, replans)))
