@@ -17,7 +17,7 @@ from leapjax.planners.guard import SCORED_TOGETHER
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
 from leapjax.running import loggers, memory
-from leapjax.running.programs import PLANS_TOGETHER
+from leapjax.running.programs import choose_chunk_sizes
 
 OUTCOME = 320  # bytes of a finished episode, while all episodes are gathered and written
 COPYING = ("each", "stratified")  # ways to mask that make T copies of a window
@@ -162,7 +162,7 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
     judged = getattr(search, "judge", "energy") == "energy" and getattr(search, "is_judged", True)
     scored = judged or search.score
     passes = max(many, min(many, SCORED_TOGETHER) * horizon if scored else 1)
-    plans = min(PLANS_TOGETHER, config.episodes)
+    plans = min(*choose_chunk_sizes(config), config.episodes)
     choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
     drawn = getattr(search, "resampled", 1) * domain.num_actions + horizon
     needs["--iterations, --restarts, --beams, --candidates, --horizon"] = plans * (

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 # Number of plans in a chunk. A single chunk size needs a single program, which compiles soon.
 # Larger chunks are a tenth faster, but suit the last episodes of an evaluation less.
 PLANS_TOGETHER = 32
+# The same where restarts stop once a plan is good enough: a chunk waits for its last plan. On hard
+# boards of Sudoku that takes 29 s of CPU time, 35 s in chunks of 8, and 71 s in chunks of 32.
+RESTARTED_TOGETHER = 4
 
 
 class Programs(NamedTuple):
@@ -102,8 +105,10 @@ def _compile(run: "Run") -> Callable[[], Programs]:
 
 
 def choose_chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
-    """Returns the size of a run's chunks of plans, in a tuple: at most `PLANS_TOGETHER`."""
-    return (min(PLANS_TOGETHER, 1 << (config.episodes - 1).bit_length()),)
+    """Returns the size of a run's chunks of plans, in a tuple."""
+    stops = getattr(config.planner, "enough", None) is not None
+    most = RESTARTED_TOGETHER if stops else PLANS_TOGETHER
+    return (min(most, 1 << (config.episodes - 1).bit_length()),)
 
 
 def make_mesh(config: AnyConfig) -> Mesh:
