@@ -17,6 +17,7 @@ from leapjax.domains.puzzles.satisfiability import formulas
 from leapjax.domains.puzzles.satisfiability.domain import Settings, make
 from leapjax.domains.puzzles.satisfiability.formulas import OPEN, Formula, FormulaAdapter, Size
 from leapjax.domains.puzzles.satisfiability.rules import rules
+from leapjax.energy import symmetric
 from leapjax.errors import UserError
 from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
@@ -216,6 +217,63 @@ def test_the_energy_of_the_rules_weighs_violated_clauses(size, known, horizon):
         assert row[0] == row[1] < row[2] == np.inf  # after the last variable any value will do
 
 
+@functools.cache
+def turn(size, horizon):
+    """The turn of a level: compiled once."""
+    return jax.jit(functools.partial(make(NAMES[size], Settings()).turn, horizon=horizon))
+
+
+@SIZES
+def test_a_turned_formula_has_the_solutions_renamed(size):
+    (formula, _), seen = start(size, 0), set()
+    solutions = enumerate_solutions_fast(formula.literals, size)
+    for seed in range(5):
+        context, places, names = turn(size, 6)(jax.random.key(seed), at(size, formula))
+        new, places, names = jax.tree.map(np.asarray, (context.observation, places, names))
+        assert new.variable == 0 and (new.values == OPEN).all()
+        assert sorted(places) == [*range(6)] and (np.sort(names) == [0, 1, END]).all()
+        renamed = {tuple(names[t, values[t]] for t in places) for values in solutions}
+        assert len(renamed) == len(solutions) > 0
+        assert enumerate_solutions_fast(new.literals, size) == renamed
+        seen.add(new.literals.tobytes())
+    assert len(seen) == 5
+
+
+@SIZES
+def test_the_rules_weigh_a_plan_alike_for_each_turned_formula(size):
+    horizon, rng = 8, np.random.default_rng(0)  # two positions are after the last variable
+    plain = rules(size.differ)
+    energy = symmetric(plain, turn(size, horizon))
+    context, positions = at(size, start(size, 0)[0]), np.arange(horizon)
+
+    @jax.jit
+    def weigh(key, plan):
+        memory = energy.turn((), key, energy.encode((), context))
+        same = plain.encode((), context)
+        return [
+            (one.total((), seen, plan), one.conditional((), seen, plan, positions))
+            for one, seen in ((energy, memory), (plain, same))
+        ]
+
+    totals = set()
+    for seed in range(20):
+        plan = rng.choice([0, 1, MASK], horizon, p=[0.4, 0.4, 0.2])
+        found, expected = weigh(jax.random.key(seed), plan)
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+        totals.add(float(expected[0]))
+    assert len(totals) > 2  # so that an order the wrong way round is seen
+
+
+@SIZES
+@pytest.mark.parametrize(("known", "horizon"), [(1, 6), (0, 5)])
+def test_a_formula_is_turned_only_for_plans_of_all_variables(size, known, horizon):
+    context = at(size, start(size, 0, known)[0])
+    turned = turn(size, horizon)(jax.random.key(0), context)
+    jax.tree.map(np.testing.assert_array_equal, turned.context, context)
+    np.testing.assert_array_equal(turned.places, np.arange(horizon))
+    np.testing.assert_array_equal(turned.names, np.tile(np.arange(3), (horizon, 1)))
+
+
 def make_agent(**model):
     config = find_preset("satisfiability", "Sat6x20", "leap", "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0, **model)
@@ -256,7 +314,7 @@ def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
     """Its memory equals the one for variables counted from the next one on."""
     agent = make_agent()
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0, known=2)
-    encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)))
+    encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)).memory)
     rolled = formula._replace(
         literals=(formula.literals - 4) % 12, values=np.roll(formula.values, -2), variable=0
     )

@@ -172,6 +172,7 @@ def make(name: str, settings: Settings) -> Domain:
             [formulas.rename] if settings.augment else [], formulas.repeat_solution
         ),
         rules=rules(size.differ),
+        turn=formulas.turn,
         signature={"variables": size.variables, "differ": size.differ},  # any number of clauses
     )
 

@@ -23,7 +23,7 @@ from leapjax.checks import check_seed
 from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
 from leapjax.domains.puzzles.names import read_numbers
 from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, Window
+from leapjax.types import Array, Context, Demonstration, Turned, Window
 
 LEVELS = ("Sat20x91", "Nae20x42")
 LITERALS = 3  # in a clause
@@ -163,18 +163,53 @@ def rename(key: jax.Array, window: Window) -> Window:
     It permutes the variables and negates a random half of them, in clauses and solution alike. The
     new variables are assigned in order too, up to the same number of them.
     """
-    order_key, sign_key = jax.random.split(key)
     solution = window.extras.astype(jnp.int32)
     count = solution.shape[0]
-    places = jax.random.permutation(order_key, count)
-    negated = jax.random.randint(sign_key, (count,), 0, 2)
+    places, negated = _draw_symmetry(key, count)
     solution = jnp.zeros_like(solution).at[places].set(solution ^ negated)
     formula = window.context.observation
-    variables, values = jnp.divmod(formula.literals, 2)
-    literals = 2 * places[variables] + (values ^ negated[variables])
+    literals = _rename_literals(formula.literals, places, negated)
 
     def observe(variable: jax.Array) -> Formula:
         known = jnp.arange(count) < variable
         return Formula(literals, jnp.where(known, solution, OPEN), variable)
 
     return rewrite(window, formula.variable, solution, observe, end=2)
+
+
+def turn(key: jax.Array, context: Context, horizon: int) -> Turned:
+    """Permutes and negates the variables of a formula, for plans that assign all of them.
+
+    A plan that begins behind the first variable, or is shorter, would assign other variables of the
+    turned formula. Then the formula stays as it is.
+    """
+    formula = context.observation
+    count = formula.values.shape[0]
+    order, names = jnp.arange(horizon), jnp.tile(jnp.arange(3), (horizon, 1))
+    if horizon >= count:
+        places, negated = _draw_symmetry(key, count)
+        whole = formula.variable == 0
+        places = jnp.where(whole, places, jnp.arange(count))
+        negated = jnp.where(whole, negated, 0)
+        order = order.at[:count].set(jnp.argsort(places))  # `places` says where a variable goes
+        names = names.at[:count, :2].set(jnp.arange(2) ^ negated[:, None])
+        literals = _rename_literals(formula.literals, places, negated)
+        context = context._replace(observation=formula._replace(literals=literals))
+    return Turned(context, order, names)
+
+
+def _draw_symmetry(key: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """Draws a permutation of `count` variables, and which of them to negate.
+
+    Returns:
+        The new place `[count]` of each variable, and `[count]` 1 for each negated one, else 0.
+    """
+    order_key, sign_key = jax.random.split(key)
+    places = jax.random.permutation(order_key, count)
+    return places, jax.random.randint(sign_key, (count,), 0, 2)
+
+
+def _rename_literals(literals: Array, places: jax.Array, negated: jax.Array) -> jax.Array:
+    """Returns literals, of any shape, after the variables moved to `places` and changed signs."""
+    variables, values = jnp.divmod(literals, 2)
+    return 2 * places[variables] + (values ^ negated[variables])
