@@ -107,6 +107,10 @@ def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
     }  # fmt: skip
 
 
+# Of a single plan, where a preset restarts.
+MOST_CERTAIN = {"certainty": 1.0, "restarts": 1, "judge": "energy", "enough": None}
+
+
 def board_row(rate, passes=81, boards=None, **options):
     """A row of the planner that plays boards of a file."""
     config = with_options(find_preset("sudoku", puzzles.HARD, "leap", "leapjax"), options)
@@ -118,17 +122,21 @@ def board_row(rate, passes=81, boards=None, **options):
 
 def test_hard_boards_stand_beside_those_of_training():
     rows = [
-        board_row(0.9), board_row(0.6, boards="hard.txt 1234"),
-        board_row(0.7, boards="hard.txt 1234", rules=1.0),
-        board_row(0.5, passes=29.6, boards="hard.txt 1234", certainty=0.999),
+        board_row(0.9, **MOST_CERTAIN), board_row(0.6, boards="hard.txt 1234", **MOST_CERTAIN),
+        board_row(0.7, boards="hard.txt 1234", rules=1.0, **MOST_CERTAIN),
+        board_row(0.5, passes=29.6, boards="hard.txt 1234", **MOST_CERTAIN | {"certainty": 0.999}),
+        board_row(0.95, passes=38.2, boards="hard.txt 1234"),
         board_row(0.8, boards="hard.txt 1234", layers=2),  # another network
     ]  # fmt: skip
-    assert [report.is_used(row) for row in rows] == [True] * 4 + [False]
+    older = rows[1]["configuration"]["planner"]
+    del older["judge"], older["enough"]  # rows from before these settings
+    assert [report.is_used(row) for row in rows] == [True] * 5 + [False]
     lines = [[cell.strip().split(" ")[0] for cell in line.split("|")[1:-1]]
              for line in puzzles.compare_boards(rows).splitlines()[2:]]  # fmt: skip
     assert lines == [
         ["most", "81", "90.0%", "60.0%", "70.0%"],
         ["all", "30", "-", "50.0%", "-"],
+        ["restarts", "38", "-", "95.0%", "-"],
     ]
 
 
@@ -138,7 +146,7 @@ def test_ways_to_search_stand_beside_each_other(tmp_path):
         puzzle_row(rate=0.3, fill="together", iterations=10),
         puzzle_row(method="bc", rate=0.4),
         puzzle_row("Sudoku4x6", "rules", rate=0.6, fill="together", iterations=1),
-        puzzle_row("Sudoku4x6", rate=0.7, rules=1.0),
+        puzzle_row("Sudoku4x6", rate=0.7, rules=1.0, **MOST_CERTAIN),
         puzzle_row(rate=0.8, fill="margin", iterations=9),  # of no table
     ]  # fmt: skip
     assert [report.is_used(row) for row in rows] == [True] * 6 + [False]

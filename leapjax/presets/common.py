@@ -17,14 +17,14 @@ SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several action
 def paper_model(method: str, **changes: Any) -> ModelConfig:
     """Returns the network of the paper's appendix, table 5."""
     if method in UNTRAINED:
-        return ModelConfig(**changes)
+        return ModelConfig()
     return ModelConfig(architecture="paper", dropout=0.1, **changes)
 
 
 def paper_training(method: str, **changes: Any) -> TrainingConfig:
     """Returns the training of the paper's appendix, table 5."""
     if method in UNTRAINED:
-        return TrainingConfig(**{**changes, "steps": 0})
+        return TrainingConfig(steps=0)
     # This many examples fit into a core's cache. LEAP makes a copy of each for every action.
     microbatch = {"leap": 4, "classifier": 0}.get(method, 8)
     return TrainingConfig(**{"windows": "episode", "microbatch": microbatch, **changes})
@@ -32,7 +32,9 @@ def paper_training(method: str, **changes: Any) -> TrainingConfig:
 
 def our_model(method: str, **changes: Any) -> ModelConfig:
     """Returns the network of preset `leapjax`."""
-    if method in (*UNTRAINED, "classifier"):
+    if method in UNTRAINED:
+        return ModelConfig()
+    if method == "classifier":
         return ModelConfig(**changes)
     # Augmentation makes dropout useless: chosen on validation levels of BabyAI.
     return ModelConfig(dropout=0.0, **changes)
@@ -41,7 +43,7 @@ def our_model(method: str, **changes: Any) -> ModelConfig:
 def our_training(method: str, **changes: Any) -> TrainingConfig:
     """Returns the training of preset `leapjax`, with rates chosen on BabyAI's validation levels."""
     if method in UNTRAINED:
-        return TrainingConfig(**{**changes, "steps": 0})
+        return TrainingConfig(steps=0)
     rate = 1.5e-3 if method == "classifier" else 3e-3
     return TrainingConfig(**{"windows": "step", "learning_rate": rate, **changes})
 

@@ -75,7 +75,7 @@ def configure(puzzle: Puzzle, method: str, preset: str) -> AnyConfig:
         preset,
         demos=puzzle.demonstrations,
         training=training,
-        network={} if method in common.UNTRAINED else puzzle.network,
+        network=puzzle.network,
         planner=planner,
         domain_settings=puzzle.settings,
         episodes=EPISODES,

@@ -1,16 +1,14 @@
 """Presets of satisfiability."""
 
-from leapjax.configuration import AnyConfig, change
 from leapjax.domains.puzzles.satisfiability import formulas
 from leapjax.domains.puzzles.satisfiability.domain import Settings
-from leapjax.presets.common import UNTRAINED
 from leapjax.presets.puzzles import Puzzle, make_presets
 
 DEMONSTRATIONS = 2000
 TRAINING = {"steps": 2000, "batch": 32, "learning_rate": 2e-3}
 # Messages find what variables share, so a small network is enough; it trains in ten minutes on a
 # core. Chosen on validation levels of Sat20x91.
-MODEL = {"layers": 2, "heads": 2, "width": 64}
+NETWORK = {"layers": 2, "heads": 2, "width": 64}
 
 
 def describe(name: str, method: str) -> Puzzle:
@@ -21,13 +19,7 @@ def describe(name: str, method: str) -> Puzzle:
     """
     del method
     length = formulas.find_level(name).variables
-    return Puzzle("satisfiability", name, length, DEMONSTRATIONS, Settings(), TRAINING)
+    return Puzzle("satisfiability", name, length, DEMONSTRATIONS, Settings(), TRAINING, NETWORK)
 
 
-def leapjax(name: str, method: str) -> AnyConfig:
-    """Makes the configuration of our network."""
-    config = _ours(name, method)
-    return config if method in UNTRAINED else change(config, model=MODEL)
-
-
-paper, _ours = make_presets(describe)
+paper, leapjax = make_presets(describe)

@@ -2,7 +2,6 @@
 
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.domains.puzzles.sudoku.domain import Settings
-from leapjax.presets.common import UNTRAINED
 from leapjax.presets.puzzles import TURNED, Puzzle, make_presets
 
 
@@ -15,13 +14,13 @@ def describe(name: str, method: str) -> Puzzle:
     Raises:
         UserError: the level is unknown.
     """
+    del method
     level = boards.find_level(name)
     if level.side == 4:
         training = {"steps": 2000, "batch": 64, "learning_rate": 1e-3}
         return Puzzle("sudoku", name, level.cells, 500, Settings(), training, search=TURNED)
     steps = 1500 if level.fewest == level.most else 8000
-    rate = 1e-3 if method in UNTRAINED else 2e-3  # names the rows of rules, which do not learn
-    training = {"steps": steps, "batch": 32, "learning_rate": rate, "microbatch": 8}
+    training = {"steps": steps, "batch": 32, "learning_rate": 2e-3, "microbatch": 8}
     network = {"layers": 8, "width": 96}
     return Puzzle("sudoku", name, level.cells, 3000, Settings(), training, network, TURNED)
 
