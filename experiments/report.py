@@ -20,7 +20,7 @@ from leapjax.running import results, shell, startup
 from leapjax.running.results import Row
 
 DOCUMENTS = ("README.md", "docs/performance.md", "docs/reproduction.md", "docs/search.md")
-PUZZLES = ("stars", "sudoku")  # experiments, named as their domains
+PUZZLES = ("stars", "sudoku", "satisfiability")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
 

@@ -19,7 +19,10 @@ MINIMISED = {
     ", learned and rules": Setting("leapjax", changes={"rules": 1.0}),
 }
 ONE_ACTION = {(f"`--method {name}`", "T"): Setting("leapjax", name) for name in ("bc", "dt")}
-PAYS_ON = ("Star3x5, learned", "Star5x10, learned", "Sudoku9x36, learned", "Sudoku9x26, rules")
+PAYS_ON = (
+    "Star3x5, learned", "Star5x10, learned", "Sat20x91, learned", "Sudoku9x36, learned",
+    "Sudoku9x26, rules",
+)  # fmt: skip
 PAYING = (
     ("all at once", "1"), ("left to right", "T"), ("in random order", "T"),
     ("Gibbs sampling, random order", "2 T"), ("most certain first", "T"),
