@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         neutral,
         pseudo_likelihood,
         single_action,
+        symmetric,
         view,
     )
     from leapjax.errors import UserError
