@@ -429,12 +429,12 @@ def view(energy: Energy, function: Callable[[PyTree], PyTree]) -> Energy:
     return check_kind(energy, Energy)._replace(encode=encode)
 
 
-class _View(NamedTuple):
-    """The memory of a symmetric energy.
+class _Form(NamedTuple):
+    """The memory of a symmetric energy: one form of a context.
 
     Attributes:
         context: the original context.
-        memory: of the energy within, for the context as it is turned.
+        memory: memory of the energy within, for this form.
         places: see `Turned`; `None` for the original context.
         names: see `Turned`.
     """
@@ -457,41 +457,49 @@ def symmetric(energy: Energy, draw: Callable[[jax.Array, PyTree], Turned]) -> En
         energy: energy within.
         draw: (key, context) -> the context after a random symmetry. Every plan that solves the
             original context, renamed, must solve the turned one.
+
+    Raises:
+        UserError: while it plans: `draw` returns no `Turned`, or one for plans of another length.
     """
     num_actions = check_kind(energy, Energy).num_actions
 
-    def encode(params: Params, context: PyTree) -> _View:
-        return _View(context, energy.encode(params, context))
+    def encode(params: Params, context: PyTree) -> _Form:
+        return _Form(context, energy.encode(params, context))
 
-    def turn(params: Params, key: jax.Array, view: _View) -> _View:
-        turned = draw(key, view.context)
-        return _View(
-            view.context, energy.encode(params, turned.context), turned.places, turned.names
+    def turn(params: Params, key: jax.Array, form: _Form) -> _Form:
+        turned = check_kind(draw(key, form.context), Turned)
+        return _Form(
+            form.context, energy.encode(params, turned.context), turned.places, turned.names
         )
 
-    def rename(view: _View, actions: jax.Array) -> jax.Array:
+    def rename(form: _Form, actions: jax.Array) -> jax.Array:
         """Returns a plan `[T]` as the turned context has it; MASK stays MASK."""
-        if view.places is None or view.names is None:
+        if form.places is None or form.names is None:
             return actions
-        named = jnp.take_along_axis(view.names, actions[:, None] % num_actions, axis=1)[:, 0]
-        return jnp.where(actions < num_actions, named, actions)[view.places]
+        if actions.shape != form.places.shape:
+            raise UserError(
+                f"a plan of {actions.shape[0]} actions, and a symmetry of plans of "
+                f"{form.places.shape[0]}: its `places` must permute the positions of the plan"
+            )
+        named = jnp.take_along_axis(form.names, actions[:, None] % num_actions, axis=1)[:, 0]
+        return jnp.where(actions < num_actions, named, actions)[form.places]
 
     def conditional(
-        params: Params, view: _View, actions: jax.Array, positions: jax.Array
+        params: Params, form: _Form, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, num_actions)
-        if view.places is None or view.names is None:
-            return energy.conditional(params, view.memory, actions, positions)
-        there = jnp.argsort(view.places)[positions]
-        energies = energy.conditional(params, view.memory, rename(view, actions), there)
-        return jnp.take_along_axis(energies, view.names[positions], axis=1)
+        if form.places is None or form.names is None:
+            return energy.conditional(params, form.memory, actions, positions)
+        there = jnp.argsort(form.places)[positions]
+        energies = energy.conditional(params, form.memory, rename(form, actions), there)
+        return jnp.take_along_axis(energies, form.names[positions], axis=1)
 
-    def total(params: Params, view: _View, actions: jax.Array) -> jax.Array:
+    def total(params: Params, form: _Form, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
-        return energy.total(params, view.memory, rename(view, actions))
+        return energy.total(params, form.memory, rename(form, actions))
 
-    def violation(params: Params, view: _View, actions: jax.Array) -> jax.Array:
-        return energy.violation(params, view.memory, rename(view, actions))
+    def violation(params: Params, form: _Form, actions: jax.Array) -> jax.Array:
+        return energy.violation(params, form.memory, rename(form, actions))
 
     return energy._replace(
         encode=encode, conditional=conditional, total=total, turn=turn,

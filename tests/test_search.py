@@ -21,6 +21,7 @@ from leapjax import (
     from_total,
 )
 from leapjax.energy import symmetric
+from leapjax.errors import UserError
 from leapjax.planners import FILLS, bind
 from leapjax.planners.judges import SPLITS, sum_halves
 from leapjax.planners.positions import Commitment, choose_open, most_certain
@@ -285,6 +286,15 @@ def test_restarts_see_the_context_turned(judge, enough):
     assert_equal(plan.actions, context)
     # The energy is that of the plan where nothing is turned.
     assert_close(plan.energy, mislead().total((), context, jnp.asarray(plan.actions)), rtol=1e-6)
+
+
+def test_a_symmetry_of_other_plans_is_refused():
+    longer = TURNING.turn((), jax.random.key(0), TURNING.encode((), jnp.array([2, 0, 1])))
+    with pytest.raises(UserError, match="a plan of 4 actions, and a symmetry of plans of 3"):
+        TURNING.conditional((), longer, jnp.zeros(4, int), jnp.arange(4))
+    wrong = symmetric(mislead(), lambda key, context: context)
+    with pytest.raises(UserError, match="Turned"):
+        wrong.turn((), jax.random.key(0), wrong.encode((), jnp.array([2, 0, 1])))
 
 
 def test_the_parts_of_an_energy_are_turned_together():
