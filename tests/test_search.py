@@ -203,7 +203,7 @@ def test_halves_sum_the_conditionals_of_each_action_given_the_other_half():
     for seed, plan in itertools.product(range(4), all_plans(horizon, actions)[[0, 5, 14]]):
         score = float(sum_halves(energy, table, memory, jax.random.key(seed), jnp.asarray(plan)))
         splits = [cost(plan, half) + cost(plan, {*range(horizon)} - half) for half in halves]
-        sums = [a + b for a, b in itertools.product(splits, repeat=SPLITS)]
+        sums = [sum(each) for each in itertools.product(splits, repeat=SPLITS)]
         assert np.isclose(sums, score, rtol=1e-4).any()
         found.add(round(score, 4))
     assert len(found) > 3  # keys draw different halves
@@ -334,7 +334,7 @@ def test_restarts_stop_when_a_plan_is_good_enough():
 
 
 @pytest.mark.parametrize("fill", [fill for fill in FILLS if fill != "together"])
-@pytest.mark.parametrize("judge", ["sum", "energy", "halves"])
+@pytest.mark.parametrize("judge", ["sum", "energy"])
 def test_wide_beams_find_the_mode_in_any_order(fill, judge):
     for seed in range(6):
         table = random_table(seed, HORIZON, ACTIONS)
@@ -343,6 +343,15 @@ def test_wide_beams_find_the_mode_in_any_order(fill, judge):
         joint = joint_probabilities(table)
         assert_equal(plan.actions, np.unravel_index(joint.argmax(), joint.shape))
         assert_close(plan.energy, -np.log(joint.max()), rtol=1e-4)
+
+
+def test_halves_choose_among_beams_of_all_plans():
+    table, key = random_table(4, HORIZON, ACTIONS), jax.random.key(0)
+    memory = ENUMERABLE.encode(table, NO_TILT)
+    judge_key = jax.random.fold_in(key, 2)
+    scores = jax.vmap(lambda plan: sum_halves(ENUMERABLE, table, memory, judge_key, plan))(PLANS)
+    plan = plan_for(BeamConfig(HORIZON, len(PLANS), judge="halves"), params=table)
+    assert_equal(plan.actions, PLANS[np.argmin(scores)])
 
 
 def test_the_total_energy_chooses_another_beam_than_the_sum():
