@@ -1,4 +1,4 @@
-"""The tables of stars and Sudoku, whose plans are executed whole, by search."""
+"""The tables of puzzles, whose plans are executed whole, by search."""
 
 import dataclasses
 from collections.abc import Sequence

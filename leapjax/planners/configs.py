@@ -122,6 +122,11 @@ class GibbsConfig:
         return 1 if self.fill == "together" else -(-self.horizon // self.resampled)
 
     @property
+    def returnable(self) -> int:
+        """The plans of a trace that may be returned: all, or the last."""
+        return self.iterations if self.keep == "best" else 1
+
+    @property
     def is_judged(self) -> bool:
         """Whether there are several plans to compare."""
         return self.restarts > 1 or self.keep == "best"

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
 from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open, compute_probabilities
-from leapjax.planners.restarts import Chain, find_best_chain
-from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_turn
+from leapjax.planners.restarts import Chain, find_best_chain, turns_contexts
+from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 
 def gibbs(
@@ -42,11 +42,11 @@ def gibbs(
 
     chain = find_best_chain(energy, params, key, memory, config, run)
     best = jnp.argmin(chain.scores)
-    actions = (chain.trace if config.keep == "best" else chain.trace[-1:])[best]
+    actions = chain.trace[-config.returnable :][best]
     satisfied = energy.violation(params, memory, actions) <= 0
     plan = Plan(actions, chain.trace, satisfied, chain.valid, chain.passes)
     # The judge knows the energies, unless it is another or saw the context turned.
-    known = config.judge == "energy" and not (config.restarts > 1 and energy.turn is not no_turn)
+    known = config.judge == "energy" and not turns_contexts(energy, config)
     if config.score and known and config.is_judged:
         plan = plan._replace(energy=chain.scores[best])
     elif config.score:
@@ -171,7 +171,7 @@ def _run_chain(
     noise = temperatures * draw_noise(noise_key, later, config.resampled)  # [N - F, P, A]
     plan, (trace, valid) = jax.lax.scan(resample, plan, (positions, noise))
     trace = jnp.concatenate([begun, trace])
-    scores = jnp.zeros(config.iterations if config.keep == "best" else 1)
+    scores = jnp.zeros(config.returnable)
     return Chain(trace, begun_valid & valid.all(), passes + later, scores)
 
 

@@ -32,6 +32,11 @@ class Chain(NamedTuple):
 Run = Callable[[jax.Array, PyTree], Chain]  # (key, memory) -> chain, not judged
 
 
+def turns_contexts(energy: Energy, config: GibbsConfig) -> bool:
+    """Tells whether each restart sees the context turned by a symmetry of its own."""
+    return config.restarts > 1 and energy.turn is not no_turn
+
+
 def find_best_chain(
     energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: GibbsConfig, run: Run
 ) -> Chain:
@@ -44,9 +49,8 @@ def find_best_chain(
         ValueError: the judge masks actions, and the energy does not accept MASK.
     """
     judge = find_judge(config.judge, energy)
-    turns = config.restarts > 1 and energy.turn is not no_turn
+    turns, kept = turns_contexts(energy, config), config.returnable
     judge_key = jax.random.fold_in(key, 1)
-    kept = config.iterations if config.keep == "best" else 1
 
     def look(key: jax.Array) -> PyTree:
         """Returns the memory that a restart sees."""

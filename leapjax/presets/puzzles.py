@@ -30,7 +30,7 @@ class Puzzle(NamedTuple):
         settings: settings of the domain.
         training: changes of the preset's training.
         network: changes of our network.
-        search: how LEAP plans.
+        search: changes of how LEAP plans.
     """
 
     domain: str
@@ -40,7 +40,7 @@ class Puzzle(NamedTuple):
     settings: Any
     training: Mapping[str, Any]
     network: Mapping[str, Any] = {}
-    search: Mapping[str, Any] = {"fill": "confident"}
+    search: Mapping[str, Any] = {}
 
 
 def make_presets(describe: Callable[[str, str], Puzzle]) -> tuple[Preset, Preset]:

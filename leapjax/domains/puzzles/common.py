@@ -17,7 +17,7 @@ from leapjax.data.solved import collect_solved
 from leapjax.domain import Demonstrations, HeldOut
 from leapjax.environments import Transition
 from leapjax.errors import UserError
-from leapjax.types import Array, Demonstration, PyTree, Window, pad_token
+from leapjax.types import Array, Context, Demonstration, PyTree, Turned, Window, pad_token
 
 O = TypeVar("O")  # noqa: E741
 P = TypeVar("P")
@@ -109,6 +109,37 @@ def rewrite(
         actions=read(earlier, pad_token(end + 1)),
     )
     return window._replace(context=context, actions=read(ahead, end))
+
+
+def turn_whole(
+    context: Context, length: int, begins: jax.Array, horizon: int, actions: int,
+    draw: Callable[[], tuple[PyTree, jax.Array, jax.Array]],
+) -> Turned:  # fmt: skip
+    """Turns a puzzle for plans of its whole solution; see `leapjax.types.Turned`.
+
+    A plan that begins later, or is shorter, would write other parts of the turned puzzle. Then the
+    puzzle stays as it is.
+
+    Args:
+        context: context of the plan.
+        length: n, actions of a solution.
+        begins: `[]` bool: whether the plan begins with the first action.
+        horizon: T.
+        actions: A, the end action included.
+        draw: returns the turned observation, the places `[n]`, and names `[n, k]` or `[k]` of the
+            first k actions; the others keep their names.
+    """
+    names = jnp.tile(jnp.arange(actions), (horizon, 1))
+    still = Turned(context, jnp.arange(horizon), names)
+    if horizon < length:
+        return still
+    observation, places, renamed = draw()
+    turned = Turned(
+        context._replace(observation=observation),
+        still.places.at[:length].set(places),
+        names.at[:length, : renamed.shape[-1]].set(renamed),
+    )
+    return jax.tree.map(lambda new, old: jnp.where(begins, new, old), turned, still)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_seed
-from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
+from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite, turn_whole
 from leapjax.domains.puzzles.names import read_numbers
 from leapjax.errors import UserError
 from leapjax.types import Array, Context, Demonstration, Turned, Window
@@ -178,24 +178,17 @@ def rename(key: jax.Array, window: Window) -> Window:
 
 
 def turn(key: jax.Array, context: Context, horizon: int) -> Turned:
-    """Permutes and negates the variables of a formula, for plans that assign all of them.
-
-    A plan that begins behind the first variable, or is shorter, would assign other variables of the
-    turned formula. Then the formula stays as it is.
-    """
+    """Permutes and negates the variables of a formula, for plans that assign all of them."""
     formula = context.observation
     count = formula.values.shape[0]
-    order, names = jnp.arange(horizon), jnp.tile(jnp.arange(3), (horizon, 1))
-    if horizon >= count:
+
+    def draw() -> tuple[Formula, jax.Array, jax.Array]:
         places, negated = _draw_symmetry(key, count)
-        whole = formula.variable == 0
-        places = jnp.where(whole, places, jnp.arange(count))
-        negated = jnp.where(whole, negated, 0)
-        order = order.at[:count].set(jnp.argsort(places))  # `places` says where a variable goes
-        names = names.at[:count, :2].set(jnp.arange(2) ^ negated[:, None])
         literals = _rename_literals(formula.literals, places, negated)
-        context = context._replace(observation=formula._replace(literals=literals))
-    return Turned(context, order, names)
+        order = jnp.argsort(places)  # `places` says where a variable goes
+        return formula._replace(literals=literals), order, jnp.arange(2) ^ negated[:, None]
+
+    return turn_whole(context, count, formula.variable == 0, horizon, 3, draw)
 
 
 def _draw_symmetry(key: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:

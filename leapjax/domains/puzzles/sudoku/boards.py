@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.checks import check_range, check_seed
-from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite
+from leapjax.domains.puzzles.common import PuzzleAdapter, repeat, rewrite, turn_whole
 from leapjax.domains.puzzles.names import read_numbers
 from leapjax.errors import UserError
 from leapjax.types import Array, Context, Demonstration, Turned, Window
@@ -377,21 +377,15 @@ def transform(key: jax.Array, window: Window, side: int) -> Window:
 
 
 def turn(key: jax.Array, context: Context, side: int, horizon: int) -> Turned:
-    """Turns a board by random symmetries of the rules, for plans that write the whole board.
+    """Turns a board by random symmetries of the rules, for plans that write the whole board."""
+    board = context.observation
 
-    A plan that begins behind the first cell, or is shorter, would write other cells of the turned
-    board. Then the board stays as it is.
-    """
-    board, cells = context.observation, side**2
-    places, names = jnp.arange(horizon), jnp.arange(side + 1)
-    if horizon >= cells:
-        order, digits = _draw_symmetry(key, side)
-        whole = board.cell == 0
-        places = places.at[:cells].set(jnp.where(whole, order, places[:cells]))
-        names = names.at[:side].set(jnp.where(whole, digits, names[:side]))
-        digits = jnp.append(0, 1 + names[:side])[board.digits[places[:cells]]]
-        context = context._replace(observation=board._replace(digits=digits.astype(jnp.int32)))
-    return Turned(context, places, jnp.tile(names, (horizon, 1)))
+    def draw() -> tuple[Board, jax.Array, jax.Array]:
+        places, digits = _draw_symmetry(key, side)
+        found = jnp.append(0, 1 + digits)[board.digits[places]].astype(jnp.int32)
+        return board._replace(digits=found), places, digits
+
+    return turn_whole(context, side**2, board.cell == 0, horizon, side + 1, draw)
 
 
 def _draw_symmetry(key: jax.Array, side: int) -> tuple[jax.Array, jax.Array]:
