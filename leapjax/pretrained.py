@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 
 from leapjax import domains, rollouts, serialization, weights
 from leapjax.agents.base import UNNAMED, Setup, TrainingConfig
-from leapjax.batching import CHUNK_SIZES, CompiledPlanner, compile_planner, plan_keys
+from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
 from leapjax.domains import check_imported, find_domain
@@ -416,7 +416,7 @@ def _trace_parameters(
 def load(
     path: str | os.PathLike[str],
     planner: PlannerConfig | None = None,
-    chunk_sizes: Sequence[int] = CHUNK_SIZES,
+    chunk_sizes: Sequence[int] | None = None,
     level: str | None = None,
     target_return: float | None = None,
     finished: bool = False,

@@ -560,6 +560,20 @@ def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunk
     assert rows == list(range(batch))
 
 
+@pytest.mark.parametrize(
+    ("config", "sizes"),
+    [
+        (GibbsConfig(2, 4), (1, 16, 128)),
+        (GibbsConfig(2, 4, fill="confident", certainty=0.9), (1, 4)),
+        (GibbsConfig(2, 4, restarts=2, enough=0.1), (1, 4)),
+        (BeamConfig(2, fill="confident", entropy_bound=0.1), (1, 4)),
+        (ShootingConfig(2), (1, 16, 128)),
+    ],
+)
+def test_chunks_are_small_where_some_plans_take_fewer_passes(config, sizes):
+    assert compile_planner(TILTED, config).chunk_sizes == sizes
+
+
 def test_after_compiling_ahead_nothing_is_traced_or_compiled(caplog):
     traced = []
 

@@ -251,3 +251,10 @@ class BeamConfig:
 
 
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
+
+
+def passes_vary(config: PlannerConfig) -> bool:
+    """Returns whether some plans take fewer passes than others with the same configuration."""
+    if not isinstance(config, GibbsConfig | BeamConfig):
+        return False
+    return make_commitment(config).adapts or getattr(config, "enough", None) is not None

@@ -10,11 +10,10 @@ from jax.sharding import Mesh
 
 from leapjax import pretrained, sharding, training
 from leapjax.agents.batches import make_blank_steps
-from leapjax.batching import CompiledPlanner, compile_planner
+from leapjax.batching import VARYING_CHUNK_SIZES, CompiledPlanner, compile_planner
 from leapjax.configuration import AnyConfig
 from leapjax.errors import UserError
-from leapjax.planners import BeamConfig, GibbsConfig
-from leapjax.planners.configs import make_commitment
+from leapjax.planners.configs import passes_vary
 from leapjax.pretrained import Pretrained
 from leapjax.running import memory
 from leapjax.training import TrainStep
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
 # Number of plans in a chunk. A single chunk size needs a single program, which compiles soon.
 # Larger chunks are a tenth faster, but suit the last episodes of an evaluation less.
 PLANS_TOGETHER = 32
-# The same where the number of passes varies, as a chunk waits for its last plan. On hard boards of
-# Sudoku, with restarts, that takes 29 s of CPU time, 35 s in chunks of 8, 71 s in chunks of 32.
-VARYING_TOGETHER = 4
 
 
 class Programs(NamedTuple):
@@ -108,10 +104,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
 
 def choose_chunk_sizes(config: AnyConfig) -> tuple[int, ...]:
     """Returns the size of a run's chunks of plans, in a tuple."""
-    search = config.planner
-    varies = isinstance(search, GibbsConfig | BeamConfig) and make_commitment(search).adapts
-    varies |= getattr(search, "enough", None) is not None
-    most = VARYING_TOGETHER if varies else PLANS_TOGETHER
+    most = VARYING_CHUNK_SIZES[-1] if passes_vary(config.planner) else PLANS_TOGETHER
     return (min(most, 1 << (config.episodes - 1).bit_length()),)
 
 
