@@ -54,7 +54,7 @@ BEST_OF_MANY = Search(
 
 
 def list_searches(config: AnyConfig) -> list[AnyConfig]:
-    """Returns a configuration for each search that a method can make.
+    """Returns a configuration for each search that a method can make, without its own.
 
     The list is empty for methods that plan one action.
     """
@@ -65,4 +65,5 @@ def list_searches(config: AnyConfig) -> list[AnyConfig]:
         every = tuple(search for search in every if search.options != TURNED)
     if config.method == "classifier":  # scores only complete plans
         every = tuple(search for search in every if "fill" not in search.options)
-    return [change(config, planner=search.of(config.planner.horizon)) for search in every]
+    found = [change(config, planner=search.of(config.planner.horizon)) for search in every]
+    return [each for each in found if each.planner != config.planner]
