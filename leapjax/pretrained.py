@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 
 from leapjax import domains, rollouts, serialization, weights
 from leapjax.agents.base import UNNAMED, Setup, TrainingConfig
+from leapjax.agents.returns import aims_for_return
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
@@ -371,7 +372,7 @@ def ask_for_return(specification: Specification, target_return: float) -> Specif
         UserError: the planner is not conditioned on returns, or does not accept this return.
     """
     settings = specification.method_settings
-    if not hasattr(settings, "target_return") or not getattr(settings, "returns", True):
+    if not aims_for_return(settings):
         raise UserError(
             f"a return of {target_return} cannot be asked for: this {specification.method} has not "
             "learned what leads to which return"

@@ -24,7 +24,7 @@ from gymnasium.wrappers import (
 from minari import DataCollector
 
 from experiments import gymnasium as program
-from leapjax import domains
+from leapjax import domains, pretrained
 from leapjax.data import storage, windows
 from leapjax.data.storage.spaces import SPACES
 from leapjax.domain import Collection, Demonstrations, blank_context
@@ -263,6 +263,22 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(said.split())
     assert "success: a positive reward at the end (nobody has named a return)" in said
     assert domains.find_domain("gymnasium") is GYMNASIUM
+
+
+def test_a_target_return_is_a_high_one_of_the_data(tmp_path, monkeypatch, capsys):
+    """Unless one is given; a checkpoint is played with the target of its data."""
+    monkeypatch.chdir(tmp_path)
+    name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 2)
+    options = [*SMALL, "--dataset", name, "--method", "dt", "--steps", "1"]
+    assert program.main(options) == 0
+    assert "target return: 1, the 99% quantile" in " ".join(capsys.readouterr().out.split())
+    (folder,) = (tmp_path / "runs").glob("gymnasium-*")
+    assert pretrained.load(folder).specification.method_settings.target_return == 1.0
+    assert program.main([*options, "--target-return", "7"]) == 0
+    assert "quantile" not in capsys.readouterr().out
+    assert program.main([*options, "--checkpoint", str(folder)]) == 0
+    (*_, row) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
+    assert row["configuration"]["method_settings"]["target_return"] == 1.0
 
 
 def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch):

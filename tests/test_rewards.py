@@ -15,6 +15,7 @@ from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
+from tests.parameters import random_parameters
 from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
@@ -150,6 +151,23 @@ def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings, st
         planner = batching.compile_planner(agent.energy, GibbsConfig(1, 1), (len(keys),))
         found = planner(state.params, keys, mixed.contexts(2)).actions[:, 0]
         np.testing.assert_array_equal(found, expected)
+
+
+def test_a_missing_target_is_a_high_return_of_the_data():
+    """Not the highest of many; what is given stays, and what asks for no return needs none."""
+    rng, given = np.random.default_rng(0), dt.Settings(target_return=3.0)
+    good = mixed.walk(rng, 1, 1.0)._replace(rewards=np.array([5.0], np.float32))
+    data = [good._replace(rewards=np.float32([i])) for i in range(1000)]
+    missing, unconditioned = dt.Settings(None), leap.Settings(target_return=None)
+    assert returns.choose_target(missing, [good]) == dt.Settings(5.0)
+    assert returns.choose_target(missing, data) == dt.Settings(990.0)
+    for settings in (given, unconditioned, bc.Settings()):
+        assert returns.choose_target(settings, data) == settings
+    assert returns.choose_target(missing, []) == missing
+    agent = dt.make_agent(Setup(mixed.DOMAIN, 0, 1, ModelConfig(), TrainingConfig(), missing))
+    context = jax.tree.map(lambda leaf: leaf[0], mixed.contexts(0))
+    with pytest.raises(UserError, match="no target return, and no demonstrations"):
+        agent.energy.encode(random_parameters(agent), context)
 
 
 def test_the_return_that_is_wanted_is_less_by_what_was_given():

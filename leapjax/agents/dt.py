@@ -20,10 +20,11 @@ class Settings:
     """The options of Decision Transformer alone.
 
     Attributes:
-        target_return: Return of an episode to aim for while acting.
+        target_return: Return of an episode to aim for while acting; `None` for a high return of the
+            training data (`returns.QUANTILE`).
     """
 
-    target_return: float = 1.0
+    target_return: float | None = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)

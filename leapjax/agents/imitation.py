@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from leapjax.agents import losses
@@ -54,7 +55,7 @@ def make_imitator(
 
     def touch(module: PolicyModel, context: Context, actions: jax.Array) -> jax.Array:
         del actions
-        return module(context, returns=compute_returns(context))["logits"]
+        return module(context, returns=compute_returns(context, jnp.zeros(())))["logits"]
 
     mean_loss = average_loss(setup, window_loss, make_window_encoder(module))
     return Agent(

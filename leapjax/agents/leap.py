@@ -35,14 +35,15 @@ class Settings:
         repeat_state: Show the whole state to every position (eq. 4). Otherwise later positions see
             the state without the agent's pose.
         returns: Condition plans on the return to go, as Decision Transformer does.
-        target_return: Return of an episode to aim for while acting. It needs `returns`.
+        target_return: Return of an episode to aim for while acting; `None` for a high return of the
+            training data. It needs `returns`.
     """
 
     masking: str = "one"
     end: bool = True
     repeat_state: bool = True
     returns: bool = False
-    target_return: float = 1.0
+    target_return: float | None = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -169,7 +170,7 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
     batch = run_batches(setup) if in_runs else window_batches(setup)
 
     def touch(module: MaskedModel, context: Context, actions: jax.Array) -> jax.Array:
-        memory: PyTree = module.encode(context, returns=compute_returns(context))
+        memory: PyTree = module.encode(context, returns=compute_returns(context, jnp.zeros(())))
         return module.logits(memory, actions, jnp.arange(actions.shape[0]))
 
     init = make_init(setup, module, touch, optimizer)

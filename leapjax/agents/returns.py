@@ -1,16 +1,51 @@
 """Returns to go, on which Decision Transformer and LEAP can be conditioned (Chen et al., 2021)."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from leapjax.agents.base import Setup
-from leapjax.types import Context
+from leapjax.errors import UserError
+from leapjax.types import Context, Demonstration
+
+QUANTILE = 0.99  # of the demonstrations' returns: the target where settings name none
 
 ComputeReturns = Callable[..., jax.Array | None]
 # (context, return to go at a demonstration's current state) -> returns to go [K + 1] for the
 # network, or `None` if it has no such input. While acting, the second argument is `None`.
+
+
+def aims_for_return(settings: Any) -> bool:
+    """Returns whether a method with these settings is conditioned on returns."""
+    return hasattr(settings, "target_return") and getattr(settings, "returns", True)
+
+
+def lacks_target(settings: Any) -> bool:
+    """Returns whether a method with these settings takes its target return from the data."""
+    return aims_for_return(settings) and settings.target_return is None
+
+
+def choose_target(settings: Any, demonstrations: Sequence[Demonstration]) -> Any:
+    """Fills in a missing target return: a return of the data, at their `QUANTILE`.
+
+    A high quantile asks for a good episode, but not for the luckiest one.
+
+    Args:
+        settings: settings of a method.
+        demonstrations: training data; if there are none, the target stays missing.
+
+    Returns:
+        Settings with a target return; other settings as they are.
+    """
+    if not lacks_target(settings) or not demonstrations:
+        return settings
+    found = [np.sum(each.rewards, dtype=np.float64) for each in demonstrations]
+    target = float(np.quantile(found, QUANTILE, method="higher"))
+    return dataclasses.replace(settings, target_return=target)
 
 
 def condition_on_target(setup: Setup) -> ComputeReturns:
@@ -22,6 +57,11 @@ def condition_on_target(setup: Setup) -> ComputeReturns:
 
     def compute(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
         if return_to_go is None:
+            if setup.settings.target_return is None:
+                raise UserError(
+                    "there is no target return, and no demonstrations to take it from",
+                    "target_return",
+                )
             return_to_go = setup.settings.target_return - context.return_so_far
         return compute_returns_to_go(context, return_to_go) / setup.domain.scaling.returns
 

@@ -1,6 +1,6 @@
 """Presets of any environment, such as Gymnasium's: plan five actions, execute one."""
 
-from leapjax.configuration import AnyConfig
+from leapjax.configuration import AnyConfig, change
 from leapjax.domains import find_domain
 from leapjax.presets import common
 
@@ -22,7 +22,7 @@ def leapjax(domain: str, name: str, method: str) -> AnyConfig:
 
 
 def _configure(domain: str, name: str, method: str, preset: str, temperature: float) -> AnyConfig:
-    return common.configure(
+    config = common.configure(
         domain,
         name,
         method,
@@ -34,3 +34,6 @@ def _configure(domain: str, name: str, method: str, preset: str, temperature: fl
         episodes=EPISODES,
         executed=1,
     )
+    if method not in common.CONDITIONED:
+        return config
+    return change(config, method_settings={"target_return": None})  # from the data

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from leapjax import files, processes
+from leapjax.agents.returns import lacks_target
 from leapjax.data import seeds, storage
 from leapjax.data.storage import describe_dropped
 from leapjax.domain import Domain, Source
@@ -38,7 +39,8 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     name = config.demonstrations or source.default
     begun = time.perf_counter()
     if config.demonstrations is None and processes.run_on_first(lambda: not source.exists(name)):
-        if run.domain.scaling.measure is None:  # the network does not depend on the data
+        # Otherwise the programs depend on the data.
+        if run.domain.scaling.measure is None and not lacks_target(config.method_settings):
             run.programs.begin(run)
         processes.run_on_first(lambda: _make(run, source, name))
     # Each process reads its own copy: the data need not be on a shared disk.

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from leapjax import files, pretrained, processes, sharding, training
+from leapjax.agents.returns import QUANTILE, choose_target
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import apply_statistics, measure_statistics
@@ -39,7 +40,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
             it.
         Interrupted: the run was asked to stop; its newest state is saved.
     """
-    run = learn_statistics(run, data)
+    run = learn_from_data(run, data)
     processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # In Atari these are all frames: the host keeps one copy until the devices have theirs.
@@ -106,11 +107,19 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     return Pretrained(run.specification, agent.energy, params, plan, run.domain)
 
 
-def learn_statistics(run: Run, data: Sequence[Demonstration]) -> Run:
-    """Returns a run with the statistics of its data, if its network needs them."""
-    statistics = measure_statistics(run.domain, data)
+def learn_from_data(run: Run, data: Sequence[Demonstration]) -> Run:
+    """Returns a run with the statistics and the target return of its data, if it needs them."""
+    statistics, given = measure_statistics(run.domain, data), run.specification.method_settings
+    settings = choose_target(given, data)
+    if settings != given:
+        run.console.print(
+            f"target return: {settings.target_return:g}, the {QUANTILE:.0%} quantile of the "
+            "demonstrations"
+        )
     return dataclasses.replace(
         run,
         domain=apply_statistics(run.domain, statistics),
-        specification=dataclasses.replace(run.specification, statistics=statistics),
+        specification=dataclasses.replace(
+            run.specification, method_settings=settings, statistics=statistics
+        ),
     )
