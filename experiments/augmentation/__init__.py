@@ -16,6 +16,7 @@ from leapjax.domains import DOMAINS
 from leapjax.domains.babyai import domain, settings
 from leapjax.domains.babyai.augmentation import choose_augmentations
 from leapjax.domains.babyai.augmentation.words import find_words
+from leapjax.presets import PRESETS, find_presets
 
 NAME = "augmented_babyai"  # in the table of domains
 
@@ -73,3 +74,4 @@ def augment(config: AnyConfig, **changes: float) -> AnyConfig:
 
 
 DOMAINS[NAME] = DomainType(Settings, make, domain.BABYAI.levels)
+PRESETS[NAME] = find_presets("babyai")

@@ -29,6 +29,11 @@ def lacks_target(settings: Any) -> bool:
     return aims_for_return(settings) and settings.target_return is None
 
 
+def sum_rewards(demonstrations: Sequence[Demonstration]) -> list[float]:
+    """Returns the return of each demonstration."""
+    return [float(np.sum(each.rewards, dtype=np.float64)) for each in demonstrations]
+
+
 def choose_target(settings: Any, demonstrations: Sequence[Demonstration]) -> Any:
     """Fills in a missing target return: a return of the data, at their `QUANTILE`.
 
@@ -43,8 +48,7 @@ def choose_target(settings: Any, demonstrations: Sequence[Demonstration]) -> Any
     """
     if not lacks_target(settings) or not demonstrations:
         return settings
-    found = [np.sum(each.rewards, dtype=np.float64) for each in demonstrations]
-    target = float(np.quantile(found, QUANTILE, method="higher"))
+    target = float(np.quantile(sum_rewards(demonstrations), QUANTILE, method="higher"))
     return dataclasses.replace(settings, target_return=target)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from leapjax import files, processes
-from leapjax.agents.returns import lacks_target
+from leapjax.agents.returns import lacks_target, sum_rewards
 from leapjax.data import seeds, storage
 from leapjax.data.storage import describe_dropped
 from leapjax.domain import Domain, Source
@@ -74,7 +74,7 @@ def judge_data(data: Sequence[Demonstration], domain: Domain) -> dict[str, Any] 
     criterion = domain.demonstrations.criterion
     if criterion is None or not data:
         return None
-    totals = [float(np.sum(d.rewards, dtype=np.float64)) for d in data]
+    totals = sum_rewards(data)
     successes = [
         judge_episode(criterion, total, float(d.rewards[-1]), d.terminated, d.truncated)
         for total, d in zip(totals, data, strict=True)

@@ -113,8 +113,7 @@ def check_target_return(config: AnyConfig) -> None:
     if getattr(settings, "returns", True):
         return
     default = find_preset(config.domain, config.level, config.method, config.preset).method_settings
-    # A domain without presets of its own may have the method's default.
-    if settings.target_return not in (default.target_return, type(settings).target_return):
+    if settings.target_return != default.target_return:
         raise UserError(
             f"--target-return {settings.target_return}: --method {config.method} is told of "
             "returns with --returns only"
