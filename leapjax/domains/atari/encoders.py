@@ -35,8 +35,7 @@ def compute_changes(stacks: jax.Array) -> jax.Array:
     """Computes the last frame and the changes before it from stacks `[n, 84, 84, 4]`.
 
     Moving objects cover a few of thousands of pixels: a network that does not see changes learns
-    hardly anything for a thousand steps (docs/lessons.md). The result averages over two by two
-    pixels.
+    hardly anything for a thousand steps. The result averages over two by two pixels.
 
     Returns:
         `[n, 42, 42, 4]`: the last frame, then the three changes, oldest first.
@@ -68,7 +67,7 @@ class Features(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:  # noqa: D102
         for index, (side, stride, times) in enumerate(self.layers):
-            # XLA's convolution is faster here than a product over shifted copies (docs/lessons.md).
+            # XLA's convolution is faster here than a product over shifted copies.
             convolution = nn.Conv(
                 times * self.features, (side, side), stride, "VALID", dtype=self.dtype,
                 kernel_init=nn.initializers.he_normal(), name=f"convolution_{index}",
@@ -136,7 +135,7 @@ class CurrentTokens(Encoder):
         known = jnp.maximum(jnp.arange(past + 1), past - context.step)
         read = Features(HALVED, self.features, self.dtype, name="features")
         features = read(compute_changes(stack_frames(frames[known], 1)))
-        # A wide and normalised layer: the transformer needs positions as inputs (docs/lessons.md).
+        # A wide and normalised layer: the transformer needs positions as inputs.
         hidden = nn.Dense(
             HIDDEN, dtype=self.dtype, kernel_init=nn.initializers.he_normal(), name="hidden"
         )

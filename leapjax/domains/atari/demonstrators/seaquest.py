@@ -81,7 +81,7 @@ def play_seaquest(emulator: Emulator, random: np.random.Generator) -> int:
     """Plays Seaquest: moves to and fro in a lane, and fires all the time.
 
     The submarine collects six divers and surfaces with them, or rises as its air runs out. It
-    never waits, because agents that learn to wait never stop waiting (docs/lessons.md).
+    never waits, because agents that learn to wait never stop waiting.
     """
     del random
     scene = read_scene(emulator.ram())

@@ -79,7 +79,7 @@ class ContextTokens(Encoder):
         The first feature is 1 on these cells. The second says how recently the agent faced them, in
         (0, 1], where 1 is now. Both show which part of an instruction is done. The encoder leaves
         out past actions and the rest of the agent's path, because a network could recognise a
-        demonstration by them (docs/lessons.md).
+        demonstration by them.
 
         Args:
             context: context with K past steps.

@@ -1,7 +1,7 @@
 """Convolutions, normalisation and pooling of the paper's encoder.
 
-The fastest convolution on a CPU depends on the map (docs/lessons.md). On these small maps with many
-channels it is a matrix product over shifted copies. On whole grids with few channels it is XLA's.
+The fastest convolution on a CPU depends on the map. On these small maps with many channels it is a
+matrix product over shifted copies. On whole grids with few channels it is XLA's.
 """
 
 import flax.linen as nn
