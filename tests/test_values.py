@@ -1,0 +1,111 @@
+"""Values that methods learn with the default settings of an environment are the exact ones."""
+
+import functools
+
+import gymnasium as gym
+import jax
+import numpy as np
+import pytest
+
+import leapjax as leap
+from leapjax.domain import blank_context
+from leapjax.models.config import ModelConfig
+from leapjax.types import Demonstration
+from tests.programs import only_long
+from tests.quick import quick_jit
+
+STATES, SLIP, DISCOUNT = 24, 0.2, 0.99
+SMALL = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
+
+
+class Corridor(gym.Env):
+    """Action 1 leads forward to the goal, but one step in five goes the other way."""
+
+    observation_space = gym.spaces.Discrete(STATES)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0
+        return 0, {}
+
+    def step(self, action):
+        forward = bool(action) != (self.np_random.random() < SLIP)
+        self.place = max(self.place + (1 if forward else -1), 0)
+        over = self.place == STATES
+        return min(self.place, STATES - 1), float(over), over, False, {}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered():
+    gym.register("SlipperyCorridor-v0", Corridor, max_episode_steps=150)
+    yield
+    del gym.registry["SlipperyCorridor-v0"]
+
+
+def walk(env, seed, rng):
+    """An episode that steps forward with a probability of 40 to 90%."""
+    share = rng.uniform(0.4, 0.9)
+    observations, actions, rewards, over = [env.reset(seed=seed)[0]], [], [], [False, False]
+    while not any(over):
+        actions.append(int(rng.random() < share))
+        after, reward, *over, _ = env.step(actions[-1])
+        observations.append(after)
+        rewards.append(reward)
+    seen, taken, given = np.array(observations), np.int32(actions), np.float32(rewards)
+    return Demonstration(seen, taken, given, *over, seed)
+
+
+def iterate_values(read_value):
+    """Exact Q-values [STATES, 2], given (Q-values) -> the values [STATES] of their states."""
+    q = np.zeros((STATES, 2))
+    for _ in range(3000):
+        value = DISCOUNT * read_value(q)
+        back, forward = np.append(value[0], value[:-1]), np.append(value[1:], 1.0)
+        q = np.stack(
+            [SLIP * forward + (1 - SLIP) * back, (1 - SLIP) * forward + SLIP * back], axis=1
+        )
+    return q
+
+
+def find_expectiles(q, actions, share):
+    """The expectile of each state's two Q-values, given the shares [STATES, 2] of actions."""
+    high = share * np.take_along_axis(actions, q.argmax(1)[:, None], 1)[:, 0]
+    low = (1 - share) * np.take_along_axis(actions, q.argmin(1)[:, None], 1)[:, 0]
+    return (high * q.max(1) + low * q.min(1)) / (high + low)
+
+
+@only_long
+@pytest.mark.parametrize("method", ["bcq", "iql", "qr_dqn", "rem"])
+def test_values_of_the_defaults_are_exact(method):
+    """And the best action is found in each state, of which no demonstration takes it always.
+
+    CQL's conservative term and MOPO's imagined steps change the values, so they have no exact ones.
+    """
+    domain, rng = leap.make_domain("gymnasium", "SlipperyCorridor-v0"), np.random.default_rng(0)
+    env, learned = domain.make_adapter().env, []
+    data = [walk(env, seed, rng) for seed in range(500)]
+    planner = leap.fit(
+        data, domain, method, model=SMALL, progress=lambda _, means: learned.append(means["value"])
+    )
+    states = np.concatenate([each.observations[:-1] for each in data])
+    actions = np.concatenate([each.actions for each in data])
+    taken = np.stack([np.bincount(states[actions == a], minlength=STATES) for a in (0, 1)], axis=1)
+    if method == "iql":
+        shares = taken / taken.sum(axis=1, keepdims=True)
+        share = planner.specification.method_settings.expectile
+        read = functools.partial(find_expectiles, actions=shares, share=share)
+        exact = read(iterate_values(read))[states].mean()
+    else:
+        exact = iterate_values(lambda q: q.max(1))[states, actions].mean()
+    assert np.mean(learned[-3:]) == pytest.approx(exact, abs=0.1)
+    assert max(learned) < 1.1  # no return exceeds 1
+
+    blank = blank_context(planner.domain, planner.specification.context)
+    contexts = jax.tree.map(lambda leaf: np.stack([leaf] * STATES), blank)
+    contexts = contexts._replace(observation=np.arange(STATES))
+    memory = quick_jit(jax.vmap(planner.energy.encode, (None, 0)))(planner.params, contexts)
+    first = np.zeros((STATES, 1), np.int32)
+    conditional = jax.vmap(planner.energy.conditional, (None, 0, 0, 0))
+    energies = quick_jit(conditional)(planner.params, memory, first, first)[:, 0]
+    assert (np.asarray(energies)[:, :2].argmin(axis=1) == 1).all()
