@@ -1,6 +1,7 @@
 """Training in one call: from demonstrations to a ready planner."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from leapjax import compilation, pretrained, sharding
 from leapjax.agents.base import TrainingConfig
 from leapjax.agents.returns import choose_target
+from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows
@@ -136,13 +138,18 @@ def fit(
         windows.concatenate(data, domain.augmentations.extras, padded=True) if data else ()
     )
 
+    last: dict[str, float] = {}
+
     def report(done: int, state: TrainState, means: dict[str, float]) -> None:
         del state
+        last.update(means)
         progress(done, means)
 
     state, key = begin(seed)
     placed = sharding.replicate(steps_of_all, mesh)
     state = train(step, state, placed, key, training.steps, report)
+    if warning := judge_values(settings, data, last):
+        warnings.warn(warning, stacklevel=2)
     params = jax.tree.map(jnp.asarray, sharding.to_host(state.params))
     plan = compile_planner(agent.energy, planner, encode_next=agent.encode_next)
     return Pretrained(specification, agent.energy, params, plan, domain)

@@ -37,7 +37,7 @@ from leapjax.domains.gymnasium.observations import (
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.rollouts import evaluate
-from leapjax.running import command_line, results
+from leapjax.running import command_line, results, train
 from leapjax.running.data import judge_data
 from leapjax.types import Demonstration, Plan
 from tests import toy
@@ -255,12 +255,15 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     (chosen,) = command_line.parse("gymnasium", ["--demonstrations", name])
     assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # as the data say
     options = [*SMALL, "--horizon", "3", "--context", "1", "--steps", "40"]
+    judged = lambda settings, data, means: f"{len(data)} of {means['step']}"  # noqa: E731
+    monkeypatch.setattr(train, "judge_values", judged)
     assert program.main(["--dataset", name, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
     assert (row["data_success"], row["data_return"], row["criterion_given"]) == (1.0, 1.0, False)
     said = capsys.readouterr().out
     assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(said.split())
+    assert "warning: 4 of 40" in said
     assert "success: a positive reward at the end (nobody has named a return)" in said
     assert domains.find_domain("gymnasium") is GYMNASIUM
 

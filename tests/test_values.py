@@ -1,6 +1,8 @@
 """Values that methods learn with the default settings of an environment are the exact ones."""
 
 import functools
+import itertools
+import warnings
 
 import gymnasium as gym
 import jax
@@ -8,9 +10,12 @@ import numpy as np
 import pytest
 
 import leapjax as leap
+from leapjax import fitting
+from leapjax.agents import value_range
 from leapjax.domain import blank_context
 from leapjax.models.config import ModelConfig
 from leapjax.types import Demonstration
+from tests.parameters import make_begin
 from tests.programs import only_long
 from tests.quick import quick_jit
 
@@ -86,9 +91,12 @@ def test_values_of_the_defaults_are_exact(method):
     domain, rng = leap.make_domain("gymnasium", "SlipperyCorridor-v0"), np.random.default_rng(0)
     env, learned = domain.make_adapter().env, []
     data = [walk(env, seed, rng) for seed in range(500)]
-    planner = leap.fit(
-        data, domain, method, model=SMALL, progress=lambda _, means: learned.append(means["value"])
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # of values that rewards do not allow
+        planner = leap.fit(
+            data, domain, method, model=SMALL,
+            progress=lambda _, means: learned.append(means["value"]),
+        )  # fmt: skip
     states = np.concatenate([each.observations[:-1] for each in data])
     actions = np.concatenate([each.actions for each in data])
     taken = np.stack([np.bincount(states[actions == a], minlength=STATES) for a in (0, 1)], axis=1)
@@ -110,3 +118,52 @@ def test_values_of_the_defaults_are_exact(method):
     conditional = jax.vmap(planner.energy.conditional, (None, 0, 0, 0))
     energies = quick_jit(conditional)(planner.params, memory, first, first)[:, 0]
     assert (np.asarray(energies)[:, :2].argmin(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize("terminated", [True, False])
+@pytest.mark.parametrize("rewards", [[0.0, 0.0, 1.0], [1.0, 1.0, -3.0], [-1.0, -2.0, 20.0]])
+def test_rewards_allow_the_returns_of_all_episodes_made_of_their_steps(rewards, terminated):
+    """What comes after eight steps changes a return by 48 times their discount at most."""
+    discount = 0.5
+    data = [Demonstration(np.zeros(4), np.zeros(3, np.int32), np.array(rewards), terminated,
+                          not terminated, 0)]  # fmt: skip
+    steps, last = (rewards[:-1], rewards[-1:]) if terminated else (rewards, [0.0])
+    found = [
+        sum(discount**t * reward for t, reward in enumerate((*middle, end)))
+        for length in range(9)
+        for middle in itertools.product(steps, repeat=length)
+        for end in last
+        if terminated or length == 8
+    ]
+    allowed = value_range.find_value_range(discount, data)
+    np.testing.assert_allclose(allowed, (min(found), max(found)), rtol=0, atol=48 * 0.5**8)
+
+
+def test_without_a_discount_only_an_end_bounds_what_rewards_allow():
+    episode = Demonstration(
+        np.zeros(3), np.zeros(2, np.int32), np.array([0.0, 1.0]), True, False, 0
+    )
+    assert value_range.find_value_range(1.0, [episode]) == (0, 1)
+    cut = episode._replace(terminated=False, truncated=True)
+    assert value_range.find_value_range(1.0, [episode, cut]) == (0, np.inf)
+
+
+@pytest.mark.parametrize(("method", "value"), [("bcq", 1.2), ("iql", -0.2), ("bc", 1.2)])
+def test_values_that_rewards_do_not_allow_give_a_warning(method, value, monkeypatch):
+    """But a method that learns no values may report what it likes."""
+
+    def train(step, state, data, key, steps, report):
+        for mean in (7.0, 1.05, value):  # only the last counts
+            report(steps, state, {"value": mean})
+        return state
+
+    monkeypatch.setattr(fitting, "make_begin", make_begin)
+    monkeypatch.setattr(fitting, "train", train)
+    domain = leap.make_domain("gymnasium", "SlipperyCorridor-v0")
+    episode = Demonstration(
+        np.array([0, 1, 1]), np.int32([1, 1]), np.float32([0, 1]), True, False, 0
+    )
+    with warnings.catch_warnings(record=True, action="always") as given:
+        leap.fit([episode], domain, method, model=SMALL)
+    found = [str(each.message) for each in given if "rewards allow 0 to 1" in str(each.message)]
+    assert len(found) == (method != "bc")

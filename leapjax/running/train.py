@@ -12,6 +12,7 @@ import jax
 
 from leapjax import files, pretrained, processes, sharding, training
 from leapjax.agents.returns import QUANTILE, choose_target
+from leapjax.agents.value_range import judge_values
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
 from leapjax.domain import apply_statistics, measure_statistics
@@ -101,6 +102,9 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
 
         often = REPORT_SECONDS if jax.process_count() == 1 else math.inf
         state = training.train(step, state, steps, key, total, report, report_seconds=often)
+    settings = run.specification.method_settings
+    if metrics and (warning := judge_values(settings, data, metrics[-1])):
+        console.print(f"warning: {warning}", highlight=False)
     run.seconds["train"] = metrics[-1]["seconds"] if metrics else 0.0
     # Each process plans for itself, on its own devices.
     params = jax.tree.map(jax.numpy.asarray, sharding.to_host(state.params))
