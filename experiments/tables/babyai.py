@@ -133,13 +133,13 @@ def compute_middle(rows: Sequence[Row], setting: Setting) -> tuple[float, float,
 
 
 def compare_iterations(rows: Sequence[Row]) -> str:
-    """Tabulates success rates against the number of iterations, for training seed 0."""
+    """Tabulates success and mean steps of episodes against N, for training seed 0."""
+
+    def cell(row: Row) -> str:
+        return f"{compute_mean_rate([row]):.1f}%, {row['mean_length']:.1f}"
+
     lines = [
-        [
-            level,
-            title,
-            *(f"{compute_mean_rate([of[n]]):.1f}%" if n in of else "" for n in ITERATIONS),
-        ]
+        [level, title, *(cell(of[n]) if n in of else "" for n in ITERATIONS)]
         for level, by_title in group_by_iterations(rows).items()
         for title, of in by_title.items()
     ]
