@@ -41,7 +41,7 @@ def find_value_range(
 
     Such an episode takes steps that do not end it, and then perhaps one that does; each has a
     reward that the data have for such a step. Of these episodes the best repeats the best step for
-    ever, or ends at once.
+    ever, or ends at once. The range includes 0, where values begin.
 
     Args:
         discount: discount of rewards per step, in 0 .. 1.
@@ -52,5 +52,5 @@ def find_value_range(
     repeated = np.unique(np.concatenate(going_on)).astype(float)
     ending = np.array([d.rewards[-1] for d in demonstrations if d.terminated], float)
     for_ever = [reward * steps if reward else 0.0 for reward in repeated]
-    returns = np.append(for_ever, ending)
-    return float(returns.min()), float(returns.max())
+    returns = [0.0, *for_ever, *ending]
+    return float(min(returns)), float(max(returns))
