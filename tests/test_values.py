@@ -122,9 +122,7 @@ def test_values_of_the_defaults_are_exact(method):
 
 @pytest.mark.parametrize("terminated", [True, False])
 @pytest.mark.parametrize("rewards", [[0.0, 0.0, 1.0], [1.0, 1.0, -3.0], [-1.0, -2.0, 20.0]])
-def test_rewards_allow_nothing_and_the_returns_of_all_episodes_made_of_their_steps(
-    rewards, terminated
-):
+def test_rewards_allow_zero_and_returns_of_episodes_made_of_their_steps(rewards, terminated):
     """What comes after eight steps changes a return by 48 times their discount at most."""
     discount = 0.5
     data = [Demonstration(np.zeros(4), np.zeros(3, np.int32), np.array(rewards), terminated,
