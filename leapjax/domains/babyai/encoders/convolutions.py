@@ -59,8 +59,9 @@ class Convolution(nn.Module):
 class GroupNorm(nn.Module):
     """Group normalisation (Wu and He, 2018), in place of the authors' batch normalisation.
 
-    It equals `nn.GroupNorm` of a batch of one map. The gradient of that module takes as long as a
-    convolution. This module sums over cells first, so it splits no large array into groups.
+    It equals `nn.GroupNorm`, whose gradient takes as long as a convolution. This module sums over
+    cells first, so it splits no large array into groups. Both treat the first axis as a batch, so
+    they normalise each column of a map by itself (docs/deviations.md).
 
     Attributes:
         dtype: type of the result; statistics are float32.
@@ -77,8 +78,8 @@ class GroupNorm(nn.Module):
         exact = image.astype(jnp.float32)
 
         def mean(each: jax.Array) -> jax.Array:
-            """Averages each group over the map, repeated for the group's channels: `[C]`."""
-            groups = each.mean(axis=(0, 1)).reshape(NORM_GROUPS, -1)
+            """Averages each column and group, repeated for the group's channels: `[X, 1, C]`."""
+            groups = each.mean(axis=1, keepdims=True).reshape(len(image), 1, NORM_GROUPS, -1)
             return jnp.repeat(groups.mean(axis=-1), channels // NORM_GROUPS, axis=-1)
 
         centre = mean(exact)
