@@ -255,8 +255,9 @@ def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     (chosen,) = command_line.parse("gymnasium", ["--demonstrations", name])
     assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # as the data say
     options = [*SMALL, "--horizon", "3", "--context", "1", "--steps", "40"]
-    judged = lambda settings, data, means: f"{len(data)} of {means['step']}"  # noqa: E731
-    monkeypatch.setattr(train, "judge_values", judged)
+    monkeypatch.setattr(
+        train, "judge_values", lambda _, data, means: f"{len(data)} of {means['step']}"
+    )
     assert program.main(["--dataset", name, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
     assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1

@@ -13,14 +13,13 @@ import leapjax as leap
 from leapjax import fitting
 from leapjax.agents import value_range
 from leapjax.domain import blank_context
-from leapjax.models.config import ModelConfig
 from leapjax.types import Demonstration
+from tests.episodes import SMALL, record_episode
 from tests.parameters import make_begin
 from tests.programs import only_long
 from tests.quick import quick_jit
 
 STATES, SLIP, DISCOUNT = 24, 0.2, 0.99
-SMALL = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
 
 
 class Corridor(gym.Env):
@@ -51,14 +50,7 @@ def registered():
 def walk(env, seed, rng):
     """An episode that steps forward with a probability of 40 to 90%."""
     share = rng.uniform(0.4, 0.9)
-    observations, actions, rewards, over = [env.reset(seed=seed)[0]], [], [], [False, False]
-    while not any(over):
-        actions.append(int(rng.random() < share))
-        after, reward, *over, _ = env.step(actions[-1])
-        observations.append(after)
-        rewards.append(reward)
-    seen, taken, given = np.array(observations), np.int32(actions), np.float32(rewards)
-    return Demonstration(seen, taken, given, *over, seed)
+    return record_episode(env, lambda seen: int(rng.random() < share), seed)
 
 
 def iterate_values(read_value):

@@ -11,7 +11,6 @@ from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig, PlannerConfig
 
 UNTRAINED = ("random", "rules")  # methods without training
-CONDITIONED = ("leap", "dt")  # methods that can be conditioned on returns
 SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several actions, others choose one
 
 
