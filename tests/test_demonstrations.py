@@ -11,7 +11,8 @@ from leapjax.data import seeds
 from leapjax.domain import Collection
 from leapjax.domains.babyai import demonstrations, levels, observations
 from leapjax.domains.babyai.adapter import BabyAIAdapter
-from leapjax.domains.babyai.demonstrations import FAILED, OTHER_GOAL, FullViewBot
+from leapjax.domains.babyai.bot import FullViewBot
+from leapjax.domains.babyai.demonstrations import FAILED, OTHER_GOAL
 from leapjax.errors import UserError
 from tests.dynamics import FRONT
 from tests.oracles import assert_same_observation, slow_path_lengths
@@ -115,9 +116,35 @@ def test_a_search_leaves_the_doors_as_they_were_also_if_it_fails():
     assert doors(env) and not any(is_open for is_open, _ in doors(env))
 
 
-def test_locked_doors_are_left_to_the_exploring_bot():
-    assert type(demonstrations.make_bot(reset("BabyAI-UnlockLocal-v0", 0))) is BabyAIBot
-    assert type(demonstrations.make_bot(reset("GoToObjMazeS4R2Close", 0))) is FullViewBot
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [("BabyAI-KeyCorridor-v0", 0.6), ("BabyAI-UnlockPickup-v0", 1.0),
+     ("BabyAI-PutNextS5N1-v0", 1.0)],
+)  # fmt: skip
+def test_a_bot_that_sees_the_grid_takes_shorter_ways_through_locked_doors(name, most):
+    """MiniGrid's bot explores until it finds the key; without locked doors both may agree."""
+    seen, explored = [], []
+    for seed in range(8):
+        for kind, lengths in ((FullViewBot, seen), (BabyAIBot, explored)):
+            env, action, over = reset(name, seed), None, False
+            bot = kind(env)
+            while not over:
+                action = int(bot.replan(action))
+                _, reward, terminated, truncated, _ = env.step(action)
+                over = terminated or truncated
+            assert terminated and reward > 0
+            lengths.append(env.step_count)
+    assert sum(seen) <= most * sum(explored)
+
+
+@pytest.mark.parametrize("name", ["BabyAI-UnlockToUnlock-v0", "BabyAI-BlockedUnlockPickup-v0",
+                                  "BabyAI-PutNextS5N2Carrying-v0"])  # fmt: skip
+def test_keys_behind_locked_doors_and_objects_in_hand_are_no_obstacle(name):
+    level = levels.find_level(name)
+    found = demonstrations.collect(level, 8, seed=0)
+    assert found.dropped[FAILED] <= 2
+    doors_opened = [(d.actions == TOGGLE).sum() for d in found.demonstrations]
+    assert min(doors_opened) >= {"BabyAI-UnlockToUnlock-v0": 2}.get(name, 0)
 
 
 def test_demonstrations_depend_on_the_training_seed_alone():
@@ -145,7 +172,7 @@ class Stubborn:
 
 
 def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
-    monkeypatch.setattr(demonstrations, "make_bot", lambda env: Stubborn(None))
+    monkeypatch.setattr(demonstrations, "FullViewBot", lambda env: Stubborn(None))
     with pytest.raises(UserError, match="the bot cannot solve this level") as raised:
         demonstrations.collect(levels.find_level("GoToLocalS7N5"), 1, seed=0)
     assert "\n" not in str(raised.value)
@@ -154,7 +181,7 @@ def test_a_level_that_the_bot_cannot_solve_is_given_up(monkeypatch):
 @pytest.mark.parametrize("action", [END, DROP])  # dropping nothing never does anything
 def test_a_bot_that_gives_up_or_runs_out_of_time_has_failed(monkeypatch, action):
     adapter, dropped = BabyAIAdapter(levels.find_level("GoToLocalS7N5")), Counter()
-    monkeypatch.setattr(demonstrations, "make_bot", lambda env: Stubborn(action))
+    monkeypatch.setattr(demonstrations, "FullViewBot", lambda env: Stubborn(action))
     assert demonstrations.demonstrate(adapter, 0, dropped) is None
     assert dropped == {FAILED: 1}
     assert adapter.env.step_count == (0 if action == END else adapter.env.max_steps)

@@ -6,7 +6,7 @@ from PIL import Image
 from experiments import failures
 from experiments.failures import Cause
 from leapjax.domains.babyai.adapter import END
-from leapjax.domains.babyai.demonstrations import make_bot
+from leapjax.domains.babyai.bot import FullViewBot
 from leapjax.domains.babyai.levels import find_level
 from tests.programs import only_long, untrained_run
 
@@ -51,7 +51,7 @@ def test_a_detour_is_what_the_way_is_longer_than_straight():
 
 def test_a_recorder_knows_the_way_that_was_walked():
     found = recorder("GoToObjMazeS4", seed=3)
-    bot, action = make_bot(found.env), None
+    bot, action = FullViewBot(found.env), None
     while found.last is None or not found.last.terminated:
         action = int(bot.replan(action))
         assert action != END

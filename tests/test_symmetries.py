@@ -65,7 +65,7 @@ def states(name: str) -> list[Observation]:
     found = []
     for seed in range(14):
         found.append(adapter.reset(seed))
-        bot = demonstrations.make_bot(adapter.env) if seed >= 10 else None
+        bot = demonstrations.FullViewBot(adapter.env) if seed >= 10 else None
         for _ in range(60):
             transition = adapter.step(int(bot.replan()) if bot else wander(adapter, rng))
             if transition.terminated:
@@ -224,7 +224,7 @@ def test_both_ways_to_tell_a_sequence_mean_the_same():
         other.env.instrs = swapped(other.env.instrs.instr_b, other.env.instrs.instr_a)
         other.env.instrs.reset_verifier(other.env)
         assert vocabulary.decode(restated) == other.env.instrs.surface(other.env)
-        bot, transition = demonstrations.make_bot(one.env), None
+        bot, transition = demonstrations.FullViewBot(one.env), None
         while transition is None or not (transition.terminated or transition.truncated):
             action = int(bot.replan())
             transition, same = one.step(action), other.step(action)

@@ -317,15 +317,15 @@ def test_what_is_recorded_is_what_was_done(name):
 
 def test_a_quarter_of_the_actions_are_mistakes(monkeypatch):
     """A random action is the one that the demonstrator wanted once in six times."""
-    make_bot, wanted = demonstrations.make_bot, []
+    bots, wanted = demonstrations.FullViewBot, []
 
     def watched(env):
-        bot = make_bot(env)
+        bot = bots(env)
         replan = bot.replan
         bot.replan = lambda action: wanted.append(int(replan(action))) or wanted[-1]
         return bot
 
-    monkeypatch.setattr(demonstrations, "make_bot", watched)
+    monkeypatch.setattr(demonstrations, "FullViewBot", watched)
     adapter, wrong = BabyAIAdapter(find_level("GoToObjMazeS4Mistakes")), []
     for seed in range(80):
         wanted.clear()
