@@ -9,7 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from leapjax.domains.babyai.encoders import cells, convolutions, distances, instructions
+from leapjax.domains.babyai.encoders import cells, convolutions, distances, instructions, memory
+from leapjax.domains.babyai.encoders.context_tokens import ContextTokens
+from leapjax.domains.babyai.observations import Observation
+from leapjax.domains.babyai.settings import Settings
+from leapjax.types import Context, pad_token
+from tests.parameters import random_like
 from tests.quick import quick_jit
 
 SIDE = 6
@@ -119,11 +124,15 @@ def test_the_state_after_the_last_word_ignores_padding():
 
 
 def test_cells_attend_to_the_words_that_are_given():
-    encoder, attention = instructions.InstructionEncoder(10, 8), instructions.WordAttention(2, 4)
+    encoder, attention = instructions.InstructionEncoder(10, 8), instructions.CrossAttention(2, 4)
     grid = jax.random.normal(jax.random.key(0), (3, 4, 5))
     encoded = jax.jit(encoder.init_with_output)(jax.random.key(1), jnp.array([3, 1, 4]))[0]
-    params = jax.jit(attention.init)(jax.random.key(2), grid, encoded)
-    attend = functools.partial(jax.jit(attention.apply), params)
+    params = jax.jit(attention.init)(jax.random.key(2), grid, encoded.words, encoded.given)
+    apply = jax.jit(attention.apply)
+
+    def attend(grid, said):
+        return apply(params, grid, said.words, said.given)
+
     said = attend(grid, encoded)
     assert said.shape == grid.shape
     padded = jax.tree.map(lambda x: jnp.concatenate([x, 100 * x]), encoded)
@@ -162,3 +171,59 @@ def test_groups_are_normalised_as_by_flax(shape):
 
     ours, usual = loss(convolutions.GroupNorm()), loss(nn.GroupNorm(convolutions.NORM_GROUPS))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, usual)
+
+
+@pytest.mark.parametrize("recall", [False, True])
+def test_padding_of_grid_and_instruction_changes_no_token(recall):
+    """In every direction of the agent, on a grid that may be smaller than square."""
+    settings = Settings(fields=4, sweeps=12, word_heads=2, memory=recall, channels=8)
+    encoder, rng = ContextTokens(settings, 16), np.random.default_rng(0)
+    past, (width, height) = 3, (SIDE, SIDE - 1)
+    grids = np.zeros((past + 1, SIDE, SIDE, 3), np.uint8)
+    grids[:, :width, :height] = rng.integers([1, 0, 0], [8, 6, 4], (past + 1, width, height, 3))
+    poses = rng.integers(0, [width, height, 4], (past + 1, 3)).astype(np.int32)
+    states = Observation(
+        grids, poses, np.tile(np.int32([5, 2]), (past + 1, 1)),
+        np.tile(np.int32([1, 3]), (past + 1, 1)), np.tile(np.int32([4, 7, 2]), (past + 1, 1)),
+    )  # fmt: skip
+    actions = np.int32([3, 4, 5])
+
+    def pad(extra):
+        grid = np.pad(states.grid, ((0, 0), (0, extra), (0, extra), (0, 0)))
+        words = np.pad(states.instruction, ((0, 0), (0, extra)))
+        return states._replace(grid=grid, instruction=words)
+
+    def context(states, direction):
+        states = states._replace(pose=np.append(states.pose[:, :2], states.pose[:, 2:] * 0, 1))
+        states.pose[-1, 2], states.pose[0, 2] = direction, 1
+        now, before = (jax.tree.map(lambda x, w=w: x[w], states) for w in (-1, slice(past)))
+        return Context(now, before, actions, np.zeros(past, np.float32), np.int32(past),
+                       np.float32(0))  # fmt: skip
+
+    shapes = jax.eval_shape(encoder.init, jax.random.key(0), context(states, 0))
+    params, apply = random_like(shapes, 0.1), quick_jit(encoder.apply)
+    for direction in range(4):
+        tokens = apply(params, context(states, direction))
+        for extra in (1, 5):
+            padded = apply(params, context(pad(extra), direction))
+            np.testing.assert_allclose(padded, tokens, rtol=1e-4, atol=1e-4)
+
+
+def test_the_agent_recalls_deeds_and_the_sides_of_its_first_pose():
+    """It stood at (2, 3) facing down, picked up, went on, and now faces up at (2, 4)."""
+    context = Context(
+        Observation(np.zeros((6, 6, 3)), np.int32([2, 4, 3]), np.int32([5, 1]), None, None),
+        Observation(None, np.int32([[0, 0, 0], [2, 3, 1], [2, 3, 1]]), None, None, None),
+        np.int32([pad_token(7), 3, 2]), np.zeros(3), np.int32(2), np.float32(0),
+    )  # fmt: skip
+    seen = np.asarray(memory.recall(context, 6))
+    # Now the grid is turned by three quarters: (x, y) is at (5 - y, x).
+    deeds = np.zeros((6, 6, 3))
+    deeds[1, 2, 0] = 2 / 4
+    np.testing.assert_array_equal(seen[..., :3], deeds)
+    unturned = np.array([[seen[5 - y, x, 3:5] for y in range(6)] for x in range(6)])
+    for x, y in np.ndindex(6, 6):
+        np.testing.assert_array_equal(unturned[x, y], np.sign([y - 3, 2 - x]))
+    held = seen[1, 2, 5:]
+    assert held.sum() == 2 and held[5] == held[11 + 1] == 1
+    assert np.abs(seen[..., 5:]).sum() == 2

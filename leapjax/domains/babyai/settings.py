@@ -20,6 +20,9 @@ class Settings:
         fields: Learned distance fields; 0 for convolutions alone.
         sweeps: Rounds of value iteration that compute the distance fields.
         word_heads: Attention heads from cells to the words of the instruction; 0 for no attention.
+        memory: Mark where the agent picked up, dropped and toggled, and which cells its first pose
+            saw ahead and on its right; words then find out which of their tasks are done. For long
+            instructions; needs `word_heads`.
         radius: Cells around the agent, in each direction, that are read one by one.
     """
 
@@ -31,6 +34,7 @@ class Settings:
     fields: int = 8
     sweeps: int = 16
     word_heads: int = 0
+    memory: bool = False
     radius: int = 3
 
     def __post_init__(self) -> None:
@@ -41,3 +45,5 @@ class Settings:
         check_at_least(self, 0, "fields", "word_heads", most=1000)
         check_at_least(self, 0, "radius", most=100)  # no level is larger
         check_within(self, 0, 1, "clutter")
+        if self.memory and not self.word_heads:
+            raise ValueError("memory needs word_heads: cells learn from words what is done")

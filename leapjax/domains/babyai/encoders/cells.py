@@ -10,6 +10,7 @@ from leapjax.domains.babyai.observations import Observation
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
 OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
+OUTSIDE = 0  # object index of padding, which no cell of a level has
 
 
 class CellEmbedding(nn.Module):

@@ -42,31 +42,35 @@ class GridEncoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, cells: jax.Array, agent: jax.Array, goal: jax.Array
+        self, cells: jax.Array, inside: jax.Array, agent: jax.Array, goal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Computes features `[S, S, channels]` and the agent's distances `[fields]`.
 
+        Features of padding are zeros, as beyond the border, so the result does not depend on S.
+
         Args:
             cells: features `[S, S, C]` of each cell's content.
+            inside: `[S, S, 1]`, 1 for cells of the level, 0 for padding.
             agent: the agent's cell `[2]`.
             goal: the goal's cell `[2]`; (-1, -1) if it is not observed.
         """
+        cells = cells * inside
         distance = jnp.zeros((*cells.shape[:2], 0))
         if self.fields:
-            distance = self._compute_fields(cells, goal)
+            distance = self._compute_fields(cells, inside, goal)
         # A convolution needs only differences: distances relative to the agent's, squashed.
         here = read_cell(distance, agent)
-        relative = jnp.tanh((distance - here) / 4)
+        relative = jnp.tanh((distance - here) / 4) * inside
         both = jnp.concatenate([cells, relative], axis=-1)
         source = _make_convolution(self.channels, "source", self.dtype)(both)
         step = _make_convolution(self.channels, "step", self.dtype)
-        h = nn.relu(source)
+        h = nn.relu(source) * inside
         for _ in range(self.rounds):
-            h = nn.relu(step(h) + source)
+            h = nn.relu(step(h) + source) * inside
         return h, jnp.tanh(here / 16)
 
-    def _compute_fields(self, cells: jax.Array, goal: jax.Array) -> jax.Array:
-        """Computes the distance fields `[S, S, fields]`."""
+    def _compute_fields(self, cells: jax.Array, inside: jax.Array, goal: jax.Array) -> jax.Array:
+        """Computes the distance fields `[S, S, fields]`; padding is as far as the border."""
         local = nn.relu(_make_convolution(self.channels, "local", self.dtype)(cells))
         free = nn.initializers.constant(-3.0)
         cost = compute_entering_cost(nn.Dense(self.fields, bias_init=free, name="blocked")(local))
@@ -78,6 +82,7 @@ class GridEncoder(nn.Module):
         start = jnp.concatenate(
             [jnp.broadcast_to(from_goal, (*cells.shape[:2], self.fields // 2)), learned], axis=-1
         )
+        start, cost = (jnp.where(inside, each, FAR) for each in (start, cost))
         return jnp.minimum(find_distances(start, cost, self.sweeps), FAR)
 
 

@@ -50,8 +50,8 @@ class InstructionEncoder(nn.Module):
         return Instruction(words + states, given, whole)
 
 
-class WordAttention(nn.Module):
-    """Attention from cells to the words of an instruction.
+class CrossAttention(nn.Module):
+    """Attention from some things to others, such as from cells to the words of an instruction.
 
     A single vector of 'go to the red ball and the key, then ...' would have to say of every object
     whether and when to go there. With attention, the cell of an object finds the words that name
@@ -66,15 +66,51 @@ class WordAttention(nn.Module):
     features: int = 16
 
     @nn.compact
-    def __call__(self, cells: jax.Array, instruction: Instruction) -> jax.Array:
-        """Computes an update `[S, S, C]` of cells `[S, S, C]` from the words."""
+    def __call__(self, readers: jax.Array, read: jax.Array, given: jax.Array) -> jax.Array:
+        """Computes an update `[..., C]` of readers `[..., C]`.
+
+        Args:
+            readers: features of the things that attend.
+            read: features `[L, W]` of the things that they attend to.
+            given: booleans `[L]`, False for padding.
+        """
 
         def heads(x: jax.Array, name: str) -> jax.Array:
             return nn.DenseGeneral((self.heads, self.features), name=name)(x)
 
-        words = instruction.words
-        queries, keys, values = heads(cells, "query"), heads(words, "key"), heads(words, "value")
-        scores = jnp.einsum("xyhd,lhd->xyhl", queries, keys) / self.features**0.5
-        weights = jax.nn.softmax(jnp.where(instruction.given, scores, -1e30), axis=-1)
-        attended = jnp.einsum("xyhl,lhd->xyhd", weights, values)
-        return nn.DenseGeneral(cells.shape[-1], axis=(-2, -1), name="output")(attended)
+        queries, keys, values = heads(readers, "query"), heads(read, "key"), heads(read, "value")
+        scores = jnp.einsum("...hd,lhd->...hl", queries, keys) / self.features**0.5
+        weights = jax.nn.softmax(jnp.where(given, scores, -1e30), axis=-1)
+        attended = jnp.einsum("...hl,lhd->...hd", weights, values)
+        return nn.DenseGeneral(readers.shape[-1], axis=(-2, -1), name="output")(attended)
+
+
+class InstructionReview(nn.Module):
+    """Tells words which of their tasks are done: they look at the grid, then at each other.
+
+    Attributes:
+        heads: number of heads.
+    """
+
+    heads: int
+
+    @nn.compact
+    def __call__(
+        self, instruction: Instruction, cells: jax.Array, inside: jax.Array
+    ) -> Instruction:
+        """Computes new features of the words, and adds their largest to the whole.
+
+        Args:
+            instruction: encoded instruction.
+            cells: features `[S, S, C]`, which show where the agent was and what it did there.
+            inside: `[S, S, 1]`, 1 for cells of the level, 0 for padding.
+        """
+        words, features = instruction.words, cells.shape[-1]
+        cells, inside = cells.reshape(-1, features), inside.reshape(-1) > 0
+        words += CrossAttention(self.heads, name="grid")(words, cells, inside)
+        words += CrossAttention(self.heads, name="others")(words, words, instruction.given)
+        hidden = nn.relu(nn.Dense(words.shape[-1], name="hidden")(words))
+        words += nn.Dense(words.shape[-1], name="update")(hidden)
+        largest = jnp.where(instruction.given[:, None], nn.relu(words), 0).max(axis=0)
+        whole = instruction.whole + nn.Dense(words.shape[-1], name="whole")(largest)
+        return Instruction(words, instruction.given, whole)

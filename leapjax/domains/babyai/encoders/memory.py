@@ -1,0 +1,105 @@
+"""Marks cells by what the agent did in its context, which shows what part of a task is done.
+
+The marks leave out most of the agent's path and its past turns and moves, because a network could
+recognise a demonstration by them. All grids are turned so that the agent faces right.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from leapjax.domains.babyai import symmetries
+from leapjax.domains.babyai.adapter import ACTIONS, NUM_ACTIONS
+from leapjax.domains.babyai.encoders.cells import COLOURS, OBJECTS, mark_cell
+from leapjax.types import Context, pad_token
+
+DEEDS = tuple(ACTIONS.index(name) for name in ("pickup", "drop", "toggle"))
+
+
+def mark_faced(context: Context, turned: jax.Array) -> jax.Array:
+    """Marks the objects and doors that the agent has faced in the context: `[S, S, 2]`.
+
+    The first feature is 1 on these cells. The second says how recently the agent faced them, in
+    (0, 1], where 1 is now.
+
+    Args:
+        context: context with K past steps.
+        turned: current grid `[S, S, 3]`, turned so that the agent faces right.
+    """
+    poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
+    recency = jnp.append(_measure_recency(context), 1.0)
+    kinds = turned[..., 0]
+    named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
+    fronts = _mark_fronts(poses, context.observation.pose[2], turned.shape[0])
+    latest = (fronts * recency[:, None, None]).max(axis=0) * named
+    return jnp.stack([latest > 0, latest], axis=-1)
+
+
+def recall(context: Context, side: int) -> jax.Array:
+    """Joins what cells show of the past: deeds, sides, and the carried object on the agent's cell.
+
+    Args:
+        context: context with K past steps.
+        side: S.
+
+    Returns:
+        Features `[S, S, 22]`.
+    """
+    pose = symmetries.rotate_pose(context.observation.pose, context.observation.pose[2], side)
+    kind, colour = context.observation.carried
+    held = jnp.append(jax.nn.one_hot(kind, OBJECTS), jax.nn.one_hot(colour, COLOURS)) * (kind > 0)
+    marks = mark_cell(pose[:2], side)[..., None] * held
+    return jnp.concatenate([mark_deeds(context, side), mark_sides(context, side), marks], axis=-1)
+
+
+def mark_deeds(context: Context, side: int) -> jax.Array:
+    """Marks where the agent picked up, dropped and toggled in the context: `[S, S, 3]`.
+
+    The features say how recently it did each, in (0, 1); 0 is never.
+
+    Args:
+        context: context with K past steps.
+        side: S.
+    """
+    recency = _measure_recency(context)
+    fronts = _mark_fronts(context.past.pose, context.observation.pose[2], side)
+    done = context.actions[:, None] == jnp.array(DEEDS)  # [K, 3]
+    marks = fronts[..., None] * (recency[:, None] * done)[:, None, None]
+    return marks.max(axis=0, initial=0)
+
+
+def mark_sides(context: Context, side: int) -> jax.Array:
+    """Marks the cells ahead of the context's first pose, and on its right: `[S, S, 2]`, -1, 0, 1.
+
+    Instructions say "in front of you" or "on your left", as seen from the first state.
+
+    Args:
+        context: context with K past steps, of which the first that is known counts.
+        side: S.
+    """
+    poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
+    known = jnp.append(_measure_recency(context) > 0, True)
+    first = poses[jnp.argmax(known)]
+    x, y, direction = symmetries.rotate_pose(first, context.observation.pose[2], side)
+    ahead = jnp.asarray(symmetries.DIRECTION_VECTORS)[direction]
+    axis = jnp.arange(side)
+    across, along = (axis - x)[:, None], (axis - y)[None, :]
+    front = across * ahead[0] + along * ahead[1]
+    right = along * ahead[0] - across * ahead[1]
+    return jnp.sign(jnp.stack([front, right], axis=-1)).astype(jnp.float32)
+
+
+def _measure_recency(context: Context) -> jax.Array:
+    """Returns how recent each past step is: `[K]` in (0, 1); 0 before the episode began."""
+    past = context.actions.shape[0]
+    known = context.actions != pad_token(NUM_ACTIONS)
+    return known * jnp.arange(1, past + 1) / (past + 1)
+
+
+def _mark_fronts(poses: jax.Array, quarters: jax.Array, side: int) -> jax.Array:
+    """Marks the cell in front of each pose `[K, 3]` in a grid turned by quarters: `[K, S, S]`."""
+
+    def mark(pose: jax.Array) -> jax.Array:
+        pose = symmetries.rotate_pose(pose, quarters, side)
+        return mark_cell(pose[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[pose[2]], side)
+
+    return jax.vmap(mark)(poses)
