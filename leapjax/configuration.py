@@ -14,7 +14,7 @@ from leapjax import files, pretrained, serialization
 from leapjax.agents.base import TrainingConfig
 from leapjax.data import seeds
 from leapjax.data.seeds import UNSEEN
-from leapjax.domain import Domain, drop_files
+from leapjax.domain import Domain, drop_files, find_signature
 from leapjax.domains import find_domain, make_level
 from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
@@ -172,7 +172,7 @@ def specify(config: AnyConfig, seed: int, domain: Domain) -> Specification:
     groups["domain_settings"] = drop_files(config.domain_settings)
     return Specification(
         config.domain, config.level, config.method, config.context, **groups,
-        signature=dict(domain.signature),
+        signature=find_signature(domain, config.model.architecture),
         origin=Origin(config.preset, seed, config.demos, config.demonstrations),
     )  # fmt: skip
 

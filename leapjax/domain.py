@@ -206,6 +206,7 @@ class Domain(NamedTuple):
         turn: (key, context, horizon=T) -> the context after a random symmetry of the task, for the
             restarts of LEAP (see `leapjax.energy.symmetric`); `None` without symmetries.
         signature: JSON values that a checkpoint and the level must agree on.
+        sizes: by architecture, further such values (see `find_signature`).
         held_out: levels of a file, which `make_adapter` then plays; `None` if it draws levels.
         made_from: (name in `leapjax.domains`, settings), from which `make_domain` made the level;
             `None` for an unregistered domain, whose planners cannot be saved.
@@ -223,6 +224,7 @@ class Domain(NamedTuple):
     rules: Energy | None = None
     turn: Turn | None = None
     signature: Mapping[str, Any] = {}
+    sizes: Mapping[str, Mapping[str, Any]] = {}
     held_out: HeldOut | None = None
     made_from: tuple[str, Any] | None = None
 
@@ -270,6 +272,11 @@ def apply_statistics(domain: Domain, statistics: Statistics) -> Domain:
     if domain.scaling.encoders is None or not statistics:
         return domain
     return domain._replace(encoders=domain.scaling.encoders(statistics))
+
+
+def find_signature(domain: Domain, architecture: str) -> dict[str, Any]:
+    """Returns the JSON values that a checkpoint of an architecture and a level must agree on."""
+    return {**domain.signature, **domain.sizes.get(architecture, {})}
 
 
 def blank_context(domain: Domain, length: int) -> Context:

@@ -15,7 +15,7 @@ from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows
-from leapjax.domain import Domain, apply_statistics, measure_statistics
+from leapjax.domain import Domain, apply_statistics, find_signature, measure_statistics
 from leapjax.domains import make_level
 from leapjax.errors import UserError
 from leapjax.methods import find_method, learns_from_rewards
@@ -128,7 +128,7 @@ def fit(
     context = asked.get("context", config.context)
     specification = Specification(
         name or "", domain.level, method, context, model, training, planner,
-        settings, domain_settings, dict(domain.signature),
+        settings, domain_settings, find_signature(domain, model.architecture),
         Origin(PRESET, seed, len(data), name_of_data), statistics,
     )  # fmt: skip
     compilation.use_disk_cache()

@@ -19,7 +19,7 @@ from leapjax.agents.base import UNNAMED, Setup, TrainingConfig
 from leapjax.agents.returns import aims_for_return
 from leapjax.batching import CompiledPlanner, compile_planner, plan_keys
 from leapjax.checks import check_at_least, check_seed, check_types
-from leapjax.domain import Domain, Statistics, apply_statistics, blank_context
+from leapjax.domain import Domain, Statistics, apply_statistics, blank_context, find_signature
 from leapjax.domains import check_imported, find_domain
 from leapjax.environments import Adapter
 from leapjax.errors import UserError, first_line
@@ -457,15 +457,17 @@ def load(
     # This comes first, because it imports the module of the level that the caller names.
     other = None if level is None else make_domain(specification, level)
     domain = make_domain(specification)
-    for name, value in domain.signature.items():
+    signature = find_signature(domain, specification.model.architecture)
+    for name, value in signature.items():
         if specification.signature.get(name) != value:
             raise UserError(f"{folder}: trained with another {name}; train it again")
     if other is not None:
-        for name, value in other.signature.items():
-            if domain.signature.get(name) != value:
+        needed = find_signature(other, specification.model.architecture)
+        for name, value in needed.items():
+            if signature.get(name) != value:
                 raise UserError(
                     f"{folder} was trained on {domain.level}, whose {name} is "
-                    f"{domain.signature.get(name)}: it cannot play {level}, where it is {value}"
+                    f"{signature.get(name)}: it cannot play {level}, where it is {value}"
                 )
         # A network that embeds step numbers has embeddings up to the limit of its training level.
         domain = other._replace(max_steps=domain.max_steps)

@@ -66,7 +66,8 @@ def make(name: str, options: Settings) -> Domain:
         augmentations=Augmentations(
             augmentation.choose_augmentations(options), augmentation.mark_needed_cells
         ),
-        signature={"side": side, "words": level.words, "vocabulary": list(vocabulary.WORDS)},
+        signature={"vocabulary": list(vocabulary.WORDS)},
+        sizes={"paper": {"side": side, "words": level.words}},
     )
 
 
