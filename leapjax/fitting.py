@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from leapjax import compilation, pretrained, sharding
 from leapjax.agents.base import TrainingConfig
-from leapjax.agents.returns import choose_target
+from leapjax.agents.measured import measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
@@ -121,7 +121,7 @@ def fit(
         raise UserError("no demonstrations: expected at least one to learn from")
     if learns_from_rewards(method, settings) and not any(d.rewards.any() for d in data):
         raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
-    settings = choose_target(settings, data)
+    settings = measure_settings(settings, data)
     name_of_data = demonstrations if isinstance(demonstrations, str) else None
     statistics = measure_statistics(domain, data) if data else ()
     domain = apply_statistics(domain, statistics)

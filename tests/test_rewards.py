@@ -1,5 +1,6 @@
 """Methods that learn from rewards find what is best in data of which most is not."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 from leapjax import batching
 from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, returns
 from leapjax.agents.base import Setup, TrainingConfig
+from leapjax.agents.measured import measure_settings
 from leapjax.domain import Scaling
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
@@ -159,15 +161,45 @@ def test_a_missing_target_is_a_high_return_of_the_data():
     good = mixed.walk(rng, 1, 1.0)._replace(rewards=np.array([5.0], np.float32))
     data = [good._replace(rewards=np.float32([i])) for i in range(1000)]
     missing, unconditioned = dt.Settings(None), leap.Settings(target_return=None)
-    assert returns.choose_target(missing, [good]) == dt.Settings(5.0)
-    assert returns.choose_target(missing, data) == dt.Settings(990.0)
+    assert measure_settings(missing, [good]) == dt.Settings(5.0)
+    assert measure_settings(missing, data) == dt.Settings(990.0)
     for settings in (given, unconditioned, bc.Settings()):
-        assert returns.choose_target(settings, data) == settings
-    assert returns.choose_target(missing, []) == missing
+        assert measure_settings(settings, data) == settings
+    assert measure_settings(missing, []) == missing
     agent = dt.make_agent(Setup(mixed.DOMAIN, 0, 1, ModelConfig(), TrainingConfig(), missing))
     context = jax.tree.map(lambda leaf: leaf[0], mixed.contexts(0))
     with pytest.raises(UserError, match="no target return, and no demonstrations"):
         agent.energy.encode(random_parameters(agent), context)
+
+
+def test_a_missing_scale_is_the_largest_discounted_return_from_any_step():
+    """Also of negative returns; rewards of one goal are left as they are."""
+    step = mixed.walk(np.random.default_rng(0), 1, 1.0)
+    costs, goal, none = (
+        step._replace(rewards=np.array(rewards, np.float32))
+        for rewards in ([1.0, -4.0, -2.0], [0.0, 0.0, 1.0], [0.0])
+    )
+    missing = iql.Settings(discount=0.5, reward_scale=None)
+    for data, scale in (([costs, goal], 5.0), ([goal], 1.0), ([none], 1.0)):
+        assert measure_settings(missing, data) == dataclasses.replace(missing, reward_scale=scale)
+    assert measure_settings(iql.Settings(), [costs]) == iql.Settings()
+    with pytest.raises(ValueError, match="reward_scale must be positive, got 0"):
+        iql.Settings(reward_scale=0.0)
+
+
+@pytest.mark.parametrize("module", [bcq, cql, iql, mopo, qr_dqn, rem])
+def test_a_scale_of_rewards_is_as_smaller_rewards(module):
+    """Rewards of 7 with a scale of 7 are learned from as rewards of 1."""
+    model, steps, found = ModelConfig(layers=1), mixed.steps(), []
+    for times in (1.0, 7.0):
+        settings = dataclasses.replace(module.Settings(), reward_scale=times)
+        agent = module.make_agent(
+            Setup(mixed.DOMAIN, 1, 1, model, TrainingConfig(batch=8), settings)
+        )
+        batch = agent.batch(jax.random.key(0), steps._replace(rewards=steps.rewards * times))
+        found.append(np.asarray(batch.context.rewards))
+    assert found[0].any()
+    np.testing.assert_allclose(*found, rtol=1e-6)
 
 
 def test_the_return_that_is_wanted_is_less_by_what_was_given():

@@ -60,7 +60,10 @@ def run_batches(setup: Setup) -> Callable[[jax.Array, Steps], Window]:
 
 
 def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionWindow]:
-    """Makes an agent's `batch`: (key, steps) -> augmented transitions `[B, ...]`."""
+    """Makes an agent's `batch`: (key, steps) -> augmented transitions `[B, ...]`.
+
+    It divides rewards by the `reward_scale` of the method's settings.
+    """
 
     def window(steps: Steps, index: jax.Array) -> Window:
         end = setup.domain.num_actions - 1
@@ -70,7 +73,9 @@ def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionW
 
     def batch(key: jax.Array, steps: Steps) -> TransitionWindow:
         drawn, indices = _draw(setup, window, key, steps)
-        return TransitionWindow(drawn.context, steps.terminated[indices])
+        rewards = drawn.context.rewards / setup.settings.reward_scale
+        context = drawn.context._replace(rewards=rewards)
+        return TransitionWindow(context, steps.terminated[indices])
 
     return batch
 

@@ -19,6 +19,7 @@ from leapjax.agents.base import Method, Setup
 from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.rewards import check_reward_scale
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import LARGEST, check_types, check_within
 from leapjax.data import windows
@@ -39,6 +40,8 @@ class Settings:
             actions.
         largest_weight: Upper bound of those weights.
         discount: Discount of rewards per step.
+        reward_scale: Divisor of rewards; `None` takes the largest discounted return of the data, in
+            absolute value, so that values lie in -1 .. 1.
         target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
     """
 
@@ -46,10 +49,12 @@ class Settings:
     inverse_temperature: float = 3.0
     largest_weight: float = 100.0
     discount: float = 0.99
+    reward_scale: float | None = 1.0
     target_rate: float = 0.005
 
     def __post_init__(self) -> None:
         check_types(self)
+        check_reward_scale(self.reward_scale)
         check_within(self, 0, 1, "expectile", "discount", "target_rate")
         check_within(self, 0, LARGEST, "inverse_temperature", "largest_weight")
 

@@ -14,6 +14,7 @@ from leapjax.agents.base import Setup
 from leapjax.agents.batch_loss import EncodeExamples, average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.rewards import check_reward_scale
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
 from leapjax.checks import check_types, check_within
 from leapjax.data import windows
@@ -30,14 +31,18 @@ class Settings:
 
     Attributes:
         discount: Discount of rewards per step.
+        reward_scale: Divisor of rewards; `None` takes the largest discounted return of the data, in
+            absolute value, so that values lie in -1 .. 1.
         target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
     """
 
     discount: float = 0.99
+    reward_scale: float | None = 1.0
     target_rate: float = 0.005
 
     def __post_init__(self) -> None:
         check_types(self)
+        check_reward_scale(self.reward_scale)
         check_within(self, 0, 1, "discount", "target_rate")
 
 

@@ -1,6 +1,5 @@
 """Returns to go, on which Decision Transformer and LEAP can be conditioned (Chen et al., 2021)."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -34,22 +33,13 @@ def sum_rewards(demonstrations: Sequence[Demonstration]) -> list[float]:
     return [float(np.sum(each.rewards, dtype=np.float64)) for each in demonstrations]
 
 
-def choose_target(settings: Any, demonstrations: Sequence[Demonstration]) -> Any:
-    """Fills in a missing target return: a return of the data, at their `QUANTILE`.
-
-    A high quantile asks for a good episode, but not for the luckiest one.
+def choose_target(demonstrations: Sequence[Demonstration]) -> float:
+    """Returns a high return of the data, at their `QUANTILE`: a good episode's, not the luckiest's.
 
     Args:
-        settings: settings of a method.
-        demonstrations: training data; if there are none, the target stays missing.
-
-    Returns:
-        Settings with a target return; other settings as they are.
+        demonstrations: training data, at least one.
     """
-    if not lacks_target(settings) or not demonstrations:
-        return settings
-    target = float(np.quantile(sum_rewards(demonstrations), QUANTILE, method="higher"))
-    return dataclasses.replace(settings, target_return=target)
+    return float(np.quantile(sum_rewards(demonstrations), QUANTILE, method="higher"))
 
 
 def condition_on_target(setup: Setup) -> ComputeReturns:

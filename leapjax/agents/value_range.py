@@ -23,7 +23,8 @@ def judge_values(
     """
     if not hasattr(settings, "discount") or "value" not in means or not demonstrations:
         return None
-    low, high = find_value_range(settings.discount, demonstrations)
+    limits = find_value_range(settings.discount, demonstrations)
+    low, high = (limit / settings.reward_scale for limit in limits)
     slack = TOLERANCE * (high - low)
     if low - slack <= means["value"] <= high + slack:
         return None

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from leapjax import files, processes
-from leapjax.agents.returns import lacks_target, sum_rewards
+from leapjax.agents.measured import needs_data
+from leapjax.agents.returns import sum_rewards
 from leapjax.data import seeds, storage
 from leapjax.data.storage import describe_dropped
 from leapjax.domain import Domain, Source
@@ -40,7 +41,7 @@ def load_demonstrations(run: Run) -> list[Demonstration]:
     begun = time.perf_counter()
     if config.demonstrations is None and processes.run_on_first(lambda: not source.exists(name)):
         # Otherwise the programs depend on the data.
-        if run.domain.scaling.measure is None and not lacks_target(config.method_settings):
+        if run.domain.scaling.measure is None and not needs_data(config.method_settings):
             run.programs.begin(run)
         processes.run_on_first(lambda: _make(run, source, name))
     # Each process reads its own copy: the data need not be on a shared disk.

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from leapjax import files, pretrained, processes, sharding, training
-from leapjax.agents.returns import QUANTILE, choose_target
+from leapjax.agents.measured import MEASURED, measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
@@ -112,14 +112,13 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
 
 
 def learn_from_data(run: Run, data: Sequence[Demonstration]) -> Run:
-    """Returns a run with the statistics and the target return of its data, if it needs them."""
+    """Returns a run with the statistics and settings that it takes from its data."""
     statistics, given = measure_statistics(run.domain, data), run.specification.method_settings
-    settings = choose_target(given, data)
-    if settings != given:
-        run.console.print(
-            f"target return: {settings.target_return:g}, the {QUANTILE:.0%} quantile of the "
-            "demonstrations"
-        )
+    settings = measure_settings(given, data)
+    for name in MEASURED:
+        value = getattr(settings, name, None)
+        if value != getattr(given, name, None):
+            run.console.print(f"{name.replace('_', ' ')}: {value:g}, from the demonstrations")
     return dataclasses.replace(
         run,
         domain=apply_statistics(run.domain, statistics),

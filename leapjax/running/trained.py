@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 from leapjax import pretrained
+from leapjax.agents.measured import MEASURED
 from leapjax.batching import compile_planner
 from leapjax.data import seeds
 from leapjax.energy import compose
@@ -45,7 +46,7 @@ def load_trained(run: Run) -> Pretrained:
 
 
 def _select_training_settings(specification: Specification) -> dict[str, Any]:
-    """Returns the settings that a trained planner fixes: all except its search and its target."""
+    """Returns the settings that that a trained planner fixes: all but its search and `MEASURED`."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -55,7 +56,7 @@ def _select_training_settings(specification: Specification) -> dict[str, Any]:
         return found
 
     settings = flat(dataclasses.asdict(specification), "")
-    asked = {"method_settings.target_return", "statistics"} | {
+    asked = {"statistics", *(f"method_settings.{name}" for name in MEASURED)} | {
         name for name in settings if name.startswith(("planner.", "signature."))
     }
     return {

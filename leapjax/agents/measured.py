@@ -1,0 +1,31 @@
+"""Fills in the settings of a method that the user leaves to the data."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from leapjax.agents.returns import choose_target, lacks_target
+from leapjax.agents.rewards import lacks_scale, measure_scale
+from leapjax.types import Demonstration
+
+MEASURED = ("target_return", "reward_scale")  # `None` leaves them to the data
+
+
+def needs_data(settings: Any) -> bool:
+    """Returns whether a method with these settings takes some of them from the data."""
+    return lacks_target(settings) or lacks_scale(settings)
+
+
+def measure_settings(settings: Any, demonstrations: Sequence[Demonstration]) -> Any:
+    """Returns settings of a method with a target return and a scale of rewards from the data.
+
+    Args:
+        settings: settings of a method; what they give stays.
+        demonstrations: training data; if there are none, the settings stay as they are.
+    """
+    found: dict[str, float] = {}
+    if demonstrations and lacks_target(settings):
+        found["target_return"] = choose_target(demonstrations)
+    if demonstrations and lacks_scale(settings):
+        found["reward_scale"] = measure_scale(settings.discount, demonstrations)
+    return dataclasses.replace(settings, **found)
