@@ -9,10 +9,27 @@ from collections.abc import Sequence
 
 from experiments.babyai_animation import animate
 from experiments.paper import find_success
+from leapjax.configuration import AnyConfig, change
+from leapjax.domains.babyai.levels import HELD_OUT, find_level
 from leapjax.running import main as running
 from leapjax.running.run import Experiment
 
-EXPERIMENT = Experiment("babyai", "babyai", animate=animate, paper=find_success)
+
+def play_members(config: AnyConfig) -> list[AnyConfig]:
+    """Returns a configuration for each level that a planner of many levels plays, held out or not.
+
+    A planner of one level plays no other.
+    """
+    members = find_level(config.level).members
+    if not members or config.play is not None:
+        return []
+    held_out = HELD_OUT if config.level == "BabyAI" else ()
+    return [change(config, play=name) for name in (*members, *held_out)]
+
+
+EXPERIMENT = Experiment(
+    "babyai", "babyai", searches=play_members, animate=animate, paper=find_success
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

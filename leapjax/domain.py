@@ -32,6 +32,9 @@ Turn = Callable[..., Turned]  # (key, context, horizon=T) -> turned context
 Augmentation = Callable[[jax.Array, Window], Window]  # (key, window) -> changed window
 
 
+Split = Callable[[Sequence[Demonstration]], Sequence[Sequence[Demonstration]]]
+
+
 class Collection(NamedTuple):
     """Demonstrations, and a count of the episodes that were dropped.
 
@@ -207,6 +210,8 @@ class Domain(NamedTuple):
             restarts of LEAP (see `leapjax.energy.symmetric`); `None` without symmetries.
         signature: JSON values that a checkpoint and the level must agree on.
         sizes: by architecture, further such values (see `find_signature`).
+        split: (demonstrations) -> demonstrations in parts, each of observations of one shape; a
+            batch is of one part. `None` if all observations have one shape.
         held_out: levels of a file, which `make_adapter` then plays; `None` if it draws levels.
         made_from: (name in `leapjax.domains`, settings), from which `make_domain` made the level;
             `None` for an unregistered domain, whose planners cannot be saved.
@@ -225,6 +230,7 @@ class Domain(NamedTuple):
     turn: Turn | None = None
     signature: Mapping[str, Any] = {}
     sizes: Mapping[str, Mapping[str, Any]] = {}
+    split: Split | None = None
     held_out: HeldOut | None = None
     made_from: tuple[str, Any] | None = None
 
@@ -256,6 +262,15 @@ def drop_files(settings: Any) -> Any:
     fields = [field.name for field in dataclasses.fields(settings)]
     paths = [name for name in fields if isinstance(getattr(settings, name), Path)]
     return dataclasses.replace(settings, **dict.fromkeys(paths))
+
+
+def split_demonstrations(
+    domain: Domain, demonstrations: Sequence[Demonstration]
+) -> Sequence[Sequence[Demonstration]]:
+    """Returns the parts of demonstrations, each of observations of one shape; `[]` if none."""
+    if not demonstrations:
+        return []
+    return domain.split(demonstrations) if domain.split else [demonstrations]
 
 
 def measure_statistics(domain: Domain, demonstrations: Sequence[Demonstration]) -> Statistics:

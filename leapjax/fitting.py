@@ -15,7 +15,13 @@ from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
 from leapjax.checks import check_integer, check_kind, check_seed
 from leapjax.data import storage, windows
-from leapjax.domain import Domain, apply_statistics, find_signature, measure_statistics
+from leapjax.domain import (
+    Domain,
+    apply_statistics,
+    find_signature,
+    measure_statistics,
+    split_demonstrations,
+)
 from leapjax.domains import make_level
 from leapjax.errors import UserError
 from leapjax.methods import find_method, learns_from_rewards
@@ -134,9 +140,10 @@ def fit(
     compilation.use_disk_cache()
     agent = pretrained.make_agent(specification, domain, mesh)
     begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
-    steps_of_all: Any = (
-        windows.concatenate(data, domain.augmentations.extras, padded=True) if data else ()
-    )
+    parts = [
+        windows.concatenate(part, domain.augmentations.extras, padded=True)
+        for part in split_demonstrations(domain, data)
+    ]
 
     last: dict[str, float] = {}
 
@@ -146,8 +153,8 @@ def fit(
         progress(done, means)
 
     state, key = begin(seed)
-    placed = sharding.replicate(steps_of_all, mesh)
-    state = train(step, state, placed, key, training.steps, report)
+    choose = windows.take_turns(sharding.replicate(parts, mesh), training.windows)
+    state = train(step, state, choose, key, training.steps, report)
     if warning := judge_values(settings, data, last):
         warnings.warn(warning, stacklevel=2)
     params = jax.tree.map(jnp.asarray, sharding.to_host(state.params))

@@ -123,7 +123,7 @@ def compile_ahead(
 def train(
     train_step: Callable[..., tuple[TrainState, dict[str, jax.Array]]],
     state: TrainState,
-    data: PyTree,
+    choose_data: Callable[[int], PyTree],
     key: jax.Array,
     steps: int,
     report: Callable[[int, TrainState, dict[str, float]], bool | None],
@@ -135,7 +135,7 @@ def train(
     Args:
         train_step: a `TrainStep`, or a function with its signature.
         state: state to start from; consumed.
-        data: training data, on the devices.
+        choose_data: (number of earlier steps) -> the training data of a step, on the devices.
         key: key of the run.
         steps: number of steps in all, including the steps that `state` has seen.
         report: called with (step, state, mean metrics) every `report_every` steps and at
@@ -152,7 +152,7 @@ def train(
     pending: list[dict[str, jax.Array]] = []
     stop, reported = False, time.perf_counter()
     while done < steps and not stop:
-        state, metrics = train_step(state, data, key)
+        state, metrics = train_step(state, choose_data(done), key)
         done += 1
         pending.append(metrics)
         if len(pending) > AHEAD:

@@ -57,7 +57,9 @@ def test_train_plan_evaluate_over_and_over(tmp_path):
     for cycle in range(CYCLES):
         state, key = begin(cycle)
         saved = Checkpoints(tmp_path / f"{cycle % 3}" / f"{cycle}")
-        state = training.train(step, state, data, key, 10, lambda done, now, means: None)
+        state = training.train(
+            step, state, lambda done: data, key, 10, lambda done, now, means: None
+        )
         saved.save(state)
         restored = saved.restore(state)
         saved.close()

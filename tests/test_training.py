@@ -65,11 +65,11 @@ def through_a_checkpoint(folder, state, like):
 def test_a_run_that_is_stopped_and_continued_is_the_run_that_was_not(data, tmp_path):
     agent, step = tiny()
     key = jax.random.key(7)
-    whole = training.train(step, agent.init(jax.random.key(0)), data, key, 6, ignore)
-    first = training.train(step, agent.init(jax.random.key(0)), data, key, 3, ignore)
+    whole = training.train(step, agent.init(jax.random.key(0)), lambda done: data, key, 6, ignore)
+    first = training.train(step, agent.init(jax.random.key(0)), lambda done: data, key, 3, ignore)
     restored = through_a_checkpoint(tmp_path, first, agent.init(jax.random.key(1)))
     assert_identical(restored, first)
-    assert_identical(training.train(step, restored, data, key, 6, ignore), whole)
+    assert_identical(training.train(step, restored, lambda done: data, key, 6, ignore), whole)
     assert int(whole.step) == 6
 
 
@@ -190,7 +190,9 @@ def run(losses, report_every=20, begin=0, loss=np.float32, **options):
         reports.append((done, means["loss"]))
 
     state = TrainState({}, (), np.int32(begin))
-    training.train(step, state, None, None, len(losses), report, report_every, **options)
+    training.train(
+        step, state, lambda done: None, None, len(losses), report, report_every, **options
+    )
     return reports
 
 
@@ -411,8 +413,8 @@ def test_extra_state_follows_the_parameters_and_not_the_gradient(fsdp):
     agent = average_agent(mesh)
     state, key = training.make_begin(agent, mesh)(0)
     w = np.asarray(state.params["w"], np.float64)
-    step = training.make_train_step(agent, mesh)
-    state = training.train(step, state, sharding.replicate(data, mesh), key, 5, ignore)
+    step, placed = training.make_train_step(agent, mesh), sharding.replicate(data, mesh)
+    state = training.train(step, state, lambda done: placed, key, 5, ignore)
     expected = averages(w, *(np.asarray(part, np.float64) for part in data), 5)
     for actual, wanted in zip((state.params["w"], state.extra["average"]), expected, strict=True):
         np.testing.assert_allclose(actual, wanted, rtol=1e-4, atol=1e-5)

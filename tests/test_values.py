@@ -144,7 +144,7 @@ def test_without_a_discount_only_an_end_bounds_what_rewards_allow():
 def test_values_that_rewards_do_not_allow_give_a_warning(method, value, monkeypatch):
     """But a method that learns no values may report what it likes."""
 
-    def train(step, state, data, key, steps, report):
+    def train(step, state, choose_data, key, steps, report):
         for mean in (7.0, 1.05, value):  # only the last counts
             report(steps, state, {"value": mean})
         return state

@@ -65,10 +65,10 @@ DOMAIN = Domain(
 
 def learn(agent, data, steps):
     """A state after so many steps of training, and the metrics on the way."""
-    metrics = []
+    metrics, placed = [], jax.tree.map(jnp.asarray, data)
     state = training.train(
         training.make_train_step(agent), quick_jit(agent.init)(jax.random.key(0)),
-        jax.tree.map(jnp.asarray, data), jax.random.key(1), steps,
+        lambda done: placed, jax.random.key(1), steps,
         lambda done, state, means: metrics.append(means),
     )  # fmt: skip
     return state, metrics

@@ -107,6 +107,26 @@ def concatenate(
     )
 
 
+def take_turns(parts: Sequence[Steps], by: str) -> Callable[[int], Steps]:
+    """Makes a function that chooses the part of the data for each step of training.
+
+    Each part is chosen as often as its share of all windows says, at even distances.
+
+    Args:
+        parts: at least one part.
+        by: how windows are drawn; see `sample_steps`.
+    """
+    counts = [float(part.count if by == "step" else len(part.starts)) for part in parts]
+    shares = np.cumsum(counts) / sum(counts)
+
+    def choose(step: int) -> Steps:
+        # Multiples of the golden ratio fill the interval evenly, however many there are.
+        place = step * (math.sqrt(5) - 1) / 2 % 1
+        return parts[min(int(np.searchsorted(shares, place, side="right")), len(parts) - 1)]
+
+    return choose
+
+
 def unpadded(steps: Steps) -> Steps:
     """Returns the steps without their padding, as views: it copies no array."""
     count, episodes = int(steps.count), len(steps.starts)

@@ -44,6 +44,8 @@ def leapjax(name: str, method: str) -> AnyConfig:
         UserError: the level is unknown.
     """
     level = find_level(name)
+    if level.members:
+        return _together(level, method)
     # The usual 3e-3 is too high for LEAP in large levels.
     rate = {"learning_rate": 1.5e-3} if _is_large(level) and method == "leap" else {}
     return Config(
@@ -59,6 +61,24 @@ def leapjax(name: str, method: str) -> AnyConfig:
         planner=_our_search(level, method),
         method_settings=common.settings(method, masking="random"),
         domain_settings=_augmented(level),
+    )
+
+
+def _together(level: Level, method: str) -> AnyConfig:
+    """Returns a configuration for one planner of many levels."""
+    return Config(
+        domain="babyai",
+        level=level.name,
+        method=method,
+        preset="leapjax",
+        demos=common.demonstrations(method, 300 * len(level.members)),
+        episodes=200,  # of each level, too
+        context=64,  # past steps that show what was done
+        model=common.our_model(method),
+        training=common.our_training(method, steps=1200 * len(level.members), learning_rate=1.5e-3),
+        planner=_our_search(level, method),
+        method_settings=common.settings(method, masking="random"),
+        domain_settings=Settings(augment=True, fields=12, sweeps=48, word_heads=4, memory=True),
     )
 
 

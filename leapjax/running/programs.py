@@ -75,7 +75,7 @@ def _compile(run: "Run") -> Callable[[], Programs]:
     memory.check_state(state)
 
     def compile_training() -> tuple[Any, TrainStep]:
-        if config.training.steps:
+        if config.training.steps and domain.split is None:  # else a program for each part
             begin, step = training.compile_ahead(agent, mesh, like)
             memory.check_program(step.update)
             return begin, step

@@ -6,7 +6,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 
@@ -15,7 +14,7 @@ from leapjax.agents.measured import MEASURED, measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.domain import apply_statistics, measure_statistics
+from leapjax.domain import apply_statistics, measure_statistics, split_demonstrations
 from leapjax.pretrained import Pretrained
 from leapjax.running.data import check_data, judge_data
 from leapjax.running.metrics import Metrics, read_metrics, write_metrics
@@ -45,17 +44,19 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # In Atari these are all frames: the host keeps one copy until the devices have theirs.
-    steps: Any = (
-        windows.concatenate(data, run.domain.augmentations.extras, padded=True) if data else ()
-    )
-    named = windows.fingerprint(windows.unpadded(steps) if data else ())
+    parts = [
+        windows.concatenate(part, run.domain.augmentations.extras, padded=True)
+        for part in split_demonstrations(run.domain, data)
+    ]
+    named = windows.fingerprint([windows.unpadded(part) for part in parts])
     check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = run.programs.take(run)
     state, key = begin(run.seed)
-    steps = sharding.replicate(steps, make_mesh(config))
+    parts = sharding.replicate(parts, make_mesh(config))
     compiling = time.perf_counter()
     if total:  # the only program that depends on the number of demonstrations
-        jax.block_until_ready(step.draw(key, state.step, steps))
+        for part in parts:
+            jax.block_until_ready(step.draw(key, state.step, part))
     run.seconds["compile"] += time.perf_counter() - compiling
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state) if hasattr(leaf, "nbytes"))
     # Room for two checkpoints and the next.
@@ -101,7 +102,8 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
             return any(signals)
 
         often = REPORT_SECONDS if jax.process_count() == 1 else math.inf
-        state = training.train(step, state, steps, key, total, report, report_seconds=often)
+        choose = windows.take_turns(parts, config.training.windows)
+        state = training.train(step, state, choose, key, total, report, report_seconds=often)
     settings = run.specification.method_settings
     if metrics and (warning := judge_values(settings, data, metrics[-1])):
         console.print(f"warning: {warning}", highlight=False)

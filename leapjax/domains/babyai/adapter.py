@@ -20,7 +20,7 @@ class BabyAIAdapter:
 
     Attributes:
         num_actions: A, number of actions with the end action.
-        level: level to play.
+        level: level that is played; of a level with members, the member of the last seed.
         env: MiniGrid's environment.
         side: S, side of the grid.
         goal: cell of the goal; `observations.NO_GOAL` if it is not observed.
@@ -30,23 +30,33 @@ class BabyAIAdapter:
     num_actions = NUM_ACTIONS
 
     def __init__(self, level: Level) -> None:
-        self.level = level
-        self.env = levels.make_environment(level)
-        self.side = max(self.env.width, self.env.height)
-        # Skip the agent's partial view: it is not used here, and costs more than a step.
-        self.env.gen_obs = lambda: {}  # type: ignore[method-assign]
+        self._members = [levels.find_level(name) for name in level.members] or [level]
+        self._words = level.words
+        self.side, _ = levels.measure_level(level)
+        self._open(self._members[0])
         self.goal = observations.NO_GOAL
         self.taken = END
         self._instruction = np.zeros(level.words, np.int32)
         self._random = np.random.default_rng()
 
+    def _open(self, level: Level) -> None:
+        """Makes the environment of a level without members."""
+        self.level = level
+        self.env = levels.make_environment(level)
+        # Skip the agent's partial view: it is not used here, and costs more than a step.
+        self.env.gen_obs = lambda: {}  # type: ignore[method-assign]
+
     def reset(self, seed: int) -> Observation:
         """Starts the level of a seed; returns its first state."""
+        member = self._members[seed % len(self._members)]
+        if member != self.level:
+            self.close()
+            self._open(member)
         with levels.silenced():
             self.env.reset(seed=seed)
         self.goal = observations.nearest_goal(self.env)
         self._random = np.random.default_rng([seed, SLIPS])
-        self._instruction = vocabulary.encode(self.env.mission, self.level.words)
+        self._instruction = vocabulary.encode(self.env.mission, self._words)
         return self.observe()
 
     def close(self) -> None:

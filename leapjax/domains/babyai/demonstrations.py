@@ -1,14 +1,16 @@
 """Demonstrations of BabyAI levels from MiniGrid's bot."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from leapjax.data import seeds
 from leapjax.domain import Collection
+from leapjax.domains.babyai import vocabulary
 from leapjax.domains.babyai.adapter import END, BabyAIAdapter
 from leapjax.domains.babyai.bot import FullViewBot
+from leapjax.domains.babyai.encoders.cells import OUTSIDE
 from leapjax.domains.babyai.levels import Level
 from leapjax.domains.babyai.observations import Observation
 from leapjax.environments import closing
@@ -17,6 +19,7 @@ from leapjax.types import Demonstration
 
 MISTAKES = 2  # stream of a level seed's random numbers, for mistakes
 FAILED = "failed"  # the bot gave up, crashed or ran out of time
+SIDES = (8, 11, 13, 16, 22)  # of grids in a batch: a program is compiled for each
 OTHER_GOAL = "ended at another match than the nearest"
 
 
@@ -96,3 +99,31 @@ def demonstrate(adapter: BabyAIAdapter, seed: int, dropped: Counter[str]) -> Dem
         truncated,
         seed,
     )
+
+
+def split_by_side(demonstrations: Sequence[Demonstration]) -> list[list[Demonstration]]:
+    """Splits demonstrations by the side of their grids, and cuts the padding of each part."""
+    parts: dict[int, list[Demonstration]] = {}
+    for demonstration in demonstrations:
+        states = demonstration.observations
+        grid = states.grid
+        known = (grid[0, ..., 0] != OUTSIDE).nonzero()
+        needed = int(max(map(np.max, known))) + 1
+        side = min((s for s in SIDES if s >= needed), default=grid.shape[1])
+        cut = np.ascontiguousarray(grid[:, :side, :side])
+        part = parts.setdefault(cut.shape[1], [])
+        part.append(demonstration._replace(observations=states._replace(grid=cut)))
+    return [_cut_instructions(parts[side]) for side in sorted(parts)]
+
+
+def _cut_instructions(demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
+    """Cuts padding that no instruction of these demonstrations needs."""
+    said = np.stack([each.observations.instruction[0] for each in demonstrations])
+    longest = int((said != vocabulary.PAD).sum(axis=1).max())
+
+    def cut(demonstration: Demonstration) -> Demonstration:
+        states = demonstration.observations
+        words = np.ascontiguousarray(states.instruction[:, :longest])
+        return demonstration._replace(observations=states._replace(instruction=words))
+
+    return [cut(each) for each in demonstrations]

@@ -1,6 +1,5 @@
 """BabyAI as a `Domain`."""
 
-import contextlib
 import functools
 
 import numpy as np
@@ -34,9 +33,7 @@ def make(name: str, options: Settings) -> Domain:
         UserError: the level is unknown.
     """
     level = levels.find_level(name)
-    with contextlib.closing(levels.make_environment(level)) as env:
-        side = max(env.width, env.height)
-        longest = levels.longest_episode(level, env)
+    side, longest = levels.measure_level(level)
 
     def state_tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
         del sizes
@@ -68,6 +65,7 @@ def make(name: str, options: Settings) -> Domain:
         ),
         signature={"vocabulary": list(vocabulary.WORDS)},
         sizes={"paper": {"side": side, "words": level.words}},
+        split=demonstrations.split_by_side if level.members else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import io
 from typing import Any
 
@@ -37,6 +38,7 @@ class Level:
         slip: probability that a turn becomes another of MiniGrid's first six actions.
         mistakes: share of the demonstrator's actions that are random.
         mislabelled: share of a demonstration's recorded actions that are replaced at random.
+        members: levels by name, of which each episode plays one, as its seed says.
     """
 
     name: str
@@ -56,6 +58,12 @@ class Level:
     slip: float = 0.0
     mistakes: float = 0.0
     mislabelled: float = 0.0
+    members: tuple[str, ...] = ()
+
+
+def registered_levels() -> list[str]:
+    """Lists the ids of all BabyAI levels that MiniGrid registers."""
+    return sorted(name for name in gym.registry if name.startswith("BabyAI-"))
 
 
 _GO_TO, _WITH_PLACE = 5, 9  # "go to the red ball", "pick up the red ball in front of you"
@@ -130,9 +138,33 @@ MODIFIED = {
 }
 
 
-def registered_levels() -> list[str]:
-    """Lists the ids of all BabyAI levels that MiniGrid registers."""
-    return sorted(name for name in gym.registry if name.startswith("BabyAI-"))
+# Levels that one planner learns together (experiments/babyai.py). It never learns those that are
+# held out, nor their twins, which differ in what counts as failure. MiniGrid's bot opens no boxes,
+# so nobody demonstrates KeyInBox.
+HELD_OUT = (
+    "BabyAI-GoToRedBlueBall-v0", "BabyAI-PickupDist-v0", "BabyAI-OpenDoorsOrderN4-v0",
+    "BabyAI-PutNextS5N2-v0",
+)  # fmt: skip
+NOT_DEMONSTRATED = ("BabyAI-KeyInBox-v0",)
+_TWINS = ("BabyAI-PickupDistDebug-v0", "BabyAI-OpenDoorsOrderN4Debug-v0")
+_FIRST = (
+    "GoToObj", "GoToLocal", "GoTo", "Open", "Pickup", "PutNextLocal", "Unlock", "UnlockPickup",
+    "GoToSeqS5R2", "Synth",
+)  # fmt: skip
+MIXTURES = {
+    level.name: level
+    for level in (
+        Level(
+            "BabyAI",
+            members=tuple(
+                name
+                for name in registered_levels()
+                if name not in (*HELD_OUT, *NOT_DEMONSTRATED, *_TWINS)
+            ),
+        ),
+        Level("BabyAI10", members=tuple(f"BabyAI-{name}-v0" for name in _FIRST)),
+    )
+}
 
 
 def find_level(name: str) -> Level:
@@ -141,7 +173,7 @@ def find_level(name: str) -> Level:
     Raises:
         UserError: the level is unknown; names the most similar level.
     """
-    own = {**LEVELS, **MODIFIED}
+    own = {**LEVELS, **MODIFIED, **MIXTURES}
     if name in own:
         return own[name]
     if name in registered_levels():
@@ -154,7 +186,11 @@ def find_level(name: str) -> Level:
 
 
 def make_environment(level: Level) -> RoomGridLevel:
-    """Makes MiniGrid's environment of a level, without wrappers and not yet reset."""
+    """Makes MiniGrid's environment of a level, without wrappers and not yet reset.
+
+    Args:
+        level: a level without members.
+    """
     if not level.task:
         with silenced():
             return gym.make(level.name).unwrapped  # type: ignore[return-value]
@@ -182,11 +218,18 @@ def silenced() -> contextlib.redirect_stdout:
     return contextlib.redirect_stdout(io.StringIO())
 
 
-def longest_episode(level: Level, env: RoomGridLevel) -> int:
-    """Returns the step limit for the level's longest instruction.
+@functools.cache
+def measure_level(level: Level) -> tuple[int, int]:
+    """Makes the environments of a level; returns the side of its grid, and its step limit.
 
     MiniGrid's limit grows with the navigations that an instruction needs: 2 for each of 4 clauses.
     """
-    navigations = 8 if level.sequence else 1
-    grows = navigations * env.room_size**2 * env.num_rows * env.num_cols
-    return max(env.max_steps or 0, grows)  # 0 if the limit is unknown before the reset
+    if level.members:
+        sizes = [measure_level(find_level(name)) for name in level.members]
+        sides, limits = zip(*sizes, strict=True)
+        return max(sides), max(limits)
+    with contextlib.closing(make_environment(level)) as env:
+        navigations = 8 if level.sequence else 1
+        grows = navigations * env.room_size**2 * env.num_rows * env.num_cols
+        limit = max(env.max_steps or 0, grows)  # 0 if the limit is unknown before the reset
+        return max(env.width, env.height), limit
