@@ -354,7 +354,7 @@ def name_planner(row: Row) -> str:
         f"N = {planner.get('iterations')}": "iterations" in planner,
         str(planner.get("fill")): planner.get("fill", "together") != "together",
         f"rules {rules}": bool(rules),
-        f"on {row.get('played')}": row.get("played", row["level"]) != row["level"],
+        f"learned {row['level']}": row.get("played", row["level"]) != row["level"],
     }
     return ", ".join(part for part, said in parts.items() if said)
 
@@ -377,7 +377,8 @@ def make_success_table(rows: Sequence[Row]) -> Table:
     )
 
     def named(row: Row) -> tuple[str, ...]:
-        return row["level"], f"{row['method']} ({row['preset']})", name_planner(row)
+        played = str(row.get("played", row["level"]))
+        return played, f"{row['method']} ({row['preset']})", name_planner(row)
 
     def published(row: Row) -> str:
         found = row.get("paper_success")

@@ -1,0 +1,107 @@
+"""One planner of many BabyAI levels: levels with members, and training on parts of the data."""
+
+import itertools
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import babyai
+from leapjax import load, plan_keys, rollouts
+from leapjax.data import windows
+from leapjax.domains.babyai import demonstrations, levels
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.augmentation import mark_needed_cells
+from leapjax.domains.babyai.levels import Level
+from leapjax.running import results
+from tests.programs import SINGLE, only_long
+
+SMALL, LARGE = "BabyAI-GoToObjS4-v0", "BabyAI-PutNextS5N1-v0"  # sides 4 and 9, 4 and 5 words
+TWO = Level("Two", members=(SMALL, LARGE))
+TINY = [*SINGLE, *"--channels 4 --rounds 1 --fields 2 --sweeps 2 --word-heads 1".split()]
+
+
+@pytest.fixture
+def two(monkeypatch, tmp_path):
+    monkeypatch.setitem(levels.MIXTURES, "Two", TWO)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+def test_no_level_that_is_held_out_or_its_twin_is_learned():
+    members = set(levels.find_level("BabyAI").members)
+    assert members | set(levels.HELD_OUT) <= set(levels.registered_levels())
+    for name in levels.HELD_OUT:
+        stem = name.removesuffix("-v0")
+        twins = {each for each in levels.registered_levels() if each.startswith(f"{stem}Debug")}
+        assert not members & {name, *twins}
+    assert set(levels.find_level("BabyAI10").members) < members and len(members) == 89
+
+
+def test_a_seed_plays_a_member_and_pads_it():
+    """Each episode is that of the member alone; the padding is of zeros."""
+    together = BabyAIAdapter(TWO)
+    for seed in (5, 6, 8, 7):
+        name = TWO.members[seed % 2]
+        alone = BabyAIAdapter(levels.find_level(name))
+        padded, plain = together.reset(seed), alone.reset(seed)
+        for action in (2, 0, 2, 3):
+            assert padded.grid.shape == (9, 9, 3)
+            side = plain.grid.shape[0]
+            np.testing.assert_array_equal(padded.grid[:side, :side], plain.grid)
+            assert not padded.grid[side:].any() and not padded.grid[:, side:].any()
+            for field in ("pose", "carried", "goal", "instruction"):
+                np.testing.assert_array_equal(getattr(padded, field), getattr(plain, field))
+            padded, plain = (each.step(action).observation for each in (together, alone))
+
+
+def test_parts_have_one_shape_and_lose_only_padding():
+    found = demonstrations.collect(TWO, 12, 0).demonstrations
+    small, large = demonstrations.split_by_side(found)
+    assert [len(small), len(large)] == [6, 6]
+    for part, side, words in ((small, 8, 5), (large, 9, 10)):
+        for each in part:
+            (whole,) = (d for d in found if d.seed == each.seed)
+            grid, said = each.observations.grid, each.observations.instruction
+            assert grid.shape[1:3] == (side, side) and said.shape[1] <= words
+            assert grid.sum() == whole.observations.grid.sum()
+            assert said.sum() == whole.observations.instruction.sum()
+        windows.concatenate(part, mark_needed_cells)  # of one shape
+
+
+@pytest.mark.parametrize("by", ["step", "episode"])
+def test_parts_take_turns_as_their_windows_are_many(by):
+    lengths = {"step": [4, 12, 48], "episode": [1, 1, 1]}[by]
+    counts = {"step": [1, 1, 1], "episode": [1, 3, 12]}[by]
+    parts = [
+        windows.Steps(*[None] * 8, np.zeros(episodes), None, np.int32(length), None)
+        for length, episodes in zip(lengths, counts, strict=True)
+    ]
+    choose = windows.take_turns(parts, by)
+    number = {id(part): each for each, part in enumerate(parts)}
+    chosen = [number[id(choose(step))] for step in range(1600)]
+    for each, share in enumerate((1 / 16, 3 / 16, 12 / 16)):
+        assert chosen.count(each) == pytest.approx(1600 * share, abs=3)
+    gaps = [len(list(group)) for each, group in itertools.groupby(chosen) if each == 2]
+    assert max(gaps) <= 8  # at even distances
+
+
+@only_long
+def test_a_planner_of_two_levels_plays_each(two):
+    """It resumes as it would have gone on, and has a row for each level."""
+    arguments = [*TINY, "--level", "Two", "--demos", "12", "--steps", "6"]
+    assert babyai.main([*arguments, "--runs", "whole"]) == 0
+    rows = results.read(Path("whole/babyai.jsonl"))
+    assert [row["played"] for row in rows] == ["Two", SMALL, LARGE]
+    assert babyai.main([*arguments, "--runs", "again"]) == 0
+    (folder,), (other,) = (list(Path(runs).glob("babyai-*")) for runs in ("whole", "again"))
+    same = load(folder).params, load(other).params
+    jax.tree.map(np.testing.assert_array_equal, *same)
+
+    planner = load(folder, level="BabyAI-GoToLocalS6N3-v0")  # a third level, of another size
+    adapter = planner.domain.make_adapter()
+    context = planner.specification.context
+    history = rollouts.History(adapter.reset(0), context, adapter.num_actions, 0)
+    plan = planner(plan_keys(0, np.array([0]), np.array([0])), rollouts.stack_contexts([history]))
+    assert plan.actions.shape == (1, 5)
