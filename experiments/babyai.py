@@ -16,15 +16,14 @@ from leapjax.running.run import Experiment
 
 
 def play_members(config: AnyConfig) -> list[AnyConfig]:
-    """Returns a configuration for each level that a planner of many levels plays, held out or not.
+    """Returns a configuration for each level that a planner of many levels plays.
 
-    A planner of one level plays no other.
+    These are the levels that it learned, and those that are held out. A planner of one level plays
+    no other.
     """
     members = find_level(config.level).members
-    if not members or config.play is not None:
-        return []
-    held_out = HELD_OUT if config.level == "BabyAI" else ()
-    return [change(config, play=name) for name in (*members, *held_out)]
+    played = (*members, *HELD_OUT) if members else ()
+    return [change(config, play=name) for name in played]
 
 
 EXPERIMENT = Experiment(

@@ -227,3 +227,16 @@ def test_the_agent_recalls_deeds_and_the_sides_of_its_first_pose():
     held = seen[1, 2, 5:]
     assert held.sum() == 2 and held[5] == held[11 + 1] == 1
     assert np.abs(seen[..., 5:]).sum() == 2
+
+
+def test_things_are_doors_keys_balls_boxes_and_the_agent():
+    """Wherever they are; padding of the indices is outside the grid."""
+    rng = np.random.default_rng(0)
+    for side, count in ((SIDE, SIDE**2), (12, cells.MOST_THINGS)):
+        kinds = rng.choice([1, 1, 1, 2, 4, 5, 6, 7, 8, 9, 10], (side, side), p=[0.07] * 10 + [0.3])
+        grid = np.stack([kinds] * 3, axis=-1)
+        found = cells.find_things(Observation(grid, None, None, None, None))
+        expected = np.flatnonzero(np.isin(kinds, [4, 5, 6, 7, 10]))[:count]
+        assert found.shape == (count,)
+        np.testing.assert_array_equal(found[: len(expected)], expected)
+        assert (np.asarray(found[len(expected) :]) == side**2).all()

@@ -93,7 +93,7 @@ def test_a_planner_of_two_levels_plays_each(two):
     arguments = [*TINY, "--level", "Two", "--demos", "12", "--steps", "6"]
     assert babyai.main([*arguments, "--runs", "whole"]) == 0
     rows = results.read(Path("whole/babyai.jsonl"))
-    assert [row["played"] for row in rows] == ["Two", SMALL, LARGE]
+    assert [row["played"] for row in rows] == ["Two", SMALL, LARGE, *levels.HELD_OUT]
     assert babyai.main([*arguments, "--runs", "again"]) == 0
     (folder,), (other,) = (list(Path(runs).glob("babyai-*")) for runs in ("whole", "again"))
     same = load(folder).params, load(other).params

@@ -42,7 +42,8 @@ class FullViewBot(BabyAIBot):
 
     def __init__(self, env: RoomGridLevel) -> None:
         self._opens_locked = False  # whether paths may lead through locked doors
-        self._asks = False  # whether a path is only measured
+        self._measures = False  # whether a path is only measured, not followed
+        self._drops = False  # whether a path leads to a place where to drop something
         super().__init__(env)
         self.vis_mask[:] = True
 
@@ -89,11 +90,19 @@ class FullViewBot(BabyAIBot):
 
     def _find_obj_pos(self, obj_desc, adjacent=False):  # noqa: ANN001, ANN202
         """Finds the nearest match of a description, perhaps behind a locked door."""
-        self._asks = True
+        self._measures = True
         try:
             return super()._find_obj_pos(obj_desc, adjacent)
         finally:
-            self._asks = False
+            self._measures = False
+
+    def _find_drop_pos(self, except_pos=None):  # noqa: ANN001, ANN202
+        """Finds a place to drop an object, on this side of locked doors."""
+        self._drops = True
+        try:
+            return super()._find_drop_pos(except_pos)
+        finally:
+            self._drops = False
 
     def _shortest_path(self, accept_fn, try_with_blockers=False):  # noqa: ANN001, ANN202
         """Finds a path; only if there is none, a path through locked doors.
@@ -102,14 +111,14 @@ class FullViewBot(BabyAIBot):
             LockedOut: the path leads through a locked door, and the bot would follow it.
         """
         found = super()._shortest_path(accept_fn, try_with_blockers)
-        if found[0] is not None:
+        if found[0] is not None or self._drops:
             return found
         self._opens_locked = True
         try:
             path, finish, with_blockers = super()._shortest_path(accept_fn, try_with_blockers)
         finally:
             self._opens_locked = False
-        if path and not self._asks:
+        if path and not self._measures:
             cells = (self.mission.unwrapped.grid.get(*place) for place in path[:-1])
             locked = (cell for cell in cells if isinstance(cell, Door) and cell.is_locked)
             if (door := next(locked, None)) is not None:

@@ -21,8 +21,8 @@ class Settings:
         sweeps: Rounds of value iteration that compute the distance fields.
         word_heads: Attention heads from cells to the words of the instruction; 0 for no attention.
         memory: Mark where the agent picked up, dropped and toggled, and which cells its first pose
-            saw ahead and on its right; words then find out which of their tasks are done. For long
-            instructions; needs `word_heads`.
+            saw ahead and on its right. Only things attend to words, and words to things: so words
+            find out which of their tasks are done. For long instructions; needs `word_heads`.
         radius: Cells around the agent, in each direction, that are read one by one.
     """
 

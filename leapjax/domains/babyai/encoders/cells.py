@@ -10,6 +10,7 @@ from leapjax.domains.babyai.observations import Observation
 # MiniGrid's encoding of a cell: object 0 to 10, colour 0 to 5, state 0 to 3.
 OBJECTS, COLOURS, STATES = 11, symmetries.COLOURS, 4
 DIRECTIONS = 4
+MOST_THINGS = 64  # in a level: BossLevel has some forty
 OUTSIDE = 0  # object index of padding, which no cell of a level has
 
 
@@ -46,6 +47,18 @@ def mark_cell(position: jax.Array, side: int) -> jax.Array:
     axis = jnp.arange(side)
     hit = (axis == position[0])[:, None] & (axis == position[1])[None, :]
     return hit.astype(jnp.float32)
+
+
+def find_things(observation: Observation) -> jax.Array:
+    """Returns the flat indices `[n]` of doors, keys, balls, boxes and the agent; S^2 pads the end.
+
+    n is `MOST_THINGS`, or the number of cells if there are fewer.
+    """
+    kinds = jnp.asarray(observation.grid)[..., 0].reshape(-1)
+    named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
+    cells = kinds.shape[0]
+    things = named | (kinds == symmetries.AGENT)
+    return jnp.nonzero(things, size=min(MOST_THINGS, cells), fill_value=cells)[0]
 
 
 def read_neighbourhood(image: jax.Array, position: jax.Array, radius: int) -> jax.Array:

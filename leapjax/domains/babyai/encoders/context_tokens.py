@@ -11,6 +11,7 @@ from leapjax.domains.babyai.encoders.cells import (
     OBJECTS,
     OUTSIDE,
     CellEmbedding,
+    find_things,
     read_cell,
     read_neighbourhood,
 )
@@ -59,12 +60,18 @@ class ContextTokens(Encoder):
         inside = (observation.grid[..., :1] != OUTSIDE).astype(cells.dtype)
         if c.memory:
             cells += nn.Dense(c.channels, use_bias=False, name="deeds")(recall(context, side))
+            places = find_things(observation)
+            things = cells.reshape(side * side, -1).at[places].get(mode="fill", fill_value=0)
             review = InstructionReview(c.word_heads, name="review")
-            instruction = review(instruction, cells, inside)
+            instruction = review(instruction, things, places < side * side)
         scale, shift = jnp.split(dense(2 * c.channels, name="modulation")(instruction.whole), 2)
         modulated = cells * (1 + scale) + shift
-        if c.word_heads:
-            attention = CrossAttention(c.word_heads, name="words")
+        attention = CrossAttention(c.word_heads, name="words") if c.word_heads else None
+        if attention and c.memory:  # of things only: most cells are walls or empty
+            told = attention(things, instruction.words, instruction.given)
+            flat = modulated.reshape(side * side, -1).at[places].add(told, mode="drop")
+            modulated = flat.reshape(modulated.shape)
+        elif attention:
             modulated += attention(cells, instruction.words, instruction.given)
         encoder = GridEncoder(c.channels, c.fields, c.sweeps, c.rounds, self.dtype, name="grid")
         grid, distances = encoder(modulated, inside, observation.pose[:2], observation.goal)

@@ -86,7 +86,7 @@ class CrossAttention(nn.Module):
 
 
 class InstructionReview(nn.Module):
-    """Tells words which of their tasks are done: they look at the grid, then at each other.
+    """Tells words which of their tasks are done: they look at things, then at each other.
 
     Attributes:
         heads: number of heads.
@@ -96,18 +96,17 @@ class InstructionReview(nn.Module):
 
     @nn.compact
     def __call__(
-        self, instruction: Instruction, cells: jax.Array, inside: jax.Array
+        self, instruction: Instruction, things: jax.Array, there: jax.Array
     ) -> Instruction:
         """Computes new features of the words, and adds their largest to the whole.
 
         Args:
             instruction: encoded instruction.
-            cells: features `[S, S, C]`, which show where the agent was and what it did there.
-            inside: `[S, S, 1]`, 1 for cells of the level, 0 for padding.
+            things: features `[n, C]` of things, which show what the agent did with them.
+            there: booleans `[n]`, False for padding.
         """
-        words, features = instruction.words, cells.shape[-1]
-        cells, inside = cells.reshape(-1, features), inside.reshape(-1) > 0
-        words += CrossAttention(self.heads, name="grid")(words, cells, inside)
+        words = instruction.words
+        words += CrossAttention(self.heads, name="things")(words, things, there)
         words += CrossAttention(self.heads, name="others")(words, words, instruction.given)
         hidden = nn.relu(nn.Dense(words.shape[-1], name="hidden")(words))
         words += nn.Dense(words.shape[-1], name="update")(hidden)

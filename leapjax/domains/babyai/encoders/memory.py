@@ -29,8 +29,7 @@ def mark_faced(context: Context, turned: jax.Array) -> jax.Array:
     recency = jnp.append(_measure_recency(context), 1.0)
     kinds = turned[..., 0]
     named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
-    fronts = _mark_fronts(poses, context.observation.pose[2], turned.shape[0])
-    latest = (fronts * recency[:, None, None]).max(axis=0) * named
+    latest = _mark_fronts(context, poses, recency, turned.shape[0]) * named
     return jnp.stack([latest > 0, latest], axis=-1)
 
 
@@ -61,10 +60,11 @@ def mark_deeds(context: Context, side: int) -> jax.Array:
         side: S.
     """
     recency = _measure_recency(context)
-    fronts = _mark_fronts(context.past.pose, context.observation.pose[2], side)
-    done = context.actions[:, None] == jnp.array(DEEDS)  # [K, 3]
-    marks = fronts[..., None] * (recency[:, None] * done)[:, None, None]
-    return marks.max(axis=0, initial=0)
+    marks = [
+        _mark_fronts(context, context.past.pose, recency * (context.actions == deed), side)
+        for deed in DEEDS
+    ]
+    return jnp.stack(marks, axis=-1)
 
 
 def mark_sides(context: Context, side: int) -> jax.Array:
@@ -95,11 +95,16 @@ def _measure_recency(context: Context) -> jax.Array:
     return known * jnp.arange(1, past + 1) / (past + 1)
 
 
-def _mark_fronts(poses: jax.Array, quarters: jax.Array, side: int) -> jax.Array:
-    """Marks the cell in front of each pose `[K, 3]` in a grid turned by quarters: `[K, S, S]`."""
+def _mark_fronts(context: Context, poses: jax.Array, values: jax.Array, side: int) -> jax.Array:
+    """Marks the cells in front of poses with the largest of their values: `[S, S]`, else 0.
 
-    def mark(pose: jax.Array) -> jax.Array:
-        pose = symmetries.rotate_pose(pose, quarters, side)
-        return mark_cell(pose[:2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[pose[2]], side)
-
-    return jax.vmap(mark)(poses)
+    Args:
+        context: context, in whose turned grid the cells lie.
+        poses: poses `[n, 3]`, not turned.
+        values: `[n]`, not negative; 0 before the episode began.
+        side: S.
+    """
+    quarters = context.observation.pose[2]
+    turned = jax.vmap(symmetries.rotate_pose, (0, None, None))(poses, quarters, side)
+    fronts = turned[:, :2] + jnp.asarray(symmetries.DIRECTION_VECTORS)[turned[:, 2]]
+    return jnp.zeros((side, side)).at[fronts[:, 0], fronts[:, 1]].max(values, mode="drop")
