@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import quality
-from experiments import babyai
+from experiments import babyai, noise
 from leapjax import UserError, load, plan_keys, pretrained, rollouts
 from leapjax.data import seeds, storage
 from leapjax.domains.babyai.adapter import BabyAIAdapter
@@ -273,3 +273,17 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     assert all(row["plans_per_second"] > 0 and row["successes"] <= 3 for row in written)
     assert played == [list(seeds.validation_seeds(0, 3))] * 2
     assert (tmp_path / "plot.png").stat().st_size > 1000
+
+
+def test_noise_is_tried_on_validation_levels_at_every_temperature(workplace, tmp_path):
+    """PlaTe draws one beam at a temperature."""
+    folder = str(tmp_path)
+    arguments = [*TOY_RUN, *"--method leap --level GoToLocalS7N5 --steps 0 --episodes 2".split()]
+    assert noise.main([*arguments, "--runs", folder]) == 0
+    rows = results.read(tmp_path / "noise.jsonl")
+    tried = [row["configuration"]["planner"]["temperature"] for row in rows]
+    assert sorted(tried) == sorted(noise.TEMPERATURES)
+    assert all(row["validation"] for row in rows)
+    (plate,) = parse("babyai", ["--method", "plate", "--preset", "paper"])
+    beams = {each.planner.temperature: each.planner.beams for each in noise.try_temperatures(plate)}
+    assert set(beams.values()) == {1} and set(beams) == {*noise.TEMPERATURES} - {0.0}
