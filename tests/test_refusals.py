@@ -11,6 +11,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from minigrid.utils.baby_ai_bot import Subgoal
 
 import experiments.__main__ as everything
 import leapjax as leap
@@ -26,7 +28,9 @@ from leapjax import checkpoints, files, pretrained
 from leapjax.checkpoints import Checkpoints, states
 from leapjax.configuration import make_domain, specify
 from leapjax.data import storage
-from leapjax.domains.babyai import demonstrations, levels
+from leapjax.domains.babyai import bot, demonstrations, levels
+from leapjax.domains.babyai.adapter import BabyAIAdapter
+from leapjax.domains.babyai.bot import FullViewBot
 from leapjax.errors import UserError
 from leapjax.running import jax_setup, startup
 from leapjax.running import main as running
@@ -454,8 +458,20 @@ def test_a_disk_that_fills_is_one_line_and_older_files_stay(workplace, capfd, ca
     check_params(workplace / "a", 1.0)
 
 
-def test_a_bot_that_never_decides_is_a_failed_demonstration():
-    """MiniGrid's bot goes round in circles on one in six of these levels."""
-    collected = demonstrations.collect(levels.find_level("BabyAI-UnlockToUnlock-v0"), 5, seed=0)
-    assert len(collected.demonstrations) == 5
-    assert collected.dropped[demonstrations.FAILED] > 0
+def test_a_bot_that_never_decides_is_a_failed_demonstration(monkeypatch):
+    """MiniGrid's bot goes from subgoal to subgoal for ever on one in six levels with locked doors."""
+
+    class Undecided(Subgoal):
+        def replan_before_action(self):
+            return None
+
+    def process(self, instruction):
+        self.stack.append(Undecided(self))
+
+    monkeypatch.setattr(FullViewBot, "_process_instr", process)
+    adapter, dropped = BabyAIAdapter(levels.find_level("GoToLocalS7N5")), Counter()
+    with pytest.raises(bot.Undecided):
+        adapter.reset(0)
+        FullViewBot(adapter.env).replan()
+    assert demonstrations.demonstrate(adapter, 0, dropped) is None
+    assert dropped == {demonstrations.FAILED: 1}
