@@ -459,7 +459,7 @@ def test_a_disk_that_fills_is_one_line_and_older_files_stay(workplace, capfd, ca
 
 
 def test_a_bot_that_never_decides_is_a_failed_demonstration(monkeypatch):
-    """MiniGrid's bot goes from subgoal to subgoal for ever on one level in six of UnlockToUnlock."""
+    """MiniGrid's bot goes from subgoal to subgoal for ever on one in six of UnlockToUnlock."""
 
     class Undecided(Subgoal):
         def replan_before_action(self):
