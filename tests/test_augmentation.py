@@ -21,6 +21,7 @@ from leapjax.domains.babyai.augmentation import (
     apply_symmetries,
     mark_needed_cells,
 )
+from leapjax.domains.babyai.augmentation.goals import hide_goal
 from leapjax.domains.babyai.augmentation.words import find_words
 from leapjax.domains.babyai.dynamics import FORWARD, LAVA, roll
 from tests.dynamics import FRONT, stepped
@@ -315,3 +316,22 @@ def test_lookalikes_share_kind_or_colour_with_a_target_that_is_named_but_never_b
         assert not alike.all(axis=1).any()
         shared += alike.sum(axis=0)
     assert (shared > 0).all() == shared.any() == named
+
+
+def test_goals_are_hidden_in_their_share_of_windows_and_in_all_states():
+    """Nothing else changes, and where a goal is shown nothing at all."""
+    window = window_at(steps_of(collected("GoToLocalS8N7")[:1]), jnp.int32(2), 3, 4, END)
+    keys = jax.random.split(jax.random.key(0), 400)
+    changed = jax.jit(jax.vmap(lambda key: hide_goal(key, window, 0.3)))(keys)
+    now, past = (np.asarray(part.goal) for part in (changed.context.observation,
+                                                    changed.context.past))  # fmt: skip
+    hidden = (now == -1).all(axis=1)
+    assert 0.2 < hidden.mean() < 0.4 and (past[hidden] == -1).all()
+    context = changed.context
+    shown = context._replace(
+        observation=context.observation._replace(goal=now[~hidden]),
+        past=context.past._replace(goal=past[~hidden]),
+    )
+    same(now[~hidden], np.broadcast_to(window.context.observation.goal, now[~hidden].shape))
+    for new, old in zip(jax.tree.leaves(shown), jax.tree.leaves(window.context), strict=True):
+        same(new, np.broadcast_to(old, new.shape))

@@ -15,6 +15,8 @@ class Settings:
         exchange_objects: With `augment`: also exchange keys, balls and boxes for each other.
         clutter: Largest probability, in 0 .. 1, that a free cell gets a random object. Cells that
             the demonstration needs stay free.
+        hidden_goals: Probability, in 0 .. 1, that a training window does not show its goal, so that
+            the network learns to find it from the instruction.
         channels: Features of each grid cell.
         rounds: Rounds of convolution over the grid.
         fields: Learned distance fields; 0 for convolutions alone.
@@ -29,6 +31,7 @@ class Settings:
     augment: bool = False
     exchange_objects: bool = False
     clutter: float = 0.0
+    hidden_goals: float = 0.0
     channels: int = 32
     rounds: int = 2
     fields: int = 8
@@ -44,6 +47,6 @@ class Settings:
         check_at_least(self, 0, "rounds", most=200)  # each round is compiled by itself
         check_at_least(self, 0, "fields", "word_heads", most=1000)
         check_at_least(self, 0, "radius", most=100)  # no level is larger
-        check_within(self, 0, 1, "clutter")
+        check_within(self, 0, 1, "clutter", "hidden_goals")
         if self.memory and not self.word_heads:
             raise ValueError("memory needs word_heads: cells learn from words what is done")

@@ -1,8 +1,8 @@
 """Augments windows of demonstrations, with a file for each kind of augmentation.
 
-The module `equivalents` applies symmetries of the world and of its language, and `clutter` adds
-objects. A window's `extras`, `[S, S]` bool, mark the cells that the rest of its demonstration needs
-free.
+The module `equivalents` applies symmetries of the world and of its language, `clutter` adds
+objects, and `goals` hides the goal. A window's `extras`, `[S, S]` bool, mark the cells that the
+rest of its demonstration needs free.
 """
 
 import numpy as np
@@ -11,6 +11,7 @@ from leapjax.domain import Augmentation
 from leapjax.domains.babyai import symmetries
 from leapjax.domains.babyai.augmentation.clutter import add_clutter
 from leapjax.domains.babyai.augmentation.equivalents import apply_symmetries
+from leapjax.domains.babyai.augmentation.goals import hide_goal
 from leapjax.domains.babyai.augmentation.words import find_words
 from leapjax.domains.babyai.settings import Settings
 from leapjax.types import Demonstration
@@ -19,6 +20,8 @@ from leapjax.types import Demonstration
 def choose_augmentations(settings: Settings) -> list[Augmentation]:
     """Returns the augmentations that the settings ask for; the last is applied first."""
     found: list[Augmentation] = []
+    if settings.hidden_goals:
+        found.append(lambda key, w: hide_goal(key, w, settings.hidden_goals))
     if settings.augment:
         found.append(
             lambda key, w: apply_symmetries(key, w, find_words(), settings.exchange_objects)
