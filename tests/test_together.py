@@ -87,6 +87,14 @@ def test_parts_take_turns_as_their_windows_are_many(by):
     assert max(gaps) <= 8  # at even distances
 
 
+def test_the_network_of_the_paper_reads_grids_of_one_side_only(two, capsys):
+    arguments = [*SINGLE, "--level", "Two", "--preset", "paper", "--demos", "2"]
+    assert babyai.main(arguments) == 2
+    assert "Two has no encoder for architecture 'paper'" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
 @only_long
 def test_a_planner_of_two_levels_plays_each(two):
     """It resumes as it would have gone on, and has a row for each level."""

@@ -46,7 +46,7 @@ def load_trained(run: Run) -> Pretrained:
 
 
 def _select_training_settings(specification: Specification) -> dict[str, Any]:
-    """Returns the settings that that a trained planner fixes: all but its search and `MEASURED`."""
+    """Returns the settings that a trained planner fixes: all but its search and `MEASURED`."""
 
     def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
         found: dict[str, Any] = {}

@@ -4,7 +4,13 @@ import functools
 
 import numpy as np
 
-from leapjax.domain import Augmentations, Demonstrations, Domain, DomainType
+from leapjax.domain import (
+    Augmentations,
+    Demonstrations,
+    Domain,
+    DomainType,
+    EncoderMaker,
+)
 from leapjax.domains.babyai import (
     augmentation,
     demonstrations,
@@ -48,13 +54,16 @@ def make(name: str, options: Settings) -> Domain:
         del sizes
         return ContextTokens(options, model.width, model.dtype)
 
+    encoders: dict[str, EncoderMaker] = {"leapjax": context_tokens}
+    if not level.members:  # the paper's network reads grids of one side
+        encoders["paper"] = state_tokens
     return Domain(
         level=level.name,
         make_adapter=lambda: BabyAIAdapter(level),
         actions=ACTIONS,
         max_steps=longest,
         blank=observations.blank(side, level.words),
-        encoders={"paper": state_tokens, "leapjax": context_tokens},
+        encoders=encoders,
         demonstrations=Demonstrations(
             functools.partial(demonstrations.collect, level),
             check=functools.partial(check_states, level=level),
