@@ -1,7 +1,7 @@
 """The noise of each method on BabyAI's validation levels: `python -m experiments.noise --help`.
 
-Trains a method, then plays with each temperature. The tables show a method with the temperature
-that succeeds most here, and choose the noise of all methods by this one rule.
+Trains a method, then plays with each temperature. One rule chooses the noise of every method: the
+temperature that succeeds most.
 """
 
 import sys

@@ -30,8 +30,6 @@ Statistics = tuple[tuple[tuple[float, ...], ...], ...]
 # Statistics of training data, kept in checkpoints: [array of an observation][column][number].
 Turn = Callable[..., Turned]  # (key, context, horizon=T) -> turned context
 Augmentation = Callable[[jax.Array, Window], Window]  # (key, window) -> changed window
-
-
 Split = Callable[[Sequence[Demonstration]], Sequence[Sequence[Demonstration]]]
 
 
@@ -262,15 +260,6 @@ def drop_files(settings: Any) -> Any:
     fields = [field.name for field in dataclasses.fields(settings)]
     paths = [name for name in fields if isinstance(getattr(settings, name), Path)]
     return dataclasses.replace(settings, **dict.fromkeys(paths))
-
-
-def split_demonstrations(
-    domain: Domain, demonstrations: Sequence[Demonstration]
-) -> Sequence[Sequence[Demonstration]]:
-    """Returns the parts of demonstrations, each of observations of one shape; `[]` if none."""
-    if not demonstrations:
-        return []
-    return domain.split(demonstrations) if domain.split else [demonstrations]
 
 
 def measure_statistics(domain: Domain, demonstrations: Sequence[Demonstration]) -> Statistics:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from leapjax import compilation, pretrained, sharding
 from leapjax.agents.base import TrainingConfig
+from leapjax.agents.batches import join_demonstrations
 from leapjax.agents.measured import measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
@@ -20,7 +21,6 @@ from leapjax.domain import (
     apply_statistics,
     find_signature,
     measure_statistics,
-    split_demonstrations,
 )
 from leapjax.domains import make_level
 from leapjax.errors import UserError
@@ -140,10 +140,7 @@ def fit(
     compilation.use_disk_cache()
     agent = pretrained.make_agent(specification, domain, mesh)
     begin, step = make_begin(agent, mesh), make_train_step(agent, mesh)
-    parts = [
-        windows.concatenate(part, domain.augmentations.extras, padded=True)
-        for part in split_demonstrations(domain, data)
-    ]
+    parts = join_demonstrations(domain, data)
 
     last: dict[str, float] = {}
 

@@ -80,6 +80,17 @@ def transition_batches(setup: Setup) -> Callable[[jax.Array, Steps], TransitionW
     return batch
 
 
+def join_demonstrations(domain: Domain, demonstrations: Sequence[Demonstration]) -> list[Steps]:
+    """Joins demonstrations into the parts that a domain splits them into; `[]` if there are none.
+
+    The arrays are padded, so that programs for one training seed serve most others.
+    """
+    if not demonstrations:
+        return []
+    parts = domain.split(demonstrations) if domain.split else [demonstrations]
+    return [windows.concatenate(part, domain.augmentations.extras, padded=True) for part in parts]
+
+
 def make_blank_steps(domain: Domain) -> Steps:
     """Makes one blank step of a domain, to compile training before there are data."""
     states = jax.tree.map(lambda x: np.stack([x, x]), domain.blank)

@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 import jax
 
 from leapjax import files, pretrained, processes, sharding, training
+from leapjax.agents.batches import join_demonstrations
 from leapjax.agents.measured import MEASURED, measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.checkpoints import Checkpoints
 from leapjax.data import windows
-from leapjax.domain import apply_statistics, measure_statistics, split_demonstrations
+from leapjax.domain import apply_statistics, measure_statistics
 from leapjax.pretrained import Pretrained
 from leapjax.running.data import check_data, judge_data
 from leapjax.running.metrics import Metrics, read_metrics, write_metrics
@@ -44,10 +45,7 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     processes.run_on_first(lambda: run.opened.enter_context(files.lock_folder(run.folder)))
     config, folder, console, total = run.config, run.folder, run.console, run.config.training.steps
     # In Atari these are all frames: the host keeps one copy until the devices have theirs.
-    parts = [
-        windows.concatenate(part, run.domain.augmentations.extras, padded=True)
-        for part in split_demonstrations(run.domain, data)
-    ]
+    parts = join_demonstrations(run.domain, data)
     named = windows.fingerprint([windows.unpadded(part) for part in parts])
     check_data(folder, named, [each.seed for each in data], judge_data(data, run.domain))
     agent, begin, step, plan = run.programs.take(run)

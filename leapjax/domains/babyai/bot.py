@@ -9,6 +9,7 @@ from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.envs.babyai.core.verifier import PutNextInstr
 from minigrid.utils.baby_ai_bot import BabyAIBot, DropSubgoal, GoNextToSubgoal, OpenSubgoal
 
+FOLLOW, MEASURE, DROP = "follow", "measure", "drop"  # what a path is searched for
 MOST_LOOKS = 200  # looks at its subgoals after which a bot without an action is stuck
 
 
@@ -42,8 +43,7 @@ class FullViewBot(BabyAIBot):
 
     def __init__(self, env: RoomGridLevel) -> None:
         self._opens_locked = False  # whether paths may lead through locked doors
-        self._measures = False  # whether a path is only measured, not followed
-        self._drops = False  # whether a path leads to a place where to drop something
+        self._purpose = FOLLOW  # of the paths that it searches for
         super().__init__(env)
         self.vis_mask[:] = True
 
@@ -90,19 +90,22 @@ class FullViewBot(BabyAIBot):
 
     def _find_obj_pos(self, obj_desc, adjacent=False):  # noqa: ANN001, ANN202
         """Finds the nearest match of a description, perhaps behind a locked door."""
-        self._measures = True
-        try:
+        with self._search_to(MEASURE):
             return super()._find_obj_pos(obj_desc, adjacent)
-        finally:
-            self._measures = False
 
     def _find_drop_pos(self, except_pos=None):  # noqa: ANN001, ANN202
         """Finds a place to drop an object, on this side of locked doors."""
-        self._drops = True
-        try:
+        with self._search_to(DROP):
             return super()._find_drop_pos(except_pos)
+
+    @contextlib.contextmanager
+    def _search_to(self, purpose: str) -> Iterator[None]:
+        """Searches for paths for another purpose than to follow them, for a while."""
+        self._purpose = purpose
+        try:
+            yield
         finally:
-            self._drops = False
+            self._purpose = FOLLOW
 
     def _shortest_path(self, accept_fn, try_with_blockers=False):  # noqa: ANN001, ANN202
         """Finds a path; only if there is none, a path through locked doors.
@@ -111,14 +114,14 @@ class FullViewBot(BabyAIBot):
             LockedOut: the path leads through a locked door, and the bot would follow it.
         """
         found = super()._shortest_path(accept_fn, try_with_blockers)
-        if found[0] is not None or self._drops:
+        if found[0] is not None or self._purpose == DROP:
             return found
         self._opens_locked = True
         try:
             path, finish, with_blockers = super()._shortest_path(accept_fn, try_with_blockers)
         finally:
             self._opens_locked = False
-        if path and not self._measures:
+        if path and self._purpose == FOLLOW:
             cells = (self.mission.unwrapped.grid.get(*place) for place in path[:-1])
             locked = (cell for cell in cells if isinstance(cell, Door) and cell.is_locked)
             if (door := next(locked, None)) is not None:

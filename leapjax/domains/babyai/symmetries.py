@@ -95,6 +95,11 @@ def reflect_actions(actions: jax.Array) -> jax.Array:
     return jnp.where(actions == LEFT, RIGHT, jnp.where(actions == RIGHT, LEFT, actions))
 
 
+def is_coloured(kinds: jax.Array) -> jax.Array:
+    """Returns whether object indices are of a door, key, ball or box, whose colour has a name."""
+    return (kinds >= FIRST_COLOURED) & (kinds <= LAST_COLOURED)
+
+
 class Renaming(NamedTuple):
     """Permutations of colours and kinds of objects, in the grid and in the language.
 
@@ -113,7 +118,7 @@ def rename(observation: Observation, renaming: Renaming) -> Observation:
     """Exchanges colours and kinds of objects in the grid, the hands and the instruction."""
     kinds, colours = observation.grid[..., 0], observation.grid[..., 1]
     # Only objects with a colour in the language change colour: walls stay grey.
-    coloured = (kinds >= FIRST_COLOURED) & (kinds <= LAST_COLOURED)
+    coloured = is_coloured(kinds)
     new_kinds = renaming.objects[kinds].astype(kinds.dtype)
     new_colours = renaming.colours[colours].astype(colours.dtype)
     grid = observation.grid.at[..., 0].set(new_kinds)

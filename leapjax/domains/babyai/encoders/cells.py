@@ -55,9 +55,8 @@ def find_things(observation: Observation) -> jax.Array:
     n is `MOST_THINGS`, or the number of cells if there are fewer.
     """
     kinds = jnp.asarray(observation.grid)[..., 0].reshape(-1)
-    named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
     cells = kinds.shape[0]
-    things = named | (kinds == symmetries.AGENT)
+    things = symmetries.is_coloured(kinds) | (kinds == symmetries.AGENT)
     return jnp.nonzero(things, size=min(MOST_THINGS, cells), fill_value=cells)[0]
 
 

@@ -27,8 +27,7 @@ def mark_faced(context: Context, turned: jax.Array) -> jax.Array:
     """
     poses = jnp.concatenate([context.past.pose, context.observation.pose[None]])
     recency = jnp.append(_measure_recency(context), 1.0)
-    kinds = turned[..., 0]
-    named = (kinds >= symmetries.FIRST_COLOURED) & (kinds <= symmetries.LAST_COLOURED)
+    named = symmetries.is_coloured(turned[..., 0])
     latest = _mark_fronts(context, poses, recency, turned.shape[0]) * named
     return jnp.stack([latest > 0, latest], axis=-1)
 
