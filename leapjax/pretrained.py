@@ -1,5 +1,6 @@
 """Trained planners on disk: `leapjax.load` reads them, and every run writes its own."""
 
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -328,13 +329,16 @@ def parse_specification(folder: Path) -> Specification:
 def find_published(name: str) -> Path:
     """Finds the folder of a planner that comes with the library.
 
+    Of a family of levels, a planner plays every level: `BabyAI` plays `BabyAI-GoTo-v0`.
+
     Raises:
-        UserError: no published planner has this name.
+        UserError: no published planner plays this level.
     """
     names = sorted(path.name for path in PUBLISHED.glob("*") if path.is_dir())
-    if name not in names:
-        raise UserError(f"no planner is published for {name!r}: only for {', '.join(names)}")
-    return PUBLISHED / name
+    for known in (name, name.partition("-")[0]):
+        if known in names:
+            return PUBLISHED / known
+    raise UserError(f"no planner is published for {name!r}: only for {', '.join(names)}")
 
 
 def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
@@ -354,15 +358,23 @@ def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
     save_specification(target, planner.specification)
 
 
-def find_folder(path: str | os.PathLike[str]) -> Path:
-    """Finds the folder of a run or, if it does not exist, of a level's published planner.
+def find_folder(path: str | os.PathLike[str], level: str | None = None) -> tuple[Path, str | None]:
+    """Finds the folder of a run or, if it does not exist, of a published planner.
+
+    Returns:
+        The folder, and the level to plan for: the given one, or `path` if it is the level of a
+        family; `None` for the level of training.
 
     Raises:
         UserError: the system cannot look up the path.
     """
     folder = check_path(path)
-    published = not folder.exists() and (PUBLISHED / folder).is_dir()
-    return PUBLISHED / folder if published else folder
+    if folder.exists():
+        return folder, level
+    with contextlib.suppress(UserError):  # then it is no checkpoint either
+        published = find_published(str(path))
+        return published, level or (None if published.name == str(path) else str(path))
+    return folder, level
 
 
 def ask_for_return(specification: Specification, target_return: float) -> Specification:
@@ -429,7 +441,7 @@ def load(
 
     Args:
         path: folder that a run printed. If it does not exist: the name of a level, for the
-            published planner that was trained on this level with seed 0 (README, "Results").
+            published planner of this level, or of its family (see `find_published`).
         planner: search settings with the same horizon; `None` for the settings of the run.
         chunk_sizes: see `leapjax.compile_planner`.
         level: level to plan for; `None` for the level of training. The network must fit both. If
@@ -446,7 +458,7 @@ def load(
         raise UserError(f"planner must be a configuration such as GibbsConfig, got {planner!r}")
     if not isinstance(level, str | None):
         raise UserError(f"level must be a text, got {level!r}")
-    folder = find_folder(path)
+    folder, level = find_folder(path, level)
     specification, saved = _read_sealed(folder)
     whose = describe_identity(specification)
     if target_return is not None:

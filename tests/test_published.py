@@ -128,6 +128,21 @@ def test_the_command_line_plays_published_planners(published, tmp_path, capsys):
         assert said in capsys.readouterr().err
 
 
+def test_the_planner_of_a_family_plays_each_of_its_levels(published, tmp_path):
+    (tmp_path / "published" / "GoToLocalS7N5").rename(tmp_path / "published" / "BabyAI")
+    level = "BabyAI-GoToObj-v0"
+    assert leap.load(level).domain.level == level
+    assert leap.load(level, level="GoToLocalS7N5").domain.level == "GoToLocalS7N5"
+    options = ["--pretrained", "--episodes", "2", "--no-pictures"]
+    assert babyai.main(["--level", level, *options]) == 0
+    (row,) = results.read(tmp_path / "runs" / "babyai.jsonl")
+    assert (row["level"], row["played"]) == ("GoToLocalS7N5", level)
+    assert row["paper_success"] is None  # it is of another level
+    for name in ("BabyAI-GoToObjj-v0", "Other-GoToObj-v0"):
+        with pytest.raises(UserError):
+            leap.load(name)
+
+
 LEVELS = {
     path.name: pretrained.read_specification(path).domain
     for path in sorted(pretrained.PUBLISHED.iterdir())

@@ -71,8 +71,11 @@ def parse(
             folder = pretrained.find_published(level)
             trained = pretrained.read_specification(folder)
         for method in methods or [trained.method if trained else Config.method]:
-            default = make_default(kind, domain, level, method, choice, data, trained)
-            default = dataclasses.replace(default, checkpoint=folder)
+            # The published planner of a family of levels was trained on all of them.
+            learned = trained.level if trained and choice.pretrained else level
+            default = make_default(kind, domain, learned, method, choice, data, trained)
+            play = default.play if learned == level else level
+            default = dataclasses.replace(default, checkpoint=folder, play=play)
             # Methods have different options: usage lines name the method.
             shown = f"{module} --method {method}" if methods else module
             config = override(default, others, shown)

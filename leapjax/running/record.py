@@ -49,7 +49,8 @@ def record(
 
 def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
     """Makes the JSON row of a finished run."""
-    config, paper, lengths = run.config, run.experiment.paper, episodes.lengths
+    config, lengths = run.config, episodes.lengths
+    paper = run.experiment.paper if config.play is None else None  # planners play their own level
     return {
         "experiment": run.experiment.name,
         "domain": config.domain,
