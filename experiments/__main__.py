@@ -12,8 +12,8 @@ from leapjax.running import shell, startup
 # In the order of `--help`, which shows the first line of each program's docstring.
 PROGRAMS = (
     "babyai", "atari", "gymnasium", "stars", "sudoku", "countdown", "satisfiability", "properties",
-    "stochastic", "suboptimal", "ablation", "noise", "atari_energy", "landscape", "qualitative",
-    "accuracy", "failures",
+    "stochastic", "suboptimal", "ablation", "noise", "demonstrator", "atari_energy", "landscape",
+    "qualitative", "accuracy", "failures",
 )  # fmt: skip
 
 

@@ -109,6 +109,10 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
         ),
         "iterations": (babyai.compare_iterations, "babyai"),
         "methods": (babyai.compare_methods, "babyai"),
+        "every-level": (
+            functools.partial(babyai.list_levels, demonstrated=rows["demonstrator"]),
+            "babyai",
+        ),
         "price": (functools.partial(babyai.compare_prices, measured=rows["methods"]), "babyai"),
         "search-pays": (puzzles.compare_searches, "puzzles"),
         "arms": (puzzles.compare_arms, "puzzles"),

@@ -95,6 +95,27 @@ def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 
 
+def level_row(play, rate):
+    """The row of a level that the planner of all levels played."""
+    found = row("BabyAI", rate=rate, played=True, play=play)
+    return found | {"played": play, "mean_success_length": 7.5 if rate else None}
+
+
+def test_levels_that_were_not_learned_come_first_then_those_that_fail():
+    unknown, hard, easy = "BabyAI-PickupDist-v0", "BabyAI-Unlock-v0", "BabyAI-GoTo-v0"
+    rows = [level_row(easy, 1.0), level_row(hard, 0.0), level_row(unknown, 0.5)]
+    bot = {"episodes": 200, "successes": 190, "mean_success_length": 5.0}
+    lines = babyai.list_levels(rows, dict.fromkeys((unknown, hard, easy), bot)).splitlines()[2:]
+    found = [[cell.strip().split(" [")[0] for cell in line.split("|")[1:-1]] for line in lines]
+    assert found == [
+        ["PickupDist (not learned)", "50.0%", "7.5", "95.0%", "5.0"],
+        ["Unlock", "0.0%", "-", "95.0%", "5.0"],
+        ["GoTo", "100.0%", "7.5", "95.0%", "5.0"],
+    ]
+    other = row("BabyAI", played=True, play=easy, validation=True) | {"played": easy}
+    assert [report.is_used(each) for each in (*rows, other)] == [True] * 3 + [False]
+
+
 def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
     """A row of a level whose plans are executed whole."""
     domain = "stars" if level.startswith("Star") else "sudoku"

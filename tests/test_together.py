@@ -1,15 +1,17 @@
 """One planner of many BabyAI levels: levels with members, and training on parts of the data."""
 
 import itertools
+import json
+from collections import Counter
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from experiments import babyai
+from experiments import babyai, demonstrator
 from leapjax import load, plan_keys, rollouts
-from leapjax.data import windows
+from leapjax.data import seeds, windows
 from leapjax.domains.babyai import demonstrations, levels
 from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.domains.babyai.augmentation import mark_needed_cells
@@ -68,6 +70,21 @@ def test_parts_have_one_shape_and_lose_only_padding():
             assert grid.sum() == whole.observations.grid.sum()
             assert said.sum() == whole.observations.instruction.sum()
         windows.concatenate(part, mark_needed_cells)  # of one shape
+
+
+def test_the_demonstrator_plays_each_level(two, capsys):
+    """Its steps are those of demonstrations; a level that it cannot solve is one, too."""
+    played = [SMALL, "BabyAI-KeyInBox-v0"]
+    assert demonstrator.main(["--level", *played, "--episodes", "3"]) == 0
+    solved, failed = json.loads(Path("runs/demonstrator.json").read_text()).values()
+    adapter = BabyAIAdapter(levels.find_level(SMALL))
+    played = seeds.test_seeds(seeds.UNSEEN, 3)
+    found = [demonstrations.demonstrate(adapter, seed, Counter()) for seed in played]
+    steps = [len(each.actions) for each in found]
+    assert solved == {"episodes": 3, "successes": 3, "mean_success_length": np.mean(steps)}
+    assert failed == {"episodes": 3, "successes": 0, "mean_success_length": None}
+    assert demonstrator.main(["--level", "BabyAI-KeyInBoxx-v0"]) == 2
+    assert "unknown level" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("by", ["step", "episode"])

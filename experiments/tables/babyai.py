@@ -1,6 +1,7 @@
 """The BabyAI tables: every setting of LEAP, and every method."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from experiments.tables.cells import (
 )
 from experiments.tables.settings import Setting, select
 from leapjax import scores
-from leapjax.domains.babyai.levels import LEVELS
+from leapjax.domains.babyai.levels import HELD_OUT, LEVELS, MIXTURES
 from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
@@ -58,6 +59,11 @@ BY_ITERATIONS = {
     for title, setting in ITERATED.items()
     for n in ITERATIONS
 }
+# The planner of all levels: what it plays, by level.
+EVERY = {
+    name: Setting("leapjax", changes={"play": name})
+    for name in (*MIXTURES["BabyAI"].members, *HELD_OUT)
+}
 USED = (
     *SETTINGS.values(),
     *BY_ITERATIONS.values(),
@@ -67,6 +73,8 @@ USED = (
 
 def is_used(row: Row) -> bool:
     """Tells whether a row is in a table or a figure."""
+    if row["level"] in MIXTURES:
+        return row["played"] in EVERY and EVERY[row["played"]].has(row)
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
@@ -93,6 +101,35 @@ def compare_settings(rows: Sequence[Row], settings: Mapping[str, Setting]) -> st
     cells = ["-" if each is None else format_with_interval(*each) for each in middles]
     lines.append(["interquartile mean", f"{compute_paper_middle():.1f}%", *cells])
     return make_table(" | ".join(["level", "published", *settings]), lines)
+
+
+def list_levels(rows: Sequence[Row], demonstrated: Mapping[str, Mapping[str, Any]]) -> str:
+    """Tabulates success and steps of the planner of all levels, beside the demonstrating bot's.
+
+    Levels that were never learned come first, then those that fail most.
+
+    Args:
+        rows: rows of BabyAI.
+        demonstrated: results of `experiments.demonstrator` by level.
+    """
+    found = {name: of for (_, name), of in select(rows, ["BabyAI"], EVERY).items() if of}
+
+    def order(name: str) -> tuple[bool, float]:
+        return name not in HELD_OUT, compute_mean_rate(found[name])
+
+    lines = []
+    for name in sorted(found, key=order):
+        solved = [row for row in found[name] if row["successes"]]
+        steps = sum(row["successes"] * row["mean_success_length"] for row in solved)
+        bot, short = demonstrated[name], name.removeprefix("BabyAI-").removesuffix("-v0")
+        lines.append([
+            f"{short} (not learned)" if name in HELD_OUT else short,
+            format_with_interval(compute_mean_rate(found[name]), *compute_interval(found[name])),
+            f"{steps / sum(row['successes'] for row in solved):.1f}" if solved else "-",
+            f"{bot['successes'] / bot['episodes']:.1%}",
+            f"{bot['mean_success_length']:.1f}",
+        ])  # fmt: skip
+    return make_table("level | success | steps | the bot's success | the bot's steps", lines)
 
 
 def compute_aggregates(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:

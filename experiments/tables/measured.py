@@ -15,6 +15,7 @@ from leapjax.running.schema import (
     Absent,
     Each,
     Named,
+    Nullable,
     Number,
     OneOf,
     Schema,
@@ -52,12 +53,14 @@ ENERGIES = {
     "energies": Each(float, least=2), "returns": Each(float, least=2),
     "correlation": Number(-1, 1), "p_value": Number(0, 1),
 }  # fmt: skip
+DEMONSTRATOR = {"episodes": SEVERAL, "successes": COUNT, "mean_success_length": Nullable(AMOUNT)}
 GAMES = Each({"score": float, "noise": Number(0, 1), "transitions": COUNT}, least=1)
 MEASURED: dict[str, Schema] = {
     "planning": Each(PLANNING),
     "training": Each(TRAINING),
     "quality": Each(QUALITY),
     "methods": Each({"level": str, "method": str, "plans_per_second": POSITIVE}),
+    "demonstrator": Named(DEMONSTRATOR),
     "landscape": Each(LANDSCAPE, least=1),
     "atari-data": Named(GAMES),
     "atari-energy": Named(ENERGIES, least=1),
