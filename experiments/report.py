@@ -19,7 +19,13 @@ from leapjax.files import read_text, write_text
 from leapjax.running import results, shell, startup
 from leapjax.running.results import Row
 
-DOCUMENTS = ("README.md", "docs/performance.md", "docs/reproduction.md", "docs/search.md")
+DOCUMENTS = (
+    "README.md",
+    "docs/levels.md",
+    "docs/performance.md",
+    "docs/reproduction.md",
+    "docs/search.md",
+)
 PUZZLES = ("stars", "sudoku", "satisfiability")  # experiments, named as their domains
 EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
