@@ -74,7 +74,7 @@ USED = (
 def is_used(row: Row) -> bool:
     """Tells whether a row is in a table or a figure."""
     if row["level"] in MIXTURES:
-        return row["played"] in EVERY and EVERY[row["played"]].has(row)
+        return EVERY.get(row["played"], OURS).has(row)  # all in turn, or one of them
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 
