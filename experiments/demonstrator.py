@@ -36,7 +36,7 @@ class Options:
         runs: Folder for a result that is not recorded.
     """
 
-    level: tuple[str, ...] = (*MIXTURES["BabyAI"].members, *HELD_OUT)
+    level: tuple[str, ...] = ()
     episodes: int = 200
     record: bool = False
     runs: Path = Path("runs")
@@ -53,7 +53,8 @@ def play_all(options: Options) -> None:
     """Plays the levels, writes the file after each, and prints a table."""
     check_counts(options, "episodes")
     played = seeds.test_seeds(seeds.UNSEEN, options.episodes)
-    levels = [find_level(name) for name in options.level]
+    names = options.level or (*MIXTURES["BabyAI"].members, *HELD_OUT)
+    levels = [find_level(name) for name in names]
     path = results.choose_folder(options.record, options.runs) / RESULTS
     console = Console(markup=False)
     table = Table("level", "solved", "steps")
