@@ -361,6 +361,10 @@ def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
 def find_folder(path: str | os.PathLike[str], level: str | None = None) -> tuple[Path, str | None]:
     """Finds the folder of a run or, if it does not exist, of a published planner.
 
+    Args:
+        path: folder, or name of a published planner or of a level of its family.
+        level: level to plan for, if the caller names one.
+
     Returns:
         The folder, and the level to plan for: the given one, or `path` if it is the level of a
         family; `None` for the level of training.
