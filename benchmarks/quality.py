@@ -70,7 +70,7 @@ def run(options: Options) -> None:
     if options.plot is not None:
         plots.check_figure(options.plot)
     check_writable(options.json)
-    folders = [pretrained.find_folder(path)[0] for path in options.runs]
+    folders = [pretrained.find_folder(path) for path in options.runs]
     searches = {}
     for folder in folders:
         specification = pretrained.read_specification(folder)

@@ -10,20 +10,14 @@ from collections.abc import Sequence
 from experiments.babyai_animation import animate
 from experiments.paper import find_success
 from leapjax.configuration import AnyConfig, change
-from leapjax.domains.babyai.levels import HELD_OUT, find_level
+from leapjax.domains.babyai.levels import find_level, list_played
 from leapjax.running import main as running
 from leapjax.running.run import Experiment
 
 
 def play_members(config: AnyConfig) -> list[AnyConfig]:
-    """Returns a configuration for each level that a planner of many levels plays.
-
-    These are the levels that it learned, and those that are held out. A planner of one level plays
-    no other.
-    """
-    members = find_level(config.level).members
-    played = (*members, *HELD_OUT) if members else ()
-    return [change(config, play=name) for name in played]
+    """Returns a configuration for each level that a planner of many levels plays."""
+    return [change(config, play=name) for name in list_played(find_level(config.level))]
 
 
 EXPERIMENT = Experiment(

@@ -17,7 +17,7 @@ from rich.table import Table
 from leapjax.data import seeds
 from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.domains.babyai.demonstrations import FAILED, demonstrate
-from leapjax.domains.babyai.levels import HELD_OUT, MIXTURES, Level, find_level
+from leapjax.domains.babyai.levels import Level, find_level, list_played
 from leapjax.environments import closing
 from leapjax.running import results, shell
 from leapjax.running.limits import check_counts
@@ -53,7 +53,7 @@ def play_all(options: Options) -> None:
     """Plays the levels, writes the file after each, and prints a table."""
     check_counts(options, "episodes")
     played = seeds.test_seeds(seeds.UNSEEN, options.episodes)
-    names = options.level or (*MIXTURES["BabyAI"].members, *HELD_OUT)
+    names = options.level or list_played(find_level("BabyAI"))
     levels = [find_level(name) for name in names]
     path = results.choose_folder(options.record, options.runs) / RESULTS
     console = Console(markup=False)

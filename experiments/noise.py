@@ -7,7 +7,8 @@ temperature that succeeds most.
 import sys
 from collections.abc import Sequence
 
-from leapjax.configuration import AnyConfig, change
+from experiments.common.searches import change_planner
+from leapjax.configuration import AnyConfig
 from leapjax.planners import BeamConfig
 from leapjax.running import main as running
 from leapjax.running import shell
@@ -28,8 +29,7 @@ def try_temperatures(config: AnyConfig) -> list[AnyConfig]:
         | ({"beams": 1} if temperature and isinstance(config.planner, BeamConfig) else {})
         for temperature in TEMPERATURES
     ]
-    found = [change(config, planner=planner) for planner in planners]
-    return [each for each in found if each.planner != config.planner]
+    return change_planner(config, planners)
 
 
 EXPERIMENT = Experiment("noise", "babyai", searches=try_temperatures)

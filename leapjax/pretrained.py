@@ -358,27 +358,17 @@ def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> N
     save_specification(target, planner.specification)
 
 
-def find_folder(path: str | os.PathLike[str], level: str | None = None) -> tuple[Path, str | None]:
-    """Finds the folder of a run or, if it does not exist, of a published planner.
-
-    Args:
-        path: folder, or name of a published planner or of a level of its family.
-        level: level to plan for, if the caller names one.
-
-    Returns:
-        The folder, and the level to plan for: the given one, or `path` if it is the level of a
-        family; `None` for the level of training.
+def find_folder(path: str | os.PathLike[str]) -> Path:
+    """Finds the folder of a run or, if it does not exist, of a level's published planner.
 
     Raises:
         UserError: the system cannot look up the path.
     """
     folder = check_path(path)
-    if folder.exists():
-        return folder, level
-    with contextlib.suppress(UserError):  # then it is no checkpoint either
-        published = find_published(str(path))
-        return published, level or (None if published.name == str(path) else str(path))
-    return folder, level
+    if not folder.exists():
+        with contextlib.suppress(UserError):  # then it is no level of a published planner either
+            return find_published(str(path))
+    return folder
 
 
 def ask_for_return(specification: Specification, target_return: float) -> Specification:
@@ -462,7 +452,9 @@ def load(
         raise UserError(f"planner must be a configuration such as GibbsConfig, got {planner!r}")
     if not isinstance(level, str | None):
         raise UserError(f"level must be a text, got {level!r}")
-    folder, level = find_folder(path, level)
+    folder = find_folder(path)
+    if level is None and folder != check_path(path):
+        level = str(path)  # the name of a published planner's level
     specification, saved = _read_sealed(folder)
     whose = describe_identity(specification)
     if target_return is not None:

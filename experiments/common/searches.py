@@ -1,7 +1,7 @@
 """The ways to search with one trained energy, for plans that are executed whole."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from leapjax.configuration import AnyConfig, change, make_domain
@@ -65,5 +65,10 @@ def list_searches(config: AnyConfig) -> list[AnyConfig]:
         every = tuple(search for search in every if search.options != TURNED)
     if config.method == "classifier":  # scores only complete plans
         every = tuple(search for search in every if "fill" not in search.options)
-    found = [change(config, planner=search.of(config.planner.horizon)) for search in every]
+    return change_planner(config, [search.of(config.planner.horizon) for search in every])
+
+
+def change_planner(config: AnyConfig, planners: Iterable[Mapping[str, Any]]) -> list[AnyConfig]:
+    """Returns a configuration for each change of the planner's fields, without the given one."""
+    found = [change(config, planner=planner) for planner in planners]
     return [each for each in found if each.planner != config.planner]

@@ -17,7 +17,7 @@ from experiments.tables.cells import (
 )
 from experiments.tables.settings import Setting, select
 from leapjax import scores
-from leapjax.domains.babyai.levels import HELD_OUT, LEVELS, MIXTURES
+from leapjax.domains.babyai.levels import HELD_OUT, LEVELS, MIXTURES, find_level, list_played
 from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
@@ -61,8 +61,7 @@ BY_ITERATIONS = {
 }
 # The planner of all levels: what it plays, by level.
 EVERY = {
-    name: Setting("leapjax", changes={"play": name})
-    for name in (*MIXTURES["BabyAI"].members, *HELD_OUT)
+    name: Setting("leapjax", changes={"play": name}) for name in list_played(find_level("BabyAI"))
 }
 USED = (
     *SETTINGS.values(),

@@ -67,14 +67,14 @@ def parse(
     trained = None if folder is None else pretrained.read_specification(folder)
     configs = []
     for level in choose_levels(domain, choice, data, trained):
+        learned = level
         if choice.pretrained:
             folder = pretrained.find_published(level)
             trained = pretrained.read_specification(folder)
+            learned = trained.level  # of a family: all of its levels
         for method in methods or [trained.method if trained else Config.method]:
-            # The published planner of a family of levels was trained on all of them.
-            learned = trained.level if trained and choice.pretrained else level
             default = make_default(kind, domain, learned, method, choice, data, trained)
-            play = default.play if learned == level else level
+            play = None if learned == level else level
             default = dataclasses.replace(default, checkpoint=folder, play=play)
             # Methods have different options: usage lines name the method.
             shown = f"{module} --method {method}" if methods else module

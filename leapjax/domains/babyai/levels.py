@@ -167,6 +167,14 @@ MIXTURES = {
 }
 
 
+def list_played(level: Level) -> tuple[str, ...]:
+    """Lists the levels that a planner of many levels plays: those it learned and those held out.
+
+    The list is empty for a level without members.
+    """
+    return (*level.members, *HELD_OUT) if level.members else ()
+
+
 def find_level(name: str) -> Level:
     """Finds a level by name or id.
 
