@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from leapjax.domains.babyai import symmetries
 from leapjax.domains.babyai.encoders import cells, convolutions, distances, instructions, memory
 from leapjax.domains.babyai.encoders.context_tokens import ContextTokens
 from leapjax.domains.babyai.observations import Observation
@@ -211,12 +212,14 @@ def test_padding_of_grid_and_instruction_changes_no_token(recall):
 
 def test_the_agent_recalls_deeds_and_the_sides_of_its_first_pose():
     """It stood at (2, 3) facing down, picked up, went on, and now faces up at (2, 4)."""
+    grid, nowhere = jnp.zeros((6, 6, 3), jnp.int32), np.int32([-1, -1])
+    observation = Observation(grid, np.int32([2, 4, 3]), np.int32([5, 1]), nowhere, None)
     context = Context(
-        Observation(np.zeros((6, 6, 3)), np.int32([2, 4, 3]), np.int32([5, 1]), None, None),
+        observation,
         Observation(None, np.int32([[0, 0, 0], [2, 3, 1], [2, 3, 1]]), None, None, None),
         np.int32([pad_token(7), 3, 2]), np.zeros(3), np.int32(2), np.float32(0),
     )  # fmt: skip
-    seen = np.asarray(memory.recall(context, 6))
+    seen = np.asarray(memory.recall(context, symmetries.rotate(observation, 3)))
     # Now the grid is turned by three quarters: (x, y) is at (5 - y, x).
     deeds = np.zeros((6, 6, 3))
     deeds[1, 2, 0] = 2 / 4
@@ -227,6 +230,20 @@ def test_the_agent_recalls_deeds_and_the_sides_of_its_first_pose():
     held = seen[1, 2, 5:]
     assert held.sum() == 2 and held[5] == held[11 + 1] == 1
     assert np.abs(seen[..., 5:]).sum() == 2
+
+
+@pytest.mark.parametrize("carried", [[0, 0], [5, 2], [5, 3]])
+def test_things_match_locked_doors_of_their_colour(carried):
+    """Of the colours 2 and 4 there are locked doors; of 3 there is only a closed one."""
+    grid = np.zeros((6, 6, 3), np.int32)
+    grid[0, 1], grid[0, 2], grid[0, 3] = (4, 2, 2), (4, 4, 2), (4, 3, 1)  # locked, locked, closed
+    grid[2, 1], grid[2, 2], grid[2, 3] = (5, 2, 0), (6, 4, 0), (5, 3, 0)  # key, ball, key
+    grid[4, 1] = (2, 2, 2)  # a wall has no colour with a name
+    observation = Observation(grid, np.int32([3, 3, 0]), np.int32(carried), None, None)
+    expected = np.zeros((6, 6))
+    expected[0, 1] = expected[0, 2] = expected[2, 1] = expected[2, 2] = 1
+    expected[3, 3] = carried == [5, 2]
+    np.testing.assert_array_equal(memory.mark_matches(observation)[..., 0], expected)
 
 
 def test_things_are_doors_keys_balls_boxes_and_the_agent():

@@ -75,10 +75,7 @@ def _together(level: Level, method: str) -> AnyConfig:
         episodes=200,  # of each level, too
         context=64,  # past steps that show what was done
         model=common.our_model(method),
-        # Windows of each level are equally many: short tasks are not easier.
-        training=common.our_training(
-            method, steps=_steps(level), learning_rate=1.5e-3, windows="episode"
-        ),
+        training=common.our_training(method, steps=_steps(level), learning_rate=1.5e-3),
         planner=_our_search(level, method),
         method_settings=common.settings(method, masking="random"),
         domain_settings=Settings(

@@ -59,7 +59,8 @@ class ContextTokens(Encoder):
             cells += nn.Dense(c.channels, use_bias=False, name="faced")(faced)
         inside = (observation.grid[..., :1] != OUTSIDE).astype(cells.dtype)
         if c.memory:
-            cells += nn.Dense(c.channels, use_bias=False, name="deeds")(recall(context, side))
+            recalled = recall(context, observation)
+            cells += nn.Dense(c.channels, use_bias=False, name="deeds")(recalled)
             places = find_things(observation)
             things = cells.reshape(side * side, -1).at[places].get(mode="fill", fill_value=0)
             review = InstructionReview(c.word_heads, name="review")

@@ -6,12 +6,16 @@ recognise a demonstration by them. All grids are turned so that the agent faces 
 
 import jax
 import jax.numpy as jnp
+from minigrid.core.constants import OBJECT_TO_IDX, STATE_TO_IDX
 
 from leapjax.domains.babyai import symmetries
 from leapjax.domains.babyai.adapter import ACTIONS, NUM_ACTIONS
 from leapjax.domains.babyai.encoders.cells import COLOURS, OBJECTS, mark_cell
+from leapjax.domains.babyai.observations import Observation
 from leapjax.types import Context, pad_token
 
+DOOR = OBJECT_TO_IDX["door"]
+LOCKED = STATE_TO_IDX["locked"]
 DEEDS = tuple(ACTIONS.index(name) for name in ("pickup", "drop", "toggle"))
 
 
@@ -32,21 +36,23 @@ def mark_faced(context: Context, turned: jax.Array) -> jax.Array:
     return jnp.stack([latest > 0, latest], axis=-1)
 
 
-def recall(context: Context, side: int) -> jax.Array:
-    """Joins what cells show of the past: deeds, sides, and the carried object on the agent's cell.
+def recall(context: Context, turned: Observation) -> jax.Array:
+    """Joins what cells show of the past: deeds, sides, what opens locked doors, the carried object.
 
     Args:
         context: context with K past steps.
-        side: S.
+        turned: current observation, turned so that the agent faces right.
 
     Returns:
-        Features `[S, S, 22]`.
+        Features `[S, S, 23]`.
     """
-    pose = symmetries.rotate_pose(context.observation.pose, context.observation.pose[2], side)
-    kind, colour = context.observation.carried
+    side = turned.grid.shape[0]
+    kind, colour = turned.carried
     held = jnp.append(jax.nn.one_hot(kind, OBJECTS), jax.nn.one_hot(colour, COLOURS)) * (kind > 0)
-    marks = mark_cell(pose[:2], side)[..., None] * held
-    return jnp.concatenate([mark_deeds(context, side), mark_sides(context, side), marks], axis=-1)
+    marks = mark_cell(turned.pose[:2], side)[..., None] * held
+    return jnp.concatenate(
+        [mark_deeds(context, side), mark_sides(context, side), marks, mark_matches(turned)], axis=-1
+    )
 
 
 def mark_deeds(context: Context, side: int) -> jax.Array:
@@ -85,6 +91,24 @@ def mark_sides(context: Context, side: int) -> jax.Array:
     front = across * ahead[0] + along * ahead[1]
     right = along * ahead[0] - across * ahead[1]
     return jnp.sign(jnp.stack([front, right], axis=-1)).astype(jnp.float32)
+
+
+def mark_matches(observation: Observation) -> jax.Array:
+    """Marks doors and objects of the colour of a locked door: `[S, S, 1]`.
+
+    It marks the agent if it carries one. "Open the door" does not name the colour of the key.
+
+    Args:
+        observation: current observation.
+    """
+    kinds, colours, states = jnp.moveaxis(jnp.asarray(observation.grid), -1, 0)
+    locked = (kinds == DOOR) & (states == LOCKED)
+    coloured = jax.nn.one_hot(colours, COLOURS)
+    wanted = (coloured * locked[..., None]).max(axis=(0, 1))
+    kind, colour = observation.carried
+    there = (coloured @ wanted) * symmetries.is_coloured(kinds)
+    held = mark_cell(observation.pose[:2], kinds.shape[0]) * wanted[colour] * (kind > 0)
+    return (there + held)[..., None]
 
 
 def _measure_recency(context: Context) -> jax.Array:
