@@ -275,8 +275,9 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     assert (tmp_path / "plot.png").stat().st_size > 1000
 
 
-def test_noise_is_tried_on_validation_levels_at_every_temperature(workplace, tmp_path):
+def test_noise_is_tried_on_validation_levels_at_every_temperature(workplace, tmp_path, monkeypatch):
     """PlaTe draws one beam at a temperature."""
+    monkeypatch.setattr(noise, "TEMPERATURES", (0.0, 0.5))  # a program is compiled for each
     folder = str(tmp_path)
     arguments = [*TOY_RUN, *"--method leap --level GoToLocalS7N5 --steps 0 --episodes 2".split()]
     assert noise.main([*arguments, "--runs", folder]) == 0

@@ -13,6 +13,7 @@ import pytest
 
 from leapjax import extras
 from leapjax.errors import UserError
+from tests.programs import only_long
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -97,10 +98,15 @@ def run(arguments, environment):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "code", [PLANNING, "import sys\nimport leapjax\nleapjax.load('GoToLocalS7N5')\n"
-             "assert 'orbax' not in sys.modules"],
-)  # fmt: skip
+LOADING = """
+import sys
+import leapjax
+leapjax.load("GoToLocalS7N5")
+assert "orbax" not in sys.modules
+"""
+
+
+@pytest.mark.parametrize("code", [pytest.param(PLANNING, marks=only_long), LOADING])
 def test_what_is_not_needed_is_not_loaded_although_it_is_installed(code):
     ended = run(["-c", code], {})
     assert ended.returncode == 0, ended.stderr

@@ -273,7 +273,7 @@ def test_a_target_return_is_a_high_one_of_the_data(tmp_path, monkeypatch, capsys
     """Unless one is given; a checkpoint is played with the target of its data."""
     monkeypatch.chdir(tmp_path)
     name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 2)
-    options = [*SMALL, "--dataset", name, "--method", "dt", "--steps", "1"]
+    options = [*SMALL, "--dataset", name, "--method", "dt", "--steps", "0"]
     assert program.main(options) == 0
     assert "target return: 1, from the demonstrations" in " ".join(capsys.readouterr().out.split())
     (folder,) = (tmp_path / "runs").glob("gymnasium-*")

@@ -24,14 +24,15 @@ from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
 from leapjax.running.metrics import read_metrics
 from leapjax.running.progress import Meter
 from leapjax.types import TrainState
-from tests.programs import LONG, RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
+from tests.programs import RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
 
+@only_long
 def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
     rng = np.random.default_rng(0)
-    for _ in range(10 if LONG else 1):
+    for _ in range(10):
         before = max(place.steps_saved("killed"), default=0)
         run = place.start("killed")
         place.wait_for_checkpoint(run, "killed", before if before < STEPS // 2 else 0)
