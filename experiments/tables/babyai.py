@@ -126,7 +126,7 @@ def list_levels(rows: Sequence[Row], demonstrated: Mapping[str, Mapping[str, Any
             format_with_interval(compute_mean_rate(found[name]), *compute_interval(found[name])),
             f"{steps / sum(row['successes'] for row in solved):.1f}" if solved else "-",
             f"{bot['successes'] / bot['episodes']:.1%}",
-            f"{bot['mean_success_length']:.1f}",
+            f"{bot['mean_success_length']:.1f}" if bot["successes"] else "-",
         ])  # fmt: skip
     return make_table("level | success | steps | the bot's success | the bot's steps", lines)
 
