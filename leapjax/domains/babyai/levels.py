@@ -138,9 +138,9 @@ MODIFIED = {
 }
 
 
-# Levels that the planner of many levels (experiments/babyai.py) plays and never learns: four to
-# measure that; the twins of two of them, which differ in what counts as failure; and KeyInBox,
-# which nobody demonstrates, because MiniGrid's bot opens no boxes.
+# Levels that the planner of many levels (experiments/babyai.py) plays and never learns: four that
+# show how it does on new levels; the twins of two of these, which differ in what counts as failure;
+# and KeyInBox, which nobody demonstrates, because MiniGrid's bot opens no boxes.
 HELD_OUT = (
     "BabyAI-GoToRedBlueBall-v0", "BabyAI-PickupDist-v0", "BabyAI-OpenDoorsOrderN4-v0",
     "BabyAI-PutNextS5N2-v0",

@@ -22,9 +22,10 @@ class Settings:
         fields: Learned distance fields; 0 for convolutions alone.
         sweeps: Rounds of value iteration that compute the distance fields.
         word_heads: Attention heads from cells to the words of the instruction; 0 for no attention.
-        memory: Mark where the agent picked up, dropped and toggled, and which cells its first pose
-            saw ahead and on its right. Only things attend to words, and words to things: so words
-            find out which of their tasks are done. For long instructions; needs `word_heads`.
+        memory: Mark where the agent picked up, dropped and toggled, which cells its first pose saw
+            ahead and on its right, and what has the colour of a locked door. Only things attend to
+            words, and words to things: so words find out which of their tasks are done. For long
+            instructions; needs `word_heads`.
         radius: Cells around the agent, in each direction, that are read one by one.
     """
 

@@ -1,7 +1,8 @@
-"""Marks cells by what the agent did in its context, which shows what part of a task is done.
+"""Marks cells by what the agent did in its context, and by what may open a locked door.
 
-The marks leave out most of the agent's path and its past turns and moves, because a network could
-recognise a demonstration by them. All grids are turned so that the agent faces right.
+Deeds show what part of a task is done. The marks leave out most of the agent's path and its past
+turns and moves, because a network could recognise a demonstration by them. All grids are turned so
+that the agent faces right.
 """
 
 import jax
