@@ -24,7 +24,7 @@ from leapjax.domains.babyai.dynamics import (
 )
 from leapjax.domains.babyai.encoders.cells import mark_cell
 from leapjax.domains.babyai.observations import Observation
-from leapjax.domains.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT
+from leapjax.domains.babyai.symmetries import EMPTY, INTERCHANGEABLE, LEFT, is_coloured
 from leapjax.types import Array, Context
 
 
@@ -113,7 +113,7 @@ def _find_thing_poses(observation: Observation, poses: jax.Array) -> jax.Array:
     """Marks the poses `[n, 3]` in which an agent faces a door or an object: `[n]` bool."""
     x, y = find_faced_cells(poses).T
     kinds = jnp.asarray(observation.grid)[x, y, 0]
-    return (kinds >= DOOR) & (kinds <= INTERCHANGEABLE[-1])
+    return is_coloured(kinds)
 
 
 def goal_before_visit(context: Context, actions: jax.Array) -> jax.Array:

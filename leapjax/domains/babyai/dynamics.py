@@ -9,7 +9,7 @@ from leapjax.domains.babyai.symmetries import AGENT, DIRECTION_VECTORS, EMPTY, L
 
 FORWARD = ACTIONS.index("forward")
 FLOOR, DOOR, GOAL, LAVA = 3, 4, 8, 9  # MiniGrid's object indices; a floor is a coloured cell
-OPEN = 0  # MiniGrid's state of an open door
+OPEN, LOCKED = 0, 2  # MiniGrid's states of a door; 1 is closed
 PASSABLE = (EMPTY, FLOOR, GOAL, LAVA, AGENT)  # the agent's mark hides the cell below
 
 

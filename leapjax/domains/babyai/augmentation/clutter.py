@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.domains.babyai import symmetries
-from leapjax.domains.babyai.dynamics import DOOR
 from leapjax.types import Context, Window
 
 
@@ -77,6 +76,6 @@ def find_target(context: Context) -> jax.Array:
     x, y = context.observation.goal
     now = jnp.asarray(context.observation.grid)[x, y]
     seen = jnp.concatenate([jnp.asarray(context.past.grid)[:, x, y], now[None]])  # [K + 1, 3]
-    thing = (seen[:, 0] >= DOOR) & (seen[:, 0] <= symmetries.INTERCHANGEABLE[-1])
+    thing = symmetries.is_coloured(seen[:, 0])
     last = jnp.argmax(thing * jnp.arange(1, len(seen) + 1))
     return seen[last].astype(jnp.int32)

@@ -7,16 +7,14 @@ that the agent faces right.
 
 import jax
 import jax.numpy as jnp
-from minigrid.core.constants import OBJECT_TO_IDX, STATE_TO_IDX
 
 from leapjax.domains.babyai import symmetries
 from leapjax.domains.babyai.adapter import ACTIONS, NUM_ACTIONS
+from leapjax.domains.babyai.dynamics import DOOR, LOCKED
 from leapjax.domains.babyai.encoders.cells import COLOURS, OBJECTS, mark_cell
 from leapjax.domains.babyai.observations import Observation
 from leapjax.types import Context, pad_token
 
-DOOR = OBJECT_TO_IDX["door"]
-LOCKED = STATE_TO_IDX["locked"]
 DEEDS = tuple(ACTIONS.index(name) for name in ("pickup", "drop", "toggle"))
 
 
