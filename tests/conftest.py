@@ -1,4 +1,4 @@
-"""What several tests share."""
+"""Fixtures and hooks that several test files share."""
 
 import gc
 import shutil
@@ -14,11 +14,11 @@ from leapjax.types import Demonstration
 from tests import OURS, parameters
 from tests.programs import TOY_RUN
 
-# Tracing makes very many objects, of which few are garbage; JAX tidies up at each collection, too.
+# Tracing makes many objects, few of them garbage, and JAX also cleans up at each collection.
 gc.set_threshold(100_000, 20, 20)
 
-# The longest files first, so that two workers end at the same time. (Those of processes and of
-# interruption want the same run: the second should not wait for the first to make it.)
+# The longest files first, so that two workers end together. (test_processes and test_interruption
+# share a run: they start apart, so that the second need not wait until the first has made it.)
 FIRST = ["babyai", "training", "processes", "benchmarks", "interruption", "planners", "models"]
 
 
@@ -28,14 +28,14 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_unconfigure():
-    """The last thing that pytest does."""
+    """Deletes the compilation cache of the tests when pytest ends."""
     if OURS:
         shutil.rmtree(OURS, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)
 def minari_folder(tmp_path, monkeypatch):
-    """Every test has an empty Minari folder of its own: none can touch the user's."""
+    """Gives each test an empty Minari folder, so that no test touches the user's."""
     folder = tmp_path / "minari"
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
     return folder
@@ -43,13 +43,13 @@ def minari_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def quick_begin(monkeypatch):
-    """Runs begin with any parameters: nothing is compiled to draw them."""
+    """Starts runs from random parameters, without compiling a program to draw them."""
     monkeypatch.setattr(training, "make_begin", parameters.make_begin)
 
 
 @pytest.fixture(scope="session")
 def local_demonstrations() -> list[Demonstration]:
-    """Five demonstrations of GoToLocalS7N5; not to be changed."""
+    """Five demonstrations of GoToLocalS7N5; tests must not change them."""
     level = levels.find_level("GoToLocalS7N5")
     collected = demonstrations.collect(level, 5, seed=0).demonstrations
     for leaf in jax.tree.leaves([(d.observations, d.actions, d.rewards) for d in collected]):
@@ -59,7 +59,7 @@ def local_demonstrations() -> list[Demonstration]:
 
 @pytest.fixture(scope="session")
 def toy_run(tmp_path_factory) -> Path:
-    """The folder of a run of four steps; not to be changed."""
+    """The folder of a run of four steps; tests must not change it."""
     folder = tmp_path_factory.mktemp("toy")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)

@@ -1,4 +1,4 @@
-"""MiniGrid's own dynamics, from a state that an `Observation` describes."""
+"""MiniGrid's own dynamics, started in the state of an `Observation`."""
 
 import numpy as np
 from minigrid.core.grid import Grid
@@ -9,11 +9,11 @@ from minigrid.minigrid_env import MiniGridEnv
 from leapjax.domains.babyai import observations
 from leapjax.domains.babyai.observations import Observation
 
-FRONT = ((1, 0), (0, 1), (-1, 0), (0, -1))  # the cell ahead, by direction
+FRONT = ((1, 0), (0, 1), (-1, 0), (0, -1))  # step to the cell ahead, by direction
 
 
-class Bare(MiniGridEnv):
-    """MiniGrid's own dynamics in a state that an `Observation` describes."""
+class ObservationEnv(MiniGridEnv):
+    """A MiniGrid environment in the state of an `Observation`."""
 
     def __init__(self, observation: Observation) -> None:
         side = observation.grid.shape[0]
@@ -25,19 +25,19 @@ class Bare(MiniGridEnv):
         kind, colour = (int(v) for v in observation.carried)
         self.carrying = WorldObj.decode(kind, colour, 0) if kind else None
         self.step_count = 0
-        self.rest = observation
+        self.initial = observation
 
     def gen_obs(self):
         return {}
 
     def observe(self) -> Observation:
-        goal = tuple(int(v) for v in self.rest.goal)
-        side = self.rest.grid.shape[0]
-        return observations.observe(self, side, goal, np.asarray(self.rest.instruction))
+        goal = tuple(int(v) for v in self.initial.goal)
+        side = self.initial.grid.shape[0]
+        return observations.observe(self, side, goal, np.asarray(self.initial.instruction))
 
 
 def stepped(observation: Observation, action: int) -> Observation:
-    """The state after an action, by MiniGrid."""
-    env = Bare(observation)
+    """Returns the state after an action, by MiniGrid's dynamics."""
+    env = ObservationEnv(observation)
     env.step(action)
     return env.observe()

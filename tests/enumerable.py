@@ -1,8 +1,8 @@
-"""A joint distribution over all A^T plans that is small enough to enumerate: the truth.
+"""A joint distribution over all A^T plans, small enough to enumerate.
 
-`enumerable_energy` is an `Energy` whose conditionals are the exact conditionals of the
-joint and whose total is its exact negative logarithm. The same numbers, in plain NumPy
-and by counting over all plans, are `joint_probabilities` and `conditional_by_counting`.
+`enumerable_energy` is an `Energy` with the exact conditionals of the joint; its total is the exact
+negative logarithm. `joint_probabilities` and `conditional_by_counting` compute the reference values
+in plain NumPy, by counting over all plans.
 """
 
 import itertools
@@ -15,10 +15,10 @@ from leapjax.types import Energy, mask_token
 
 
 def enumerable_energy(horizon: int, num_actions: int) -> Energy:
-    """Params: log weights `[A] * T`. Context: a tilt `[T, A]` added to the log weights.
+    """Makes the energy of a joint. The conditional marginalises over positions that hold MASK.
 
-    The conditional marginalises over positions that hold MASK; the total of a plan that
-    holds MASK is infinite.
+    Parameters are log weights `[A] * T`. The context is a tilt `[T, A]`, added to the log weights.
+    The total of a plan that holds MASK is infinite.
     """
     mask = mask_token(num_actions)
 
@@ -54,18 +54,18 @@ def _along_axis(values, axis: int, axes: int):
 
 
 def random_table(seed: int, horizon: int, num_actions: int, scale: float = 1.5) -> np.ndarray:
-    """Log weights `[A] * T` of a joint whose actions depend on each other."""
+    """Draws log weights `[A] * T` of a joint whose actions depend on each other."""
     rng = np.random.default_rng(seed)
     return rng.normal(scale=scale, size=(num_actions,) * horizon).astype(np.float32)
 
 
 def all_plans(horizon: int, num_actions: int) -> np.ndarray:
-    """Every plan `[A^T, T]`, in the order of the flattened joint."""
+    """Lists all plans `[A^T, T]`, in the order of the flattened joint."""
     return np.array(list(itertools.product(range(num_actions), repeat=horizon)), np.int32)
 
 
 def joint_probabilities(table: np.ndarray, tilt: np.ndarray | None = None) -> np.ndarray:
-    """The joint `[A] * T`, in float64."""
+    """Computes the joint `[A] * T`, in float64."""
     weights = np.asarray(table, np.float64)
     if tilt is not None:
         weights = weights.copy()
@@ -76,20 +76,20 @@ def joint_probabilities(table: np.ndarray, tilt: np.ndarray | None = None) -> np
 
 
 def conditional_by_counting(joint: np.ndarray, tokens: np.ndarray, position: int) -> np.ndarray:
-    """p(action at position | the tokens elsewhere that are not MASK) `[A]`."""
+    """Computes p(action at position | the other tokens, except MASK) `[A]`."""
     num_actions = joint.shape[0]
     result = np.zeros(num_actions)
     for plan in np.ndindex(*joint.shape):
-        agrees = all(
+        is_consistent = all(
             t == position or tokens[t] == num_actions or tokens[t] == a for t, a in enumerate(plan)
         )
-        if agrees:
+        if is_consistent:
             result[plan[position]] += joint[plan]
     return result / result.sum()
 
 
 def plan_counts(plans: np.ndarray, num_actions: int) -> np.ndarray:
-    """How often each plan occurs `[A^T]`, in the order of the flattened joint."""
+    """Counts how often each plan occurs: `[A^T]`, in the order of the flattened joint."""
     plans = np.asarray(plans)
     horizon = plans.shape[-1]
     index = plans @ (num_actions ** np.arange(horizon - 1, -1, -1))
@@ -97,14 +97,14 @@ def plan_counts(plans: np.ndarray, num_actions: int) -> np.ndarray:
 
 
 def fit_p_value(counts: np.ndarray, probabilities: np.ndarray) -> float:
-    """How well counts fit a distribution: chi-square, rare outcomes pooled."""
+    """Returns the p-value of a chi-square test of counts; rare outcomes are pooled."""
     counts = np.asarray(counts, np.float64).reshape(-1)
     expected = np.asarray(probabilities, np.float64).reshape(-1) * counts.sum()
     if np.any(counts[expected == 0] > 0):
         return 0.0
     order = np.argsort(expected)
     counts, expected = counts[order], expected[order]
-    # The classical rule: at least five expected in every class.
+    # The classical rule: each class expects at least five counts.
     enough = np.searchsorted(np.cumsum(expected), 5.0) + 1
     counts = np.append(counts[:enough].sum(), counts[enough:])
     expected = np.append(expected[:enough].sum(), expected[enough:])

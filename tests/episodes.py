@@ -1,4 +1,4 @@
-"""Episodes of a Gymnasium environment, and a small network that learns from them."""
+"""Records episodes of Gymnasium environments; `SMALL` configures a network to learn from them."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ SMALL = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
 
 
 def record_episode(env, act, seed):
-    """An episode of a policy (observation) -> action."""
-    observations, actions, rewards, over = [env.reset(seed=seed)[0]], [], [], [False, False]
-    while not any(over):
+    """Records an episode of a policy `act`: (observation) -> action."""
+    observations, actions, rewards, ended = [env.reset(seed=seed)[0]], [], [], [False, False]
+    while not any(ended):
         actions.append(act(observations[-1]))
-        after, reward, *over, _ = env.step(actions[-1])
-        observations.append(after)
+        observation, reward, *ended, _ = env.step(actions[-1])
+        observations.append(observation)
         rewards.append(reward)
     seen, taken, given = np.array(observations), np.int32(actions), np.float32(rewards)
-    return Demonstration(seen, taken, given, *over, seed)
+    return Demonstration(seen, taken, given, *ended, seed)

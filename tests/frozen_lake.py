@@ -1,4 +1,4 @@
-"""A domain that is no grid world of ours: Gymnasium's FrozenLake, in a few lines."""
+"""A domain from outside leapjax, in a few lines: Gymnasium's FrozenLake."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ class Settings:
 
 
 class Cell(Encoder):
-    """The cell that the agent is in, as one token."""
+    """Embeds the cell of each state as a token."""
 
     width: int
 
@@ -36,16 +36,16 @@ class Cell(Encoder):
         return nn.Embed(CELLS, self.width)(past)
 
 
-def shortest_way(transitions) -> list[int]:
-    """Actions from the first cell to the goal; `transitions` is FrozenLake's own table."""
-    ways, queue = {0: []}, deque([0])
+def find_shortest_path(transitions) -> list[int]:
+    """Finds the fewest actions from the first cell to the goal in FrozenLake's `transitions`."""
+    paths, queue = {0: []}, deque([0])
     while queue:
         cell = queue.popleft()
-        for action, [(_, after, _, over)] in transitions[cell].items():
-            if after not in ways and (after == GOAL or not over):
-                ways[after] = [*ways[cell], action]
-                queue.append(after)
-    return ways[GOAL]
+        for action, [(_, next_cell, _, ended)] in transitions[cell].items():
+            if next_cell not in paths and (next_cell == GOAL or not ended):
+                paths[next_cell] = [*paths[cell], action]
+                queue.append(next_cell)
+    return paths[GOAL]
 
 
 def make_adapter():
@@ -53,7 +53,7 @@ def make_adapter():
 
 
 def solve(adapter) -> list[int]:
-    return shortest_way(adapter.env.unwrapped.P)
+    return find_shortest_path(adapter.env.unwrapped.P)
 
 
 def make(level: str, settings: Settings) -> Domain:
@@ -69,9 +69,9 @@ def make(level: str, settings: Settings) -> Domain:
 
 
 def preset(level: str, method: str) -> AnyConfig:
-    """As for any environment; but plans have four actions, all are executed, and K = 1."""
-    found = environments.leapjax("frozen_lake", level, method)
-    return change(found, context=1, executed=None, planner=common.search(method, 4, 4))
+    """Returns the preset for any environment, with K = 1 and plans of four executed actions."""
+    config = environments.leapjax("frozen_lake", level, method)
+    return change(config, context=1, executed=None, planner=common.search(method, 4, 4))
 
 
 FROZEN_LAKE = DomainType(Settings, make, (LEVEL,))

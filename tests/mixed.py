@@ -1,4 +1,4 @@
-"""Data of many policies in the toy world, good and bad, and what is best in it."""
+"""Walks of good and bad policies in the toy world; its optimal actions and values."""
 
 import flax.linen as nn
 import jax
@@ -16,7 +16,7 @@ PLACES = np.array([x for x in range(-FARTHEST, FARTHEST + 1) if x])
 
 
 class Place(Encoder):
-    """A token for each place: a table, so that values are learned one by one."""
+    """Embeds the place by a table, so that the value of each place is learned separately."""
 
     width: int
 
@@ -27,7 +27,7 @@ class Place(Encoder):
 
 
 class Places(Encoder):
-    """The same for each state of a context, as the paper's encoder has it."""
+    """Embeds the place of each state in a context, as the paper's encoder does."""
 
     width: int
 
@@ -52,7 +52,7 @@ def towards(place):
 
 
 def walk(rng, start, share, limit=30):
-    """One that steps towards the middle with that probability, and away from it else."""
+    """Makes a walk that steps towards the middle with probability `share`, else away from it."""
     places, actions = [start], []
     while places[-1] and len(actions) < limit:
         place = places[-1]
@@ -67,18 +67,18 @@ def walk(rng, start, share, limit=30):
 
 
 def steps(share=0.4, episodes=20):
-    """Walks that go wrong more often than right."""
+    """Joins walks that step away from the middle more often than towards it."""
     rng = np.random.default_rng(0)
     walks = [walk(rng, int(start), share) for start in PLACES for _ in range(episodes)]
     return jax.tree.map(jnp.asarray, windows.concatenate(walks))
 
 
 def contexts(past):
-    """Each place but the middle, as an episode begins there."""
+    """Makes a context for each place but the middle, at the start of an episode."""
     blank = windows.window(steps(episodes=1), 0, past, 1, toy.END).context
     states = np.stack([toy.observe(place) for place in PLACES])
-    many = jax.tree.map(lambda leaf: np.stack([leaf] * len(PLACES)), blank)
-    return many._replace(observation=states)
+    blanks = jax.tree.map(lambda leaf: np.stack([leaf] * len(PLACES)), blank)
+    return blanks._replace(observation=states)
 
 
 def best_actions():
@@ -86,12 +86,12 @@ def best_actions():
 
 
 def best_values(discount):
-    """Q of a step towards the middle and of one away from it, by value iteration: `[10, 2]`."""
+    """Computes Q of steps towards the middle and away from it, `[10, 2]`, by value iteration."""
     values = np.zeros(2 * FARTHEST + 1)
 
     def q(place, step):
-        then = int(np.clip(place + step, -FARTHEST, FARTHEST))
-        return float(then == 0) + discount * (then != 0) * values[then + FARTHEST]
+        reached = int(np.clip(place + step, -FARTHEST, FARTHEST))
+        return float(reached == 0) + discount * (reached != 0) * values[reached + FARTHEST]
 
     for _ in range(100):
         for place in PLACES:

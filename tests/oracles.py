@@ -1,4 +1,4 @@
-"""Slow, obvious versions of what leapjax computes, written independently of it."""
+"""Slow, obvious versions of leapjax functions, written independently."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from leapjax.domains.babyai.observations import Observation
 def slow_path_lengths(
     grid, start: tuple[int, int], through_objects: bool = False
 ) -> dict[tuple[int, int], int]:
-    """Moves to reach or touch every cell, by relaxing all edges until nothing changes."""
+    """Counts the moves to reach or touch each cell: relaxes all edges until lengths are stable."""
 
     def can_stand(cell) -> bool:
         content = grid.get(*cell)
@@ -38,7 +38,7 @@ def slow_path_lengths(
 
 
 def assert_same_observation(actual: Observation, expected: Observation) -> None:
-    """Equal in every field, with the field's name where it is not."""
+    """Asserts that every field is equal; a failure names the field."""
     for field in Observation._fields:
         np.testing.assert_array_equal(
             np.asarray(getattr(actual, field)), np.asarray(getattr(expected, field)), field

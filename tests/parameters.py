@@ -1,4 +1,4 @@
-"""Parameters of networks that have learned nothing, and yet say something of what they see."""
+"""Random parameters of untrained networks, whose outputs depend on their inputs."""
 
 import jax
 import jax.numpy as jnp
@@ -8,16 +8,16 @@ from leapjax import sharding
 
 
 def random_like(shapes, scale=0.5, seed=0):
-    """Random numbers of the shapes of parameters: nothing is compiled for them.
+    """Draws random numbers in the shapes of parameters, without compiling a program.
 
-    Unlike after initialisation nothing is zero: what leaks, or a wrong mask, must show.
+    Initialisation would set some to zero, which could hide a leak or a wrong mask.
     """
     rng = np.random.default_rng(seed)
     return jax.tree.map(lambda x: rng.normal(0, scale, x.shape).astype(x.dtype), shapes)
 
 
 def scaled_like(shapes, seed=0):
-    """The same, so that what passes through many layers neither fades nor explodes."""
+    """Draws like `random_like`, at scales that keep signals stable through many layers."""
     rng = np.random.default_rng(seed)
 
     def leaf(path, shape):
@@ -30,12 +30,12 @@ def scaled_like(shapes, seed=0):
 
 
 def random_parameters(agent, scale=0.5, seed=0):
-    """The same for the parameters of an agent."""
+    """Draws parameters of an agent, like `random_like`."""
     return random_like(jax.eval_shape(agent.init, jax.random.key(0)).params, scale, seed)
 
 
 def random_state(agent):
-    """A `TrainState` with such parameters, before any step."""
+    """Makes a `TrainState` with random parameters, before the first step."""
     shapes = jax.eval_shape(agent.init, jax.random.key(0))
     state = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     return state._replace(
@@ -44,9 +44,9 @@ def random_state(agent):
 
 
 def make_begin(agent, mesh):
-    """In the place of `training.make_begin`, which takes as long to compile as a step.
+    """Replaces `training.make_begin`, which takes as long to compile as a step.
 
-    For tests that ask neither what a network begins with nor whether it learns.
+    For tests that depend neither on initial parameters nor on learning.
     """
     state = random_state(agent)
     whole = jax.sharding.NamedSharding(mesh, sharding.REPLICATED)

@@ -1,4 +1,4 @@
-"""The real program at toy size: what it leaves behind; processes of its own, watched, compared."""
+"""Toy runs of the real program: their folders, and processes that tests watch and compare."""
 
 import os
 import shutil
@@ -32,30 +32,30 @@ only_long = pytest.mark.skipif(not LONG, reason="make test-long runs it")
 SINGLE = "--episodes 3 --batch 4 --width 16 --heads 2 --layers 1 --no-pictures".split()
 SMALL = [*SINGLE, "--iterations", "2"]
 TOY = [*SMALL, *"--demos 6 --channels 4 --rounds 1 --fields 2 --sweeps 2".split()]
-TOY_RUN = [*TOY, "--steps", "4", "--iterations", "3"]  # what most tests look at
-RANDOM = "--method random --episodes 3 --no-pictures".split()  # nothing to compile but the planner
+TOY_RUN = [*TOY, "--steps", "4", "--iterations", "3"]  # the run that most tests inspect
+RANDOM = "--method random --episodes 3 --no-pictures".split()  # compiles only the planner
 
-# What processes of their own run: a method of single actions, which compiles soon.
+# Separate processes run a method of single actions, which compiles quickly.
 LAKE = Experiment("lake", "frozen_lake")
 COMMAND = ["-m", "tests.programs", *SINGLE, "--method", "bc", "--demos", "6"]
 STEPS = 200
 
 
 def main():
-    """An experiment in FrozenLake: `python -m tests.programs`."""
+    """Runs an experiment in FrozenLake: `python -m tests.programs`."""
     domains.DOMAINS[LAKE.domain] = frozen_lake.FROZEN_LAKE
     PRESETS[LAKE.domain] = {"leapjax": frozen_lake.preset}
     return running.main(LAKE)
 
 
 def toy_row(**values):
-    """A row of results with every field."""
+    """Returns a row of results with every field."""
     row = {name: "x" if kind is str else kind(1) for name, kind in results.FIELDS.items()}
     return {**row, "success": 1.0, **values}
 
 
 def with_options(config, options):
-    """A configuration with options of the command line, whichever part of it they are of."""
+    """Changes options of the command line, in whichever part of a configuration holds them."""
     changes = {}
     for option, value in options.items():
         parts = (part for part in pretrained.GROUPS if hasattr(getattr(config, part), option))
@@ -64,41 +64,41 @@ def with_options(config, options):
 
 
 def untrained_run(folder, *options):
-    """The folder of a run that has learned nothing: nothing is compiled for it."""
+    """Saves a run with random parameters, without compiling a program; returns its folder."""
     (chosen,) = command_line.parse("babyai", [*TOY, *options])
     domain = make_domain(chosen)
     specification = specify(chosen, chosen.seeds[0], domain)
     pretrained.save_specification(folder, specification)
     agent = pretrained.make_agent(specification, domain)
     params = random_parameters(agent, 0.1)
-    saved = Checkpoints(
+    checkpoints = Checkpoints(
         folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
     )
-    saved.save(TrainState(params, (), jnp.int32(specification.training.steps)))
-    saved.close()
+    checkpoints.save(TrainState(params, (), jnp.int32(specification.training.steps)))
+    checkpoints.close()
     return folder
 
 
 def seal(folder):
-    """Saves one parameter with the specification that is in a folder, whatever that says."""
+    """Replaces the checkpoints of a folder by one parameter and its current specification."""
     shutil.rmtree(folder / pretrained.CHECKPOINTS, ignore_errors=True)
     specification = pretrained.parse_specification(folder)
-    saved = Checkpoints(
+    checkpoints = Checkpoints(
         folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
     )
     params = {"w": jnp.ones((30, 30))} if specification.method != "random" else {}
-    saved.save(TrainState(params, (), jnp.int32(specification.training.steps)))
-    saved.close()
+    checkpoints.save(TrainState(params, (), jnp.int32(specification.training.steps)))
+    checkpoints.close()
 
 
 class Place:
-    """A folder to run in, with its own data sets and compilation cache."""
+    """A working folder of runs, with its own data sets."""
 
     def __init__(self, folder):
         self.folder = folder
 
     def start(self, runs, *options, devices=2, cache=None):
-        """Starts a run whose results go to the folder `runs`; `cache`: of compiled programs."""
+        """Starts a run that writes to the folder `runs`; `cache`: folder of programs, or "off"."""
         environment = {
             **os.environ,
             "PYTHONPATH": str(ROOT),
@@ -107,9 +107,9 @@ class Place:
         }
         if cache is not None:
             environment["LEAPJAX_COMPILATION_CACHE"] = cache
-        often = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
+        schedule = ["--steps", str(STEPS), "--checkpoint-seconds", "0"]
         return subprocess.Popen(
-            [sys.executable, *COMMAND, *often, "--runs", runs, *options],
+            [sys.executable, *COMMAND, *schedule, "--runs", runs, *options],
             cwd=self.folder, env=environment, text=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         )  # fmt: skip
@@ -119,12 +119,12 @@ class Place:
         assert run.wait(300) == 0, run.stderr.read()
 
     def steps_saved(self, runs):
-        """Of which steps there are checkpoints."""
+        """Returns the steps of the checkpoints, sorted."""
         folder = (self.folder / runs).glob("*/checkpoints/*")
         return sorted(int(path.name) for path in folder if path.name.isdecimal())
 
     def wait_for_checkpoint(self, run, runs, after=0):
-        """Until there is a checkpoint later than a step, and training goes on."""
+        """Waits for a checkpoint later than step `after`, before the last step."""
         deadline = time.monotonic() + 120
         while not any(after < step < STEPS for step in self.steps_saved(runs)):
             assert run.poll() is None, f"the run ended too soon: {run.stderr.read()}"
@@ -132,17 +132,17 @@ class Place:
             time.sleep(0.005)
 
     def rows(self, runs):
-        """What the runs in a folder have reported."""
+        """Returns the result rows of the runs in a folder."""
         return results.read(self.folder / runs / f"{LAKE.name}.jsonl")
 
     def parameters(self, runs):
-        """The final parameters of the only run in a folder."""
+        """Returns the final parameters of the only run in a folder."""
         (path,) = (self.folder / runs).glob(f"*/checkpoints/{STEPS}/default")
         with ocp.PyTreeCheckpointer() as checkpointer:
             return checkpointer.restore(path.absolute())["params"]
 
     def check_same_end(self, runs, tolerance=0.0):
-        """A run ended exactly as the one that nothing happened to, or nearly, with one row."""
+        """Compares a run's parameters, with `tolerance`, and its row to the uninterrupted run."""
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance),
             self.parameters(runs),
@@ -154,7 +154,7 @@ class Place:
 
 
 def place_with_a_run(tmp_path_factory):
-    """A place where a run on two devices has ended: the same for all tests of a session."""
+    """Finishes a run on two devices, once per test session, and returns its place."""
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         folder = folder.parent

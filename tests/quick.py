@@ -1,4 +1,4 @@
-"""Compiling what runs once."""
+"""Quick compilation of programs that run once."""
 
 import functools
 
@@ -12,5 +12,5 @@ quick_jit = functools.partial(jax.jit, compiler_options=QUICK)
 
 @functools.cache
 def many_plans(energy, config):
-    """The planner for a batch of keys in one context, compiled once."""
+    """Makes a planner for a batch of keys in one context; later calls return the same one."""
     return quick_jit(jax.vmap(bind(energy, config), (None, 0, None)))

@@ -1,4 +1,4 @@
-"""A planner that remembers what it was asked and what it answered."""
+"""A planner that records its inputs and its plans."""
 
 import jax
 
@@ -7,7 +7,7 @@ from leapjax.types import Context, Plan, PyTree
 
 
 class Recorder:
-    """Plans as another planner does."""
+    """Delegates to a planner, and records the calls."""
 
     def __init__(self, plan: leap.CompiledPlanner) -> None:
         self.plan = plan
@@ -17,13 +17,11 @@ class Recorder:
 
     @property
     def num_actions(self) -> int:
-        """As many as the other one's."""
         return self.plan.num_actions
 
     def plan_next(self, params, keys, contexts, cache) -> tuple[Plan, PyTree]:
-        """The plans of the other one."""
-        plans, after = self.plan.plan_next(params, keys, contexts, cache)
+        plans, next_cache = self.plan.plan_next(params, keys, contexts, cache)
         self.contexts.append(contexts)
         self.caches.append(cache)
         self.plans.append(jax.device_get(plans))
-        return plans, after
+        return plans, next_cache

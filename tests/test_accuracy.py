@@ -1,4 +1,4 @@
-"""How much of demonstrations a model knows: against a model whose answers are known."""
+"""Accuracy on demonstrations, of a model whose predictions are known."""
 
 from types import SimpleNamespace
 
@@ -20,14 +20,14 @@ DOMAIN = BABYAI.make("GoToLocalS7N5", Settings())
 
 
 def window(actions):
-    every = jnp.ones(len(actions), bool)
-    return Window(None, jnp.array(actions, jnp.int32), every, 0.0, ())  # no context is looked at
+    imitated = jnp.ones(len(actions), bool)
+    return Window(None, jnp.array(actions, jnp.int32), imitated, 0.0, ())  # no context needed
 
 
 def counting_model():
-    """Expects each action to be one more than the one before, and 0 at the start.
+    """Expects each action to be the previous action plus 1, and 0 at the start.
 
-    It knows nothing where it cannot see the action before, and is put off by seeing a later one.
+    It expects 0 after a masked action, and the end if it sees a later action.
     """
 
     def logits(params, memory, tokens, positions):
@@ -40,37 +40,37 @@ def counting_model():
     return pseudo_likelihood(lambda params, context: None, logits, ACTIONS)
 
 
-def test_actions_are_predicted_from_those_before_and_none_after():
+def test_predictions_see_only_earlier_actions():
     right, counts = accuracy.find_hits(counting_model(), None, window([0, 1, 2, 0, 1]), end=True)
     np.testing.assert_array_equal(right, [True, True, True, False, True])
     assert counts.all()
 
 
 @pytest.mark.parametrize("end", [True, False])
-def test_what_comes_after_the_end_does_not_count(end):
-    for third, known in ((2, True), (1, False)):  # the end is expected after 2 only
+def test_actions_after_the_end_do_not_count(end):
+    for third, known in ((2, True), (1, False)):  # the model expects the end after 2 only
         model, plan = counting_model(), window([0, 1, third, END, END])
         right, counts = accuracy.find_hits(model, None, plan, end)
         np.testing.assert_array_equal(counts, [True, True, True, end, False])
         np.testing.assert_array_equal(right, [True, True, known, known and end, False])
 
 
-def test_counts_are_those_of_every_step():
-    """Three demonstrations of 2, 3 and 7 steps that count up from 0, or stand still."""
-    whole = max(
+def test_hits_are_counted_from_every_step():
+    """Two demonstrations count up from 0, in 2 and 3 steps; the third repeats 0 for 7 steps."""
+    longest = max(
         DOMAIN.demonstrations.collect(20, 0, print).demonstrations, key=lambda d: len(d.actions)
     )
-    assert len(whole.actions) >= 7
+    assert len(longest.actions) >= 7
 
-    def told(actions):
+    def make_demonstration(actions):
         count = len(actions)
-        return whole._replace(
-            observations=Observation(*(part[: count + 1] for part in whole.observations)),
+        return longest._replace(
+            observations=Observation(*(part[: count + 1] for part in longest.observations)),
             actions=np.array(actions, np.int32),
-            rewards=whole.rewards[:count],
+            rewards=longest.rewards[:count],
         )
 
-    data = [told([0, 1]), told([0, 1, 2]), told([0] * 7)]
+    data = [make_demonstration([0, 1]), make_demonstration([0, 1, 2]), make_demonstration([0] * 7)]
     specification = SimpleNamespace(
         context=0, planner=SimpleNamespace(horizon=HORIZON),
         method_settings=SimpleNamespace(end=True),
@@ -87,11 +87,11 @@ def test_counts_are_those_of_every_step():
 
 
 @only_long
-def test_the_command_tells_what_was_learned_from_the_rest(tmp_path, monkeypatch, capsys):
+def test_command_compares_learned_and_other_demonstrations(tmp_path, monkeypatch, capsys):
     run = untrained_run(tmp_path / "run")
     assert accuracy.main([str(run), "--demos", "4", "--samples", "9"]) == 0
-    said = capsys.readouterr().out
-    assert "learned from" in said and "others" in said and "%" in said
+    output = capsys.readouterr().out
+    assert "learned from" in output and "others" in output and "%" in output
 
     assert accuracy.main([str(run), "--demos", "0"]) == 2
     assert "--demos must be at least 1" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The real `main`, end to end at toy size, and what it says to wrong input."""
+"""The `main` of BabyAI, end to end at toy size, and its errors for wrong input."""
 
 import functools
 import json
@@ -25,13 +25,13 @@ from tests.programs import LONG, RANDOM, TOY_RUN, only_long, untrained_run
 
 LEVEL = "GoToLocalS7N5"
 DOMAIN = BABYAI.make(LEVEL, Settings())
-MINE = storage.name_dataset(DOMAIN, 6, 0)
-SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # on one device: it compiles sooner
+DATASET = storage.name_dataset(DOMAIN, 6, 0)
+SIMPLE = "--batch 1 --no-augment --clutter 0".split()  # one device: compiles faster
 
 
 @pytest.fixture(scope="module")
 def workplace(toy_run, tmp_path_factory):
-    """A folder with its own Minari data sets, where one toy run has finished."""
+    """A folder with a finished toy run and its Minari data sets."""
     folder = tmp_path_factory.mktemp("workplace")
     shutil.copytree(toy_run.parent.parent, folder, dirs_exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
@@ -54,7 +54,7 @@ def only_folder(runs):
     return folder
 
 
-def test_a_run_leaves_a_row_a_training_curve_and_checkpoints(workplace):
+def test_a_run_writes_a_row_metrics_and_checkpoints(workplace):
     (row,) = results.read(workplace / "runs" / "babyai.jsonl")
     assert (row["domain"], row["level"], row["method"]) == ("babyai", LEVEL, "leap")
     assert row["preset"] == "leapjax" and row["demos"] == 6
@@ -69,7 +69,7 @@ def test_a_run_leaves_a_row_a_training_curve_and_checkpoints(workplace):
     assert not (folder / "plan.gif").exists()  # without --pictures
 
 
-def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
+def test_evaluating_a_checkpoint_repeats_the_result_without_other_options(workplace):
     arguments = (
         f"--checkpoint {run_folder(workplace)} --episodes 3 --no-pictures --runs again".split()
     )
@@ -79,26 +79,26 @@ def test_a_checkpoint_evaluates_again_and_needs_no_other_setting(workplace):
     assert after["train_steps"] == 0 and after["train_seconds"] == 0
     for name in ("successes", "mean_length", "mean_return", "demos", "configuration"):
         assert after[name] == before[name], name
-    assert after["hash"] != before["hash"]  # to train and to play are two rows
+    assert after["hash"] != before["hash"]  # training and evaluation have separate rows
     assert parse("babyai", [*TOY_RUN, *arguments]) == parse("babyai", arguments)
-    left = only_folder(workplace / "again" / "evaluations")
-    assert [path.name for path in left.iterdir()] == ["episodes.csv"]  # nothing was trained
+    outputs = only_folder(workplace / "again" / "evaluations")
+    assert [path.name for path in outputs.iterdir()] == ["episodes.csv"]  # no training
 
 
-def test_a_checkpoint_plays_no_level_that_it_has_learned_from(workplace, tmp_path, capsys):
+def test_evaluating_a_checkpoint_on_training_levels_raises_an_error(workplace, tmp_path, capsys):
     folder = tmp_path / "learned"
     shutil.copytree(run_folder(workplace), folder)
-    noted = json.loads((folder / "data.json").read_text())
-    (folder / "data.json").write_text(json.dumps({**noted, "seeds": [*noted["seeds"], 7]}))
+    note = json.loads((folder / "data.json").read_text())
+    (folder / "data.json").write_text(json.dumps({**note, "seeds": [*note["seeds"], 7]}))
     arguments = ["--checkpoint", str(folder), "--episodes", "3", "--no-pictures"]
-    assert len(noted["seeds"]) > 3
+    assert len(note["seeds"]) > 3
     assert babyai.main([*arguments, "--test-seed", "5"]) == 2
     assert "level seed 7 is both a demonstration and a test episode" in capsys.readouterr().err
-    (folder / "data.json").write_text('{"fingerprint": "0"}')  # of an earlier version
+    (folder / "data.json").write_text('{"fingerprint": "0"}')  # as earlier versions wrote it
     assert find_demonstrated(folder) == []
 
 
-def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace, tmp_path, capsys):
+def test_evaluating_a_checkpoint_keeps_its_seed_and_writes_pictures(workplace, tmp_path, capsys):
     folder = untrained_run(tmp_path / "random", "--method", "random", "--seeds", "2")
     arguments = ["--checkpoint", str(folder), "--episodes", "1", "--runs", str(tmp_path / "again")]
     assert babyai.main(arguments) == 0
@@ -122,7 +122,7 @@ def test_a_checkpoint_brings_its_seed_and_leaves_pictures_and_episodes(workplace
         ("--channels", "8", "channels is 4, not 8"),
     ],
 )
-def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
+def test_options_that_contradict_a_checkpoint_raise_an_error(
     workplace, tmp_path, capsys, option, value, message
 ):
     checkpoint = ["--checkpoint", str(run_folder(workplace)), "--runs", str(tmp_path / "runs")]
@@ -132,14 +132,14 @@ def test_a_checkpoint_is_not_what_it_was_not_trained_to_be(
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_loaded_planner_plans_as_far_and_as_large_as_it_was_trained_to(workplace):
+def test_a_loaded_planner_keeps_the_horizon_and_observation_shapes_of_training(workplace):
     planner, adapter = load(run_folder(workplace)), BabyAIAdapter(LEVELS[LEVEL])
     histories = [rollouts.History(adapter.reset(s), 0, adapter.num_actions) for s in range(3)]
     plan = planner(plan_keys(0, np.arange(3), np.zeros(3)), rollouts.stack_contexts(histories))
     actions = np.asarray(plan.actions)
     assert actions.shape == (3, 5) and plan.trace.shape == (3, 3, 5)
     assert actions.min() >= 0 and actions.max() < 7
-    assert (actions[:, 0] != 6).all()  # end is never first
+    assert (actions[:, 0] != 6).all()  # a plan never begins with the end action
     with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
         load(run_folder(workplace), GibbsConfig(horizon=4))
     for level, context, message in (
@@ -151,7 +151,7 @@ def test_a_loaded_planner_plans_as_far_and_as_large_as_it_was_trained_to(workpla
             rollouts.evaluate(make_adapter, [0], planner.plan, planner.params, context=context)
 
 
-def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
+def test_recording_skips_recorded_runs_unless_forced(workplace, capsys):
     arguments = [*RANDOM, "--record", "--runs", "recorded"]
     assert babyai.main(arguments) == 0
     path = workplace / "results" / "babyai.jsonl"
@@ -164,7 +164,7 @@ def test_recording_skips_what_is_recorded_unless_forced(workplace, capsys):
     shutil.rmtree(workplace / "results")
 
 
-# A level by its id, whose grid is not square.
+# BabyAI-PutNextS4N1-v0 is a level by id, with a grid that is not square.
 @pytest.mark.parametrize(
     ("name", "level"),
     [
@@ -194,18 +194,18 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
-        (["--demonstrations", MINE, "--demos", "7"], "fewer than 7: ask for 6"),
+        (["--demonstrations", DATASET, "--demos", "7"], "fewer than 7: ask for 6"),
         (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_code_2(workplace, capsys, arguments, message):
+def test_wrong_input_prints_one_line_and_exits_with_code_2(workplace, capsys, arguments, message):
     assert babyai.main([*TOY_RUN, *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1 and error.startswith("error: ")
 
 
-def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_path, capsys):
+def test_a_run_restarts_if_its_only_checkpoint_is_damaged(workplace, tmp_path, capsys):
     runs = tmp_path / "runs"
     arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", str(runs)]
 
@@ -227,7 +227,7 @@ def test_a_run_whose_only_training_state_is_damaged_begins_again(workplace, tmp_
         load(only_folder(runs))
 
 
-def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_path, capsys):
+def test_resuming_a_run_on_other_demonstrations_raises_an_error(workplace, tmp_path, capsys):
     folder = tmp_path / "runs" / run_folder(workplace).name
     shutil.copytree(run_folder(workplace), folder)
     (folder / "data.json").write_text('{"fingerprint": "0123456789abcdef"}')
@@ -235,8 +235,8 @@ def test_a_run_that_was_begun_on_other_demonstrations_is_refused(workplace, tmp_
     assert "was begun on other demonstrations (0123456789abcdef" in capsys.readouterr().err
 
 
-def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, capsys):
-    """Of another version of the library, which called what it learned by another name."""
+def test_a_run_does_not_overwrite_a_run_of_another_configuration(tmp_path, monkeypatch, capsys):
+    """Another version of the library may name its parameters differently."""
     arguments = [*RANDOM, "--steps", "4", "--demos", "1", "--runs", str(tmp_path / "runs")]
     assert babyai.main(arguments) == 0
     specification = only_folder(tmp_path / "runs") / "specification.json"
@@ -247,8 +247,8 @@ def test_a_run_that_does_not_fit_leaves_what_is_there(tmp_path, monkeypatch, cap
     assert specification.read_text() == before
 
 
-def test_a_data_set_of_the_users_own_is_trained_on(workplace):
-    arguments = ["--steps", "1", "--demos", "6", "--demonstrations", MINE, "--runs", "mine"]
+def test_a_run_trains_on_a_data_set_of_the_user(workplace):
+    arguments = ["--steps", "1", "--demos", "6", "--demonstrations", DATASET, "--runs", "mine"]
     assert babyai.main([*RANDOM, *arguments]) == 0
     folders = only_folder(workplace / "mine"), run_folder(workplace)
     found, expected = (json.loads((folder / "data.json").read_text()) for folder in folders)
@@ -256,8 +256,8 @@ def test_a_data_set_of_the_users_own_is_trained_on(workplace):
 
 
 def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):
-    kinds = {"one": GibbsConfig(1, 1), "two": GibbsConfig(1, 2)}
-    monkeypatch.setattr(quality, "variants", lambda trained, most: kinds)
+    searches = {"one": GibbsConfig(1, 1), "two": GibbsConfig(1, 2)}
+    monkeypatch.setattr(quality, "variants", lambda trained, most: searches)
     played, evaluate = [], rollouts.evaluate
 
     def record(make_adapter, episode_seeds, *rest, **options):
@@ -275,9 +275,9 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
     assert (tmp_path / "plot.png").stat().st_size > 1000
 
 
-def test_noise_is_tried_on_validation_levels_at_every_temperature(workplace, tmp_path, monkeypatch):
-    """PlaTe draws one beam at a temperature."""
-    monkeypatch.setattr(noise, "TEMPERATURES", (0.0, 0.5))  # a program is compiled for each
+def test_noise_plays_validation_levels_at_every_temperature(workplace, tmp_path, monkeypatch):
+    """PlaTe uses a single beam at temperatures above 0."""
+    monkeypatch.setattr(noise, "TEMPERATURES", (0.0, 0.5))  # each compiles a program
     folder = str(tmp_path)
     arguments = [*TOY_RUN, *"--method leap --level GoToLocalS7N5 --steps 0 --episodes 2".split()]
     assert noise.main([*arguments, "--runs", folder]) == 0

@@ -24,7 +24,7 @@ from leapjax.errors import UserError
         ),
     ],
 )
-def test_a_value_of_any_type_is_that_of_python_or_numpy(check, values, expected):
+def test_checks_convert_values_to_python_or_numpy_types(check, values, expected):
     for value in values:
         found = check(value)
         assert type(found) is type(expected)
@@ -32,7 +32,7 @@ def test_a_value_of_any_type_is_that_of_python_or_numpy(check, values, expected)
 
 
 @pytest.mark.parametrize(
-    ("check", "values", "says"),
+    ("check", "values", "message"),
     [
         (checks.check_integer, [5.0, "5", None, True, np.True_, [5]], "it must be an integer"),
         (checks.check_number, [math.nan, math.inf, "1", None, True, 1j, 10**400], "it must be"),
@@ -43,20 +43,20 @@ def test_a_value_of_any_type_is_that_of_python_or_numpy(check, values, expected)
         (lambda _, x: checks.check_seeds(x), [[2**32], [0.0], 5, np.array(["a"]), {}], "seed"),
     ],
 )
-def test_other_values_are_refused(check, values, says):
+def test_invalid_values_raise_an_error(check, values, message):
     for value in values:
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=message):
             check("it", value)
 
 
-def test_integers_out_of_range_are_refused():
+def test_integers_out_of_range_raise_an_error():
     with pytest.raises(UserError, match="at least 1, got 0"):
         checks.check_integer("count", 0, 1)
     with pytest.raises(UserError, match=r"at most 2147483647, got 9{57}\.\.\."):
         checks.check_integer("count", 10**100 - 1)
 
 
-def test_numbers_fit_another_type_or_are_refused():
+def test_numbers_that_do_not_fit_a_type_raise_an_error():
     assert checks.check_fits("it", [1.0, -2.0], np.dtype(np.int8)).tolist() == [1, -2]
     assert checks.check_fits("it", np.uint64(2**31 - 1), np.dtype(np.int32)) == 2**31 - 1
     assert checks.check_fits("it", np.array([0, 1]), np.dtype(bool)).tolist() == [False, True]
@@ -110,18 +110,18 @@ WRONG = {
 
 
 @pytest.mark.parametrize("field", WRONG)
-def test_a_field_holds_what_its_type_says(field):
+def test_fields_of_the_wrong_type_raise_an_error(field):
     for value in WRONG[field]:
         with pytest.raises(UserError, match=f"^{field} must be"):
             Example(**{field: value})
 
 
-def test_a_configuration_holds_plain_values():
-    given = Example(
+def test_configurations_convert_fields_to_plain_values():
+    example = Example(
         np.int64(3), np.float32(0.5), np.True_, np.str_("b"), [1, np.float64(2)], np.arange(2),
         jnp.int32(4), math.inf,
     )  # fmt: skip
-    assert given == Example(3, 0.5, True, "b", (1, 2.0), (0, 1), 4, math.inf)
-    assert isinstance(hash(given), int)
-    # An integer that stands for a number is written as one: names are made of what is written.
+    assert example == Example(3, 0.5, True, "b", (1, 2.0), (0, 1), 4, math.inf)
+    assert isinstance(hash(example), int)
+    # A float field keeps an integer, because the name of a run depends on how JSON writes it.
     assert type(Example(share=1).share) is int

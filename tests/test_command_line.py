@@ -1,4 +1,4 @@
-"""The command line as someone meets it who has just installed the package."""
+"""The command line, as a new user meets it."""
 
 import importlib
 import os
@@ -29,10 +29,10 @@ def python(*arguments, **options):
 
 @pytest.mark.parametrize("command", ["leapjax", "experiments babyai", "experiments.babyai"])
 def test_the_version_needs_no_jax(command):
-    """-S hides all that is installed, and with it the version."""
-    done = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
+    """-S hides all installed packages, and with them the version."""
+    completed = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
+    assert (completed.returncode, completed.stderr) == (0, "")
+    assert completed.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
 
 
 @pytest.mark.parametrize(
@@ -50,26 +50,26 @@ def test_usage_lines_say_how_a_program_was_started(main, started, command, monke
     for arguments, code in (["--help"], 0), (["--nothing"], 2):
         with pytest.raises(SystemExit, match=str(code)):
             main(["babyai", *arguments])
-    said = capsys.readouterr()
-    assert said.out.startswith(f"usage: {command} [-h]") and f"{command} --help" in said.err
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"usage: {command} [-h]") and f"{command} --help" in printed.err
 
 
-def test_output_that_nobody_reads_ends_a_program_quietly():
+def test_a_closed_output_pipe_ends_a_program_quietly():
     reader, writer = os.pipe()
     os.close(reader)
-    done = python("-m", "experiments", "--help", stdout=writer)
+    completed = python("-m", "experiments", "--help", stdout=writer)
     os.close(writer)
-    assert (done.returncode, done.stderr) == (startup.UNREAD, "")
+    assert (completed.returncode, completed.stderr) == (startup.UNREAD, "")
 
 
-def helps(main, arguments, capsys, monkeypatch):
-    """By option, what the help of a program says, the default apart."""
+def read_help(main, arguments, capsys, monkeypatch):
+    """Returns the help text of each option of a program, without the default."""
     monkeypatch.setenv("COLUMNS", "1000")
     with pytest.raises(SystemExit, match="0"):
         main([*arguments, "--help"])
-    said = re.sub("[│]", "", capsys.readouterr().out)
-    found = re.findall(r"^ *(--\w\S*|\[?RUNS)[^\n]*?(?:  +|\n +)(\w.*)$", said, re.MULTILINE)
-    return {option: re.sub(r" ?\((default: .*|required)\) *$", "", of) for option, of in found}
+    printed = re.sub("[│]", "", capsys.readouterr().out)
+    found = re.findall(r"^ *(--\w\S*|\[?RUNS)[^\n]*?(?:  +|\n +)(\w.*)$", printed, re.MULTILINE)
+    return {option: re.sub(r" ?\((default: .*|required)\) *$", "", body) for option, body in found}
 
 
 @pytest.mark.parametrize(
@@ -79,10 +79,10 @@ def helps(main, arguments, capsys, monkeypatch):
 def test_every_option_is_explained_in_whole_sentences(command, capsys, monkeypatch):
     name, *arguments = command.split()
     main = importlib.import_module(f"experiments.{name}").main
-    found = helps(main, arguments, capsys, monkeypatch)
+    found = read_help(main, arguments, capsys, monkeypatch)
     assert found
-    for option, said in found.items():
-        assert re.fullmatch(r"[A-Z0-9].*[.)\]] *", said), f"{option}: {said}"
+    for option, printed in found.items():
+        assert re.fullmatch(r"[A-Z0-9].*[.)\]] *", printed), f"{option}: {printed}"
 
 
 @pytest.mark.parametrize(
@@ -93,10 +93,10 @@ def test_every_option_is_explained_in_whole_sentences(command, capsys, monkeypat
         (babyai.main, {"--level", "--demonstrations"}, {"--env", "--dataset", "--game"}),
     ],
 )
-def test_each_program_has_its_own_names_of_options(main, own, not_own, capsys, monkeypatch):
-    found = helps(main, [], capsys, monkeypatch)
+def test_programs_show_only_options_of_their_own_domain(main, own, not_own, capsys, monkeypatch):
+    found = read_help(main, [], capsys, monkeypatch)
     assert own <= set(found) and not not_own & set(found)
-    assert not [said for said in found.values() if any(name in said for name in not_own)]
+    assert not [printed for printed in found.values() if any(name in printed for name in not_own)]
 
 
 def test_a_command_line_may_name_several_methods():
@@ -110,31 +110,31 @@ def test_a_command_line_may_name_several_methods():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         ("--method bc dtt", "unknown method 'dtt'"),
         ("--method", "--method needs a name"),
         ("--method bc dt --pretrained", "--method bc dt: .* is of one method"),
     ],
 )
-def test_methods_that_cannot_be_run_are_refused(arguments, says):
-    with pytest.raises(UserError, match=says):
+def test_invalid_methods_raise_an_error(arguments, message):
+    with pytest.raises(UserError, match=message):
         command_line.parse("babyai", arguments.split())
 
 
-def row(seed, method="bc", successes=5, **more):
-    of = {"seed": seed, "method": method, "hash": f"{seed}{method}"}
-    return toy_row(**of, episodes=10, successes=successes, success=successes / 10, **more)
+def make_row(seed, method="bc", successes=5, **more):
+    body = {"seed": seed, "method": method, "hash": f"{seed}{method}"}
+    return toy_row(**body, episodes=10, successes=successes, success=successes / 10, **more)
 
 
 def test_tables_end_with_the_mean_over_seeds():
     other = {"planner": {"iterations": 3}}
     rows = [
-        row(0),
-        row(1, successes=7),
-        row(0, "dt"),
-        row(1, "dt"),
-        row(2, "dt", configuration=other),
+        make_row(0),
+        make_row(1, successes=7),
+        make_row(0, "dt"),
+        make_row(1, "dt"),
+        make_row(2, "dt", configuration=other),
     ]
     table = results.make_success_table(rows)
     columns = {column.header: list(column.cells) for column in table.columns}

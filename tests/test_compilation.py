@@ -1,4 +1,4 @@
-"""Where compiled programs are kept, and when they are not."""
+"""The disk cache of compiled programs: its folder, and when it is off."""
 
 import os
 
@@ -21,7 +21,7 @@ SETTINGS = (FOLDER, SHORTEST, "jax_enable_compilation_cache")
 
 @pytest.fixture
 def no_cache(monkeypatch):
-    """JAX as it starts: without a cache, and with nothing decided."""
+    """Resets JAX to its initial state: no cache, and no decision about a cache."""
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     for name, value in zip(SETTINGS, (None, compilation.SHORTEST_OF_JAX, True), strict=True):
         jax.config.update(name, value)
@@ -33,9 +33,7 @@ def no_cache(monkeypatch):
     compilation_cache.reset_cache()
 
 
-def test_planners_are_kept_although_jax_has_compiled_something_before(
-    no_cache, tmp_path, monkeypatch
-):
+def test_planners_are_cached_even_if_jax_compiled_a_program_before(no_cache, tmp_path, monkeypatch):
     jax.config.update(SHORTEST, 0)
     jax.jit(lambda: jnp.full(3, 7))().block_until_ready()  # JAX decides that it has no cache
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
@@ -43,13 +41,13 @@ def test_planners_are_kept_although_jax_has_compiled_something_before(
     planner = compile_planner(energy, ShootingConfig(2, candidates=4))
     planner((), jax.random.split(jax.random.key(0), 1), np.zeros(1, np.float32))
     assert list((tmp_path / "programs").iterdir())
-    assert getattr(jax.config, SHORTEST) == 0  # what the user set stays
+    assert getattr(jax.config, SHORTEST) == 0  # the user's setting stays
 
 
 @pytest.mark.parametrize(
     ("setting", "value"), [(FOLDER, "elsewhere"), ("jax_enable_compilation_cache", False)]
 )
-def test_what_the_user_has_set_stays(setting, value, no_cache, tmp_path, monkeypatch):
+def test_user_settings_stay_unchanged(setting, value, no_cache, tmp_path, monkeypatch):
     monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
     jax.config.update(setting, value)
     before = [getattr(jax.config, name) for name in SETTINGS]
@@ -58,8 +56,8 @@ def test_what_the_user_has_set_stays(setting, value, no_cache, tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_it_can_be_turned_off(no_cache, tmp_path, monkeypatch):
-    for folder in ("off", str(tmp_path)):  # by the user, or by the program
+def test_users_and_programs_can_turn_the_cache_off(no_cache, tmp_path, monkeypatch):
+    for folder in ("off", str(tmp_path)):  # turned off by the user, or by the program
         monkeypatch.setenv("LEAPJAX_COMPILATION_CACHE", folder)
         jax_setup.start(cache=folder == "off")
         compilation.use_disk_cache()  # as `compile_planner` does
@@ -67,8 +65,8 @@ def test_it_can_be_turned_off(no_cache, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("system", ["linux", "windows"])
-def test_the_usual_folder_is_the_users_own(system, no_cache, tmp_path, monkeypatch):
-    if system == "windows":  # which has no owners of files, and no /proc
+def test_default_folder_is_in_the_users_cache_folder(system, no_cache, tmp_path, monkeypatch):
+    if system == "windows":  # Windows has no owners of files, and no /proc
         monkeypatch.delattr(os, "getuid")
         monkeypatch.setattr(compilation, "CPU", tmp_path / "nowhere")
         name = "Intel64 Family 6 Model 142 Stepping 10, GenuineIntel"
@@ -82,12 +80,12 @@ def test_the_usual_folder_is_the_users_own(system, no_cache, tmp_path, monkeypat
     assert getattr(jax.config, SHORTEST) == compilation.SHORTEST
 
 
-@pytest.mark.parametrize("why", ["others can write to", "cannot write to"])
-def test_what_cannot_be_kept_safely_is_not_kept_and_said_once(
-    why, no_cache, tmp_path, monkeypatch, capsys
+@pytest.mark.parametrize("reason", ["others can write to", "cannot write to"])
+def test_unsafe_folder_turns_the_cache_off_with_one_warning(
+    reason, no_cache, tmp_path, monkeypatch, capsys
 ):
     folder = tmp_path / "shared"
-    if why == "others can write to":
+    if reason == "others can write to":
         folder.mkdir()
         folder.chmod(0o777)
     else:
@@ -96,6 +94,6 @@ def test_what_cannot_be_kept_safely_is_not_kept_and_said_once(
     compilation.use_disk_cache()
     compilation.use_disk_cache()
     assert getattr(jax.config, FOLDER) is None
-    said = capsys.readouterr().err
-    assert said.startswith(f"compiled programs are not kept: {why}")
-    assert said.count("\n") == 1
+    warning = capsys.readouterr().err
+    assert warning.startswith(f"compiled programs are not kept: {reason}")
+    assert warning.count("\n") == 1

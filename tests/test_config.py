@@ -1,4 +1,4 @@
-"""What a run is configured by, and the hash that names its results."""
+"""The configuration of a run, and the hash that names its results."""
 
 import dataclasses
 import itertools
@@ -32,8 +32,8 @@ LEVEL = "GoToLocalS7N5"
 
 
 @dataclasses.dataclass(frozen=True)
-class Later(Settings):
-    """The settings of a version to come."""
+class LaterSettings(Settings):
+    """Settings of a later version, which adds a field."""
 
     mood: str = "calm"
 
@@ -43,7 +43,7 @@ def parse(*arguments):
     return found
 
 
-def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
+def test_hashes_differ_by_level_method_preset_and_seed():
     cases = list(itertools.product(BABYAI.levels, METHODS, ("leapjax", "paper"), (0, 1)))
     hashes = {
         hash_config(find_preset("babyai", level, method, name), seed)
@@ -57,42 +57,42 @@ def test_every_level_method_preset_and_seed_has_a_hash_of_its_own():
     ["--demos 499", "--context 1", "--heads 2", "--steps 7", "--iterations 9", "--masking one",
      "--radius 2", "--test-seed 1", "--validation", "--executed 3"],
 )  # fmt: skip
-def test_what_a_result_depends_on_is_in_its_hash(option):
+def test_options_that_affect_the_result_change_the_hash(option):
     assert hash_config(parse(*option.split()), 0) != hash_config(parse(), 0)
 
 
-def test_what_it_does_not_depend_on_is_not():
+def test_options_that_do_not_affect_the_result_keep_the_hash():
     options = "--seeds 1 2 --record --runs elsewhere --no-pictures --checkpoint-seconds 1 --fsdp 2"
-    more = "--microbatch 8 --demos 500"  # as the preset says
+    more = "--microbatch 8 --demos 500"  # the preset's values
     found = parse(*options.split(), *more.split())
     assert hash_config(found, 0) == hash_config(parse(), 0)
 
 
-def test_a_setting_that_is_added_later_changes_no_name(monkeypatch):
-    def names(*options):
+def test_a_new_setting_at_its_default_keeps_hashes_and_identities(monkeypatch):
+    def identify(*options):
         chosen = parse(*options)
         specification = specify(chosen, 0, make_domain(chosen))
         return hash_config(chosen, 0), pretrained.describe_identity(specification)
 
     methods = [method for method in METHODS if METHODS[method].everywhere]
-    before = [names("--method", method) for method in methods]
-    monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=Later))
-    monkeypatch.setattr(babyai, "Settings", Later)
-    assert isinstance(parse().domain_settings, Later)
-    assert [names("--method", method) for method in methods] == before
-    assert names("--mood", "calm") == before[0]
-    assert not set(names("--mood", "angry")) & set(before[0])
+    before = [identify("--method", method) for method in methods]
+    monkeypatch.setitem(domains.DOMAINS, "babyai", BABYAI._replace(settings=LaterSettings))
+    monkeypatch.setattr(babyai, "Settings", LaterSettings)
+    assert isinstance(parse().domain_settings, LaterSettings)
+    assert [identify("--method", method) for method in methods] == before
+    assert identify("--mood", "calm") == before[0]
+    assert not set(identify("--mood", "angry")) & set(before[0])
 
 
-def test_a_strategy_of_ones_own_is_not_saved():
+def test_saving_a_custom_fill_raises_an_error():
     chosen = parse()
     specification = specify(chosen, 0, make_domain(chosen))
-    own = GibbsConfig(5, 5, fill=lambda energies, key: energies[:, 0])
+    custom = GibbsConfig(5, 5, fill=lambda energies, key: energies[:, 0])
     with pytest.raises(UserError, match="a strategy by name, such as fill='confident'"):
-        pretrained.describe_identity(dataclasses.replace(specification, planner=own))
+        pretrained.describe_identity(dataclasses.replace(specification, planner=custom))
 
 
-def test_the_settings_of_a_row_can_be_read_back():
+def test_settings_are_restored_from_a_row():
     chosen = parse("--heads", "2", "--masking", "each", "--clutter", "0.2", "--steps", "7")
     row = list_settings(chosen, seed=0)
     for group in GROUPS:
@@ -106,56 +106,56 @@ def test_the_settings_of_a_row_can_be_read_back():
             serialization.from_json(type(settings), {**row[group], "mood": "calm"})
 
 
-def test_preset_paper_masks_and_ends_as_the_authors_code_does():
-    learned = {level: find_preset("babyai", level, "leap", "paper").method_settings
+def test_paper_preset_masks_and_ends_plans_like_the_authors_code():
+    by_level = {level: find_preset("babyai", level, "leap", "paper").method_settings
                for level in (LEVEL, "GoToObjMazeS7", "PickUpLoc")}  # fmt: skip
-    assert [each.masking for each in learned.values()] == ["each", "each", "all"]
-    assert not any(each.end or each.repeat_state for each in learned.values())
+    assert [each.masking for each in by_level.values()] == ["each", "each", "all"]
+    assert not any(each.end or each.repeat_state for each in by_level.values())
     assert find_preset("babyai", LEVEL, "leap", "leapjax").method_settings.end
     # In star graphs there is no pose to leave out, and a plan may end.
     stars = find_preset("stars", "Star3x5", "leap", "paper").method_settings
     assert stars.repeat_state and stars.end
 
 
-def test_all_levels_are_those_of_the_paper():
+def test_level_all_selects_the_levels_of_the_paper():
     found = command_line.parse("babyai", ["--level", "all", "--demos", "9"])
     assert [each.level for each in found] == list(BABYAI.levels)
     assert {each.demos for each in found} == {9}
-    assert len({each.planner.horizon for each in found}) > 1  # each with its own defaults
+    assert len({each.planner.horizon for each in found}) > 1  # each level has its own defaults
 
 
 @pytest.mark.parametrize(
-    ("method", "option", "value", "why"),
+    ("method", "option", "value", "reason"),
     [
         ("classifier", "--fill", "sequential", "judges complete plans only"),
         ("random", "--horizon", "3", "its horizon is 1"),
     ],
 )
-def test_a_method_is_not_asked_to_plan_in_a_way_that_it_cannot(method, option, value, why):
-    with pytest.raises(UserError, match=f"{value}.*{why}") as raised:
+def test_unsupported_planner_options_raise_an_error(method, option, value, reason):
+    with pytest.raises(UserError, match=f"{value}.*{reason}") as raised:
         command_line.parse("babyai", ["--method", method, option, value])
     assert option in shell.describe(raised.value)
 
 
 @pytest.mark.parametrize("domain", ["stars", "sudoku"])
-def test_the_classifier_can_search_where_presets_fill_plans_action_by_action(domain):
+def test_searches_of_the_classifier_fill_plans_together(domain):
     found = {name: command_line.parse(domain, ["--method", name])[0]
              for name in ("leap", "classifier")}  # fmt: skip
     assert found["leap"].planner.fill == "confident"
-    ways = list_searches(found["classifier"])
-    assert {way.planner.fill for way in ways} == {"together"}
+    searches = list_searches(found["classifier"])
+    assert {search.planner.fill for search in searches} == {"together"}
     others = list_searches(found["leap"])
-    assert len(others) > len(ways) > 1
-    assert found["leap"] not in others  # it has been played already
+    assert len(others) > len(searches) > 1
+    assert found["leap"] not in others  # a run plays its own configuration first
 
 
-def test_every_program_is_known_by_name(capsys):
+def test_programs_are_listed_and_found_by_name(capsys):
     assert programs.main(["--help"]) == 0
     shown = capsys.readouterr().out
     assert all(f"  {name} " in shown for name in programs.PROGRAMS)
     assert programs.main(["babyia"]) == 2
     assert "did you mean babyai" in capsys.readouterr().err
-    assert programs.main(["properties", "--only", "nothing"]) == 2  # what follows is handed on
+    assert programs.main(["properties", "--only", "nothing"]) == 2  # the program parses the rest
 
 
 KINDS = [
@@ -163,7 +163,7 @@ KINDS = [
     *(find_domain(name).settings for name in DOMAINS),
     ModelConfig, TrainingConfig, GibbsConfig, ShootingConfig, CrossEntropyConfig, BeamConfig,
 ]  # fmt: skip
-NEVER = {
+INVALID = {
     int: [1.0, True, "1", math.nan, -1, 2**31],
     float: [True, "1", math.nan, -math.inf],
     bool: [1, "yes", None],
@@ -173,12 +173,12 @@ NEVER = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_field_of_every_configuration_is_checked(kind):
+def test_every_field_of_every_configuration_is_validated(kind):
     for field in dataclasses.fields(kind):
         type_of = typing.get_type_hints(kind)[field.name]
         kinds = typing.get_args(type_of) or (type_of,)
         pair = typing.get_origin(type_of) is tuple
-        for value in NEVER[kinds[0]]:
+        for value in INVALID[kinds[0]]:
             if value is not None or type(None) not in kinds:
                 with pytest.raises(UserError, match=field.name):
                     kind(**{field.name: (value,) * len(kinds) if pair else value})
@@ -191,7 +191,7 @@ def test_every_field_of_every_configuration_is_checked(kind):
      "--batch 2147483647", "--demos 9999999", "--checkpoint-seconds nan", "--rules inf",
      "--fsdp 9223372036854775808", "--clip nan"],
 )  # fmt: skip
-def test_a_number_that_no_machine_can_serve_is_refused(option, monkeypatch):
+def test_excessive_numbers_raise_an_error(option, monkeypatch):
     pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 16 << 18}
     monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
     name, value = option.split()
@@ -199,7 +199,7 @@ def test_a_number_that_no_machine_can_serve_is_refused(option, monkeypatch):
         parse("--level", LEVEL, name, value)
 
 
-def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkeypatch, tmp_path):
+def test_memory_checks_reject_a_network_or_program_that_is_too_large(monkeypatch, tmp_path):
     pages = {"SC_PAGE_SIZE": 1 << 12, "SC_PHYS_PAGES": 10 << 18}
     monkeypatch.setattr(files.os, "sysconf", pages.__getitem__)
 
@@ -217,7 +217,7 @@ def test_what_a_network_and_its_program_need_is_compared_with_the_machine(monkey
     analysis.temp_size_in_bytes = 2 << 30
     with pytest.raises(UserError, match="--batch.* at least 16 GiB"):
         memory.check_program(program)
-    memory.check_program(SimpleNamespace(memory_analysis=lambda: None))  # a backend that says none
+    memory.check_program(SimpleNamespace(memory_analysis=lambda: None))  # without an analysis
     (tmp_path / "memory.max").write_text("2147483648\n")  # a container of 2 GiB
     monkeypatch.setattr(files, "CONTAINER_MEMORY", tmp_path / "memory.max")
     with pytest.raises(UserError, match="this machine has 2"):

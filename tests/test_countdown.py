@@ -1,4 +1,4 @@
-"""Countdown: the verifier and the search agree with brute force; targets of tests are new."""
+"""Countdown: the verifier and the search agree with brute force; test targets are held out."""
 
 import functools
 import itertools
@@ -38,11 +38,11 @@ from leapjax.types import pad_token
 from tests.parameters import random_parameters
 from tests.programs import only_long
 
-same = np.testing.assert_array_equal
+assert_equal = np.testing.assert_array_equal
 
 
 def apply(a, operation, b):
-    """The result of an operation in exact arithmetic; `None` if the rules forbid it."""
+    """Computes the exact result of an operation, if the rules allow it."""
     if operation == PLUS:
         return a + b
     if operation == MINUS:
@@ -53,7 +53,7 @@ def apply(a, operation, b):
 
 
 def enumerate_solutions(numbers):
-    """Every solution of every target, as equations, by brute force over all orders."""
+    """Yields the equations of every solution of every target by brute force over all orders."""
     if len(numbers) == 1:
         yield []
         return
@@ -70,7 +70,7 @@ def enumerate_solutions(numbers):
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.integers(1, 99), min_size=2, max_size=3) | st.lists(
     st.integers(1, 12), min_size=4, max_size=4))  # fmt: skip
-def test_the_search_finds_a_solution_where_brute_force_does(numbers):
+def test_search_finds_a_solution_whenever_brute_force_does(numbers):
     reached = {equations[-1][-1] for equations in enumerate_solutions(numbers)}
     for target in range(101):
         found = problems.solve(numbers, target)
@@ -82,11 +82,11 @@ def test_the_search_finds_a_solution_where_brute_force_does(numbers):
 
 
 @pytest.mark.parametrize("numbers", [[2, 3], [4, 4], [6, 3, 2], [5, 5, 1], [1, 1, 1]])
-def test_the_verifier_accepts_every_solution_and_nothing_else(numbers):
+def test_verifier_accepts_exactly_the_solutions(numbers):
     every = {tuple(equations): equations[-1][-1] for equations in enumerate_solutions(numbers)}
     written = {tuple(write_equations(e).tolist()): target for e, target in every.items()}
     assert len(written) == len(every)
-    if len(numbers) == 2:  # all equations of small numbers
+    if len(numbers) == 2:  # try all equations of small numbers
         small, operations = range(18), (PLUS, MINUS, TIMES, DIVIDE)
         for equation in itertools.product(small, operations, small, small):
             tokens = write_equations([equation]).tolist()
@@ -116,19 +116,19 @@ def test_equations_are_written_digit_by_digit():
 
 
 @pytest.mark.parametrize("name", ["Countdown2", "Countdown3", "Countdown4", "Countdown5"])
-def test_a_drawn_problem_has_the_solution_that_is_drawn(name):
-    level, kinds = problems.find_level(name), set()
+def test_problems_are_drawn_with_a_valid_solution(name):
+    level, distinct = problems.find_level(name), set()
     for seed in range(12):
         problem, solution = problems.draw(level, seed)
         numbers, target = problem.numbers.tolist(), int(problem.target)
         assert len(numbers) == level.numbers and len(solution) == level.length
         assert min(numbers) >= 1 and max(numbers) <= 99 and 10 <= target <= 100
         assert problems.is_solution(numbers, target, solution.tolist())
-        same(problem.written, [OPEN] * level.length)
-        kinds.add((*numbers, target))
+        assert_equal(problem.written, [OPEN] * level.length)
+        distinct.add((*numbers, target))
         again, _ = problems.draw(level, seed)
-        same(again.numbers, numbers)
-    assert len(kinds) == 12
+        assert_equal(again.numbers, numbers)
+    assert len(distinct) == 12
 
 
 def test_training_validation_and_test_share_no_target():
@@ -136,7 +136,7 @@ def test_training_validation_and_test_share_no_target():
     test, also_test, validation, training = (set(problems.list_targets(seed)) for seed in first)
     assert test == also_test and test | validation | training == set(range(10, 101))
     assert len(test) == len(validation) == 8 and len(training) == 75
-    for last_digits in ({target % 10 for target in of} for of in (test, validation)):
+    for last_digits in ({target % 10 for target in targets} for targets in (test, validation)):
         assert len(last_digits) == 8
     for seed in (*range(30), *range(seeds.TRAINING_START, seeds.TRAINING_START + 30)):
         problem, _ = problems.draw(Level(3), seed)
@@ -150,20 +150,20 @@ def play(adapter, seed, tokens):
     return [adapter.step(int(token)) for token in tokens]
 
 
-def test_any_solution_is_rewarded_and_an_illegal_token_is_the_last():
+def test_any_solution_is_rewarded_and_illegal_tokens_end_the_episode():
     level = Level(3)
     adapter = CountdownAdapter(level)
     problem, solution = problems.draw(level, 3)
     numbers, target = problem.numbers.tolist(), int(problem.target)
     every = [(write_equations(e), e[-1][-1]) for e in enumerate_solutions(numbers)]
-    ways = [tokens for tokens, reached in every if reached == target]
-    assert any((way == solution).all() for way in ways) and len(ways) > 1
-    for way in ways:
-        steps = play(adapter, 3, way)
+    answers = [tokens for tokens, reached in every if reached == target]
+    assert any((answer == solution).all() for answer in answers) and len(answers) > 1
+    for answer in answers:
+        steps = play(adapter, 3, answer)
         found = [(step.reward, step.terminated, step.success) for step in steps]
         assert found == [(0, False, False)] * 19 + [(1, True, True)]
-        same(steps[-1].observation.written, way)
-    # Legal equations that reach another number.
+        assert_equal(steps[-1].observation.written, answer)
+    # Legal equations that reach another number fail.
     *before, last = play(adapter, 3, next(tokens for tokens, reached in every if reached != target))
     assert not any(step.terminated for step in before)
     assert last.terminated and not last.success and last.reward == 0
@@ -171,7 +171,7 @@ def test_any_solution_is_rewarded_and_an_illegal_token_is_the_last():
         (step,) = play(adapter, 3, [wrong])
         assert step.terminated and not step.success and step.observation.place == 0
     absent = next(n for n in range(10, 100) if n not in numbers)
-    operand = [0, absent // 10, absent % 10]  # ends the episode with its last digit
+    operand = [0, absent // 10, absent % 10]  # the last digit ends the episode
     assert [step.terminated for step in play(adapter, 3, operand)] == [False] * 2 + [True]
     result = solution[:10].copy()
     result[9] = (result[9] + 1) % 10  # the arithmetic is wrong
@@ -184,8 +184,8 @@ def collect(name, count):
 
 
 @functools.cache
-def reordered(numbers):
-    """The window at a place of a demonstration, its solution in another order: compiled once."""
+def compile_reorder(numbers):
+    """Returns demonstrations, and a compiled function that reorders the window at an index."""
     data, level = collect(f"Countdown{numbers}", 4), Level(numbers)
     steps = windows.concatenate(data, problems.repeat_solution)
     steps = jax.tree.map(jnp.asarray, steps)
@@ -196,22 +196,22 @@ def reordered(numbers):
 @pytest.mark.parametrize("numbers", [2, 3, 4, 5])
 @pytest.mark.parametrize("place", [0, 1, -6])
 def test_a_reordered_window_solves_the_same_problem(numbers, place):
-    (data, change), level, seen = reordered(numbers), Level(numbers), set()
+    (data, change), level, variants = compile_reorder(numbers), Level(numbers), set()
     place %= level.length
     for seed, episode in itertools.product(range(8), range(4)):
         index = episode * level.length + place
         window = jax.device_get(change(jax.random.key(seed), index))
         problem, past = window.context.observation, window.context.past
         before = data[episode].observations
-        same(problem.numbers, before.numbers[0])
+        assert_equal(problem.numbers, before.numbers[0])
         assert (problem.target, problem.place) == (before.target[0], place)
         rest = level.length - place
         solution = [*problem.written[:place].tolist(), *window.actions[:rest].tolist()]
         given, target = problem.numbers.tolist(), int(problem.target)
         assert problems.is_solution(given, target, solution)
-        same(problem.written[place:], OPEN)
-        same(window.actions[rest:], END)
-        # The same operations on the same numbers.
+        assert_equal(problem.written[place:], OPEN)
+        assert_equal(window.actions[rest:], END)
+        # The operations and their numbers stay.
         new, old = map(problems.read_equations, (solution, data[episode].actions.tolist()))
         assert sorted(map(sorted, new)) == sorted(map(sorted, old))
         for back in (1, 2):
@@ -220,18 +220,18 @@ def test_a_reordered_window_solves_the_same_problem(numbers, place):
                 assert not past.numbers[-back].any() and not past.written[-back].any()
                 continue
             assert window.context.actions[-back] == solution[place - back]
-            same(past.written[-back][: place - back], solution[: place - back])
-            same(past.written[-back][place - back :], OPEN)
+            assert_equal(past.written[-back][: place - back], solution[: place - back])
+            assert_equal(past.written[-back][place - back :], OPEN)
             assert past.place[-back] == place - back
-        seen.add((episode, *solution))
-    assert len(seen) > 4 + (numbers > 3)  # episodes: one order for some, several for others
+        variants.add((episode, *solution))
+    assert len(variants) > 4 + (numbers > 3)  # some episodes have several orders
 
 
-def test_independent_equations_change_places_and_others_do_not():
+def test_only_independent_equations_are_reordered():
     level = Level(4)
     blank = blank_context(make("Countdown4", Settings()), 0)
 
-    def orders(*equations):
+    def sample_orders(*equations):
         solution = write_equations(equations)
         numbers = np.zeros(4, np.int32)
         problem = problems.Problem(numbers, np.int32(0), np.full(30, OPEN), np.int32(0))
@@ -245,13 +245,13 @@ def test_independent_equations_change_places_and_others_do_not():
         read = [problems.read_equations(each.tolist()) for each in found]
         return {tuple(e[-1] for e in each) for each in read}, len(np.unique(found, axis=0))
 
-    independent = orders((9, MINUS, 2, 7), (8, TIMES, 3, 24), (24, PLUS, 7, 31))
+    independent = sample_orders((9, MINUS, 2, 7), (8, TIMES, 3, 24), (24, PLUS, 7, 31))
     assert independent == ({(7, 24, 31), (24, 7, 31)}, 2 * 4)
-    chain = orders((9, MINUS, 2, 7), (7, TIMES, 3, 21), (21, DIVIDE, 1, 21))
+    chain = sample_orders((9, MINUS, 2, 7), (7, TIMES, 3, 21), (21, DIVIDE, 1, 21))
     assert chain == ({(7, 21, 21)}, 2)
 
 
-def test_the_order_of_the_given_numbers_means_nothing_to_the_network():
+def test_network_ignores_the_order_of_the_given_numbers():
     config = find_preset("countdown", "Countdown3", "leap", "leapjax")
     model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
     domain = make("Countdown3", Settings())
@@ -274,7 +274,7 @@ def test_the_order_of_the_given_numbers_means_nothing_to_the_network():
     assert np.abs(energies(other) - found)[np.isfinite(found)].max() > 1e-4
 
 
-def test_the_network_has_less_than_a_million_parameters():
+def test_network_has_fewer_than_a_million_parameters():
     config = find_preset("countdown", "Countdown5", "leap", "leapjax")
     domain = make("Countdown5", Settings())
     horizon = config.planner.horizon
@@ -292,12 +292,12 @@ def test_the_network_has_less_than_a_million_parameters():
         ("countdown4", "did you mean Countdown4"),
     ],
 )
-def test_unknown_levels_are_refused(name, message):
+def test_unknown_levels_raise_an_error(name, message):
     with pytest.raises(UserError, match=message):
         problems.find_level(name)
 
 
-def test_data_that_solve_no_problem_are_refused():
+def test_invalid_demonstrations_raise_an_error():
     source = make("Countdown3", Settings()).demonstrations
     (one,) = source.collect(1, 0, lambda done: None).demonstrations
     states = one.observations

@@ -1,4 +1,4 @@
-"""A domain of one's own goes through the same pipeline as BabyAI."""
+"""A custom domain goes through the same pipeline as BabyAI."""
 
 import jax
 import numpy as np
@@ -17,12 +17,12 @@ from tests import frozen_lake
 from tests.programs import LONG
 
 LAKE = Experiment("lake", "frozen_lake")
-EVERY = (
+COMMON = (
     "--steps 600 --batch 13 --demos 3 --episodes 5 --layers 1 --width 32 "
     "--heads 2 --learning-rate 0.01 --warmup 5 --no-pictures"
-).split()  # options that every method has
-# There are many shortest ways. All positions at once would mix them.
-TOY = [*EVERY, "--temperature", "0", "--fill", "confident"]
+).split()  # options of every method
+# Filling all positions at once would mix the many shortest paths.
+TOY = [*COMMON, "--temperature", "0", "--fill", "confident"]
 
 
 @pytest.fixture(autouse=True)
@@ -33,34 +33,34 @@ def workplace(tmp_path, monkeypatch):
     return tmp_path
 
 
-def first_plan(planner):
-    """The plan from the first state."""
+def plan_first(planner):
+    """Plans from the first state."""
     history = rollouts.History(np.zeros((), np.int64), planner.specification.context, 5)
     return planner(leap.plan_keys(0, np.zeros(1), np.zeros(1)), rollouts.stack_contexts([history]))
 
 
-def test_leap_learns_a_domain_of_ones_own(workplace):
+def test_leap_learns_a_custom_domain(workplace):
     assert running.main(LAKE, TOY) == 0
     (row,) = results.read(workplace / "runs" / "lake.jsonl")
     assert (row["domain"], row["level"]) == ("frozen_lake", frozen_lake.LEVEL)
     assert row["successes"] == row["episodes"] == 5
-    assert row["mean_return"] == 1.0 and row["mean_length"] == 6.0  # a shortest way
+    assert row["mean_return"] == 1.0 and row["mean_length"] == 6.0  # a shortest path
     assert row["paper_success"] is None
     (folder,) = (path for path in (workplace / "runs").iterdir() if path.is_dir())
     planner = leap.load(folder)
     adapter = frozen_lake.make_adapter()
     adapter.reset(0)
-    plan = first_plan(planner)
+    plan = plan_first(planner)
     for action in plan.actions[0]:
         assert not adapter.step(int(action)).terminated
 
 
-def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quick_begin):
+def test_one_command_runs_every_method(workplace, monkeypatch, capsys, quick_begin):
     kept = methods.METHODS if LONG else ("iql", "plate", "random")
     for name in methods.METHODS.keys() - kept:
-        less = methods.METHODS[name]._replace(everywhere=False)  # the others are no different
-        monkeypatch.setitem(methods.METHODS, name, less)
-    arguments = [*EVERY, "--steps", "0", "--method", "all"]  # gradients take long to compile
+        excluded = methods.METHODS[name]._replace(everywhere=False)  # similar to the kept ones
+        monkeypatch.setitem(methods.METHODS, name, excluded)
+    arguments = [*COMMON, "--steps", "0", "--method", "all"]  # no gradients, which compile slowly
     assert running.main(LAKE, arguments) == 0
     rows = results.read(workplace / "runs" / "lake.jsonl")
     assert [row["method"] for row in rows] == [
@@ -68,16 +68,16 @@ def test_every_method_from_one_command_line(workplace, monkeypatch, capsys, quic
     ]
     for method in ("iql", "plate"):  # with a target network, and another planner
         (folder,) = (workplace / "runs").glob(f"*-{method}-*")
-        plan = first_plan(leap.load(folder))
+        plan = plan_first(leap.load(folder))
         assert plan.valid.all() and (plan.actions < 5).all()
-    # A planner that is trained already is of one method.
+    # A checkpoint fixes the method.
     (folder,) = (workplace / "runs").glob("*-plate-*")
     for others, message in (("all", "of one method"), ("iql", "method is plate, not iql")):
         assert running.main(LAKE, [*arguments[:-1], others, "--checkpoint", str(folder)]) == 2
         assert message in capsys.readouterr().err
 
 
-def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(
+def test_methods_that_learn_from_rewards_reject_data_without_rewards(
     workplace, capsys, quick_begin
 ):
     lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
@@ -85,15 +85,15 @@ def test_data_without_rewards_are_refused_to_methods_that_learn_from_them(
     for demonstration in collection.demonstrations:
         demonstration.rewards[:] = 0
     storage.save("mine/unrewarded-v0", collection, lake, "nothing is rewarded")
-    arguments = [*EVERY, "--steps", "0", "--demonstrations", "mine/unrewarded-v0", "--method"]
-    for method, refused in (("dt", True), ("bc", False)):
-        assert methods.METHODS[method].rewards == refused
-        assert running.main(LAKE, [*arguments, method]) == (2 if refused else 0), method
+    arguments = [*COMMON, "--steps", "0", "--demonstrations", "mine/unrewarded-v0", "--method"]
+    for method, rejected in (("dt", True), ("bc", False)):
+        assert methods.METHODS[method].rewards == rejected
+        assert running.main(LAKE, [*arguments, method]) == (2 if rejected else 0), method
         error = capsys.readouterr().err
-        assert ("holds no rewards" in error and error.count("\n") == 1) == refused
+        assert ("holds no rewards" in error and error.count("\n") == 1) == rejected
 
 
-def test_contexts_of_another_domain_are_refused():
+def test_contexts_of_another_domain_raise_an_error():
     lake = frozen_lake.make(frozen_lake.LEVEL, frozen_lake.Settings())
     blank = blank_context(lake, 3)
     with pytest.raises(UserError, match=r"context\.past has shape \(3,\), but .* \(1,\)"):

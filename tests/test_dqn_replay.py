@@ -23,12 +23,12 @@ READ = [f"$store$_{name}" for name in STORED]
 OBSERVATION, ACTION, *_ = READ
 
 
-def episodes(lengths, seed: int = 0) -> list[Episode]:
-    """Episodes whose frames tell every episode and every step apart."""
-    return [_episode(length, 1000 * seed + i) for i, length in enumerate(lengths)]
+def make_episodes(lengths, seed: int = 0) -> list[Episode]:
+    """Makes episodes whose frames identify the episode and the step."""
+    return [_make_episode(length, 1000 * seed + i) for i, length in enumerate(lengths)]
 
 
-def _episode(length: int, seed: int) -> Episode:
+def _make_episode(length: int, seed: int) -> Episode:
     rng = np.random.default_rng(seed)
     frames = np.zeros((length, 84, 84), np.uint8)
     frames[:, :4, :4] = rng.integers(1, 256, (length, 4, 4))
@@ -37,10 +37,10 @@ def _episode(length: int, seed: int) -> Episode:
     return Episode(frames, rng.integers(0, 6, length, np.int32), rewards)
 
 
-def rows_of(some, padding: int = 3) -> dict[str, np.ndarray]:
-    """The rows of whole episodes as Dopamine's buffer adds them, without a last stale row."""
+def make_rows(episodes, padding: int = 3) -> dict[str, np.ndarray]:
+    """Makes the rows that Dopamine's buffer adds for whole episodes, without a last stale row."""
     columns: dict[str, list] = {name: [] for name in STORED}
-    for e in some:
+    for e in episodes:
         columns["observation"] += [np.zeros((padding, 84, 84)), e.frames]
         columns["action"] += [np.zeros(padding), e.actions]
         columns["reward"] += [np.zeros(padding), e.rewards]
@@ -50,15 +50,15 @@ def rows_of(some, padding: int = 3) -> dict[str, np.ndarray]:
     }
 
 
-def stale(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """With a last row of an earlier pass of the buffer: as misleading as can be."""
+def add_stale(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Appends a misleading row, as left by an earlier pass of the buffer."""
     last = {"observation": np.full((1, 84, 84), 99), "action": [5], "reward": [1], "terminal": [1]}
     return {name: np.concatenate([x, np.asarray(last[name], x.dtype)]) for name, x in rows.items()}
 
 
-def put(folder: Path, some, number: int = 0, dqn_seed: int = 1) -> Path:
-    """Writes a shard of episodes, or of rows, with NumPy and gzip alone."""
-    rows = some if isinstance(some, dict) else stale(rows_of(some))
+def store_shard(folder: Path, episodes, number: int = 0, dqn_seed: int = 1) -> Path:
+    """Writes a shard of episodes, or of rows, using only NumPy and gzip."""
+    rows = episodes if isinstance(episodes, dict) else add_stale(make_rows(episodes))
     logs = folder / "Pong" / str(dqn_seed) / "replay_logs"
     logs.mkdir(parents=True, exist_ok=True)
     count = len(rows["action"]) - 1
@@ -74,7 +74,7 @@ def read(folder: Path, transitions: int = 10**9, seed: int = 0):
     return replay.read(folder, PONG, transitions, seed)
 
 
-def refused(folder: Path, game=PONG, **options) -> str:
+def read_error(folder: Path, game=PONG, **options) -> str:
     with pytest.raises(UserError) as raised:
         replay.read(folder, game, **{"transitions": 10**9, "seed": 0, **options})
     message = str(raised.value)
@@ -82,16 +82,16 @@ def refused(folder: Path, game=PONG, **options) -> str:
     return message
 
 
-def ids(demonstrations) -> list[bytes]:
-    """What tells trajectories apart, whatever their order."""
+def identify(demonstrations) -> list[bytes]:
+    """Returns bytes that identify each trajectory."""
     return [np.asarray(d.observations[:-1]).tobytes() for d in demonstrations]
 
 
-def assert_are(demonstrations, expected) -> None:
-    """They are these whole episodes, in some order."""
+def assert_same_episodes(demonstrations, expected) -> None:
+    """Asserts that demonstrations are these whole episodes, in any order."""
     assert len(demonstrations) == len(expected)
     by_frames = {e.frames.tobytes(): e for e in expected}
-    for name, d in zip(ids(demonstrations), demonstrations, strict=True):
+    for name, d in zip(identify(demonstrations), demonstrations, strict=True):
         e = by_frames.pop(name)
         np.testing.assert_array_equal(d.observations[-1], e.frames[-1])
         np.testing.assert_array_equal(d.actions, e.actions)
@@ -101,161 +101,161 @@ def assert_are(demonstrations, expected) -> None:
         assert (d.terminated, d.truncated, d.seed) == (True, False, UNKNOWN_SEED)
 
 
-def conversions(folder: Path) -> list[Path]:
+def list_conversions(folder: Path) -> list[Path]:
     return sorted((folder / "Pong" / "1" / "leapjax").glob("*/frames.npy"))
 
 
 @pytest.fixture(scope="module")
 def three_shards(tmp_path_factory):
-    """36 episodes of 3 to 14 steps in three shards: nobody writes to them."""
+    """The folder of three shards, which tests must not change, and their 36 episodes."""
     folder = tmp_path_factory.mktemp("shards")
-    every = [episodes(range(3, 15), seed=number) for number in range(3)]
-    for number, some in enumerate(every):
-        put(folder, some, number)
-    return folder, [e for some in every for e in some]
+    groups = [make_episodes(range(3, 15), seed=number) for number in range(3)]
+    for number, episodes in enumerate(groups):
+        store_shard(folder, episodes, number)
+    return folder, [e for episodes in groups for e in episodes]
 
 
-def test_whole_trajectories_are_the_originals(three_shards):
+def test_whole_trajectories_equal_the_stored_episodes(three_shards):
     folder, originals = three_shards
     demonstrations, dropped = read(folder)
-    assert_are(demonstrations, originals)
+    assert_same_episodes(demonstrations, originals)
     assert not dropped
     # Their frames are views of one memory map.
     assert not demonstrations[0].observations.flags.writeable
     assert len({id(d.observations._mmap) for d in demonstrations}) == 1
 
 
-def test_what_files_cut_is_left_out_and_counted(tmp_path):
-    some = episodes([20, 30, 40, 50])
-    # Before rows 10 and after row 133: in the middle of the first and of the last.
-    put(tmp_path, stale({name: x[10:133] for name, x in rows_of(some).items()}))
-    for _ in range(2):  # from the shards and from their conversion
+def test_episodes_cut_by_a_file_are_dropped_and_counted(tmp_path):
+    episodes = make_episodes([20, 30, 40, 50])
+    # Starts in the middle of the first episode, and ends in the middle of the last.
+    store_shard(tmp_path, add_stale({name: x[10:133] for name, x in make_rows(episodes).items()}))
+    for _ in range(2):  # from the shards, then from their conversion
         demonstrations, dropped = read(tmp_path)
-        assert_are(demonstrations, some[1:3])
+        assert_same_episodes(demonstrations, episodes[1:3])
         assert dropped == {CUT_BEFORE: 1, CUT_AFTER: 1}
 
 
-def test_a_last_row_is_never_used(tmp_path):
-    some = episodes([5, 6])
-    put(tmp_path, rows_of(some))  # the row that ends the second episode is the stale one
+def test_last_row_of_a_shard_is_ignored(tmp_path):
+    episodes = make_episodes([5, 6])
+    store_shard(tmp_path, make_rows(episodes))  # its last row ends the second episode
     demonstrations, dropped = read(tmp_path)
-    assert_are(demonstrations, some[:1])
+    assert_same_episodes(demonstrations, episodes[:1])
     assert dropped == {CUT_AFTER: 1}
 
 
 @pytest.mark.parametrize("padding", [3, 0])
-def test_black_frames_of_a_game_are_kept(tmp_path, padding):
-    some = episodes([2, 3, 9, 1])
-    for part in some[2]:
-        part[:2] = 0  # nothing tells these from padding but that padding is three rows
-    put(tmp_path, stale(rows_of(some, padding)))
+def test_black_frames_of_an_episode_are_kept(tmp_path, padding):
+    episodes = make_episodes([2, 3, 9, 1])
+    for part in episodes[2]:
+        part[:2] = 0  # two rows of zeros, where padding has three
+    store_shard(tmp_path, add_stale(make_rows(episodes, padding)))
     demonstrations, dropped = read(tmp_path)
-    # Without padding nobody knows whether the first is whole.
-    assert_are(demonstrations, some if padding else some[1:])
+    # Without padding, the first episode may have begun before the file.
+    assert_same_episodes(demonstrations, episodes if padding else episodes[1:])
     assert dropped == ({} if padding else {CUT_BEFORE: 1})
 
 
-def test_sampling_takes_ten_at_a_visit_where_the_last_one_ended_until_there_are_enough(
+def test_sampling_takes_up_to_ten_episodes_in_order_per_visit(
     three_shards,
 ):
     folder, originals = three_shards
-    for wanted in (1, 30, 100):
-        lengths = [len(d.actions) for d in read(folder, wanted).demonstrations]
-        assert sum(lengths[:-1]) < wanted <= sum(lengths)
-    found = ids(read(folder, seed=5).demonstrations)
+    for minimum in (1, 30, 100):
+        lengths = [len(d.actions) for d in read(folder, minimum).demonstrations]
+        assert sum(lengths[:-1]) < minimum <= sum(lengths)
+    found = identify(read(folder, seed=5).demonstrations)
     shards = [[e.frames.tobytes() for e in originals[at : at + 12]] for at in (0, 12, 24)]
     assert [[name for name in found if name in shard] for shard in shards] == shards
     assert any(set(found[:10]) < set(shard) for shard in shards)
 
 
-def test_the_seed_decides(three_shards):
+def test_sampling_depends_only_on_the_seed(three_shards):
     folder, _ = three_shards
-    first = {seed: ids(read(folder, 60, seed).demonstrations) for seed in range(6)}
-    shutil.rmtree(folder / "Pong" / "1" / "leapjax")  # made again, it is the same
-    assert first == {seed: ids(read(folder, 60, seed).demonstrations) for seed in range(6)}
+    first = {seed: identify(read(folder, 60, seed).demonstrations) for seed in range(6)}
+    shutil.rmtree(folder / "Pong" / "1" / "leapjax")  # a new conversion is equal
+    assert first == {seed: identify(read(folder, 60, seed).demonstrations) for seed in range(6)}
     assert len({tuple(x) for x in first.values()}) > 1
 
 
-def test_conversions_are_opened_again_unless_shards_or_arguments_changed(tmp_path, monkeypatch):
-    put(tmp_path, episodes([5, 6]))
+def test_conversions_are_reused_until_shards_or_arguments_change(tmp_path, monkeypatch):
+    store_shard(tmp_path, make_episodes([5, 6]))
     first = read(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(gzip, "open", None)  # whoever unpacks anything now fails
-        assert ids(read(tmp_path).demonstrations) == ids(first.demonstrations)
-    changed = episodes([5, 6], seed=3)
-    put(tmp_path, changed)
-    assert_are(read(tmp_path).demonstrations, changed)
+        patch.setattr(gzip, "open", None)  # unpacking now fails
+        assert identify(read(tmp_path).demonstrations) == identify(first.demonstrations)
+    changed = make_episodes([5, 6], seed=3)
+    store_shard(tmp_path, changed)
+    assert_same_episodes(read(tmp_path).demonstrations, changed)
     read(tmp_path, 3)
     read(tmp_path, seed=1)
-    assert len(conversions(tmp_path)) == 4
+    assert len(list_conversions(tmp_path)) == 4
 
 
-def test_an_unfinished_or_damaged_conversion_is_never_used(tmp_path, monkeypatch):
-    some = episodes([5, 6])
-    put(tmp_path, some)
-    left = tmp_path / "Pong" / "1" / "leapjax" / ".unfinished"  # by a process that was killed
-    left.mkdir(parents=True)
-    (left / "frames.npy").write_bytes(b"half")
+def test_unfinished_and_damaged_conversions_are_never_used(tmp_path, monkeypatch):
+    episodes = make_episodes([5, 6])
+    store_shard(tmp_path, episodes)
+    unfinished = tmp_path / "Pong" / "1" / "leapjax" / ".unfinished"  # of a killed process
+    unfinished.mkdir(parents=True)
+    (unfinished / "frames.npy").write_bytes(b"half")
 
     def full(*args, **kwargs):
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patched:
         patched.setattr(np, "savez", full)
-        message = refused(tmp_path)
+        message = read_error(tmp_path)
     assert "No space left" in message and "make room" in message
-    assert not conversions(tmp_path) and not left.exists()
-    assert_are(read(tmp_path).demonstrations, some)
-    (path,) = conversions(tmp_path)
+    assert not list_conversions(tmp_path) and not unfinished.exists()
+    assert_same_episodes(read(tmp_path).demonstrations, episodes)
+    (path,) = list_conversions(tmp_path)
     path.write_bytes(path.read_bytes()[:5000])
-    assert str(path.parent) in refused(tmp_path)
+    assert str(path.parent) in read_error(tmp_path)
 
 
-def test_beside_read_only_data_nothing_is_written(tmp_path, monkeypatch):
-    some = episodes([5, 6])
+def test_conversions_of_read_only_data_go_to_a_private_cache(tmp_path, monkeypatch):
+    episodes = make_episodes([5, 6])
     data, cache = tmp_path / "data", tmp_path / "cache"
-    put(data, some)
+    store_shard(data, episodes)
     before = sorted(data.rglob("*"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr(os, "access", lambda path, mode: data not in Path(path).parents)
     for _ in range(2):
-        assert_are(read(data).demonstrations, some)
+        assert_same_episodes(read(data).demonstrations, episodes)
     assert sorted(data.rglob("*")) == before
     (path,) = cache.rglob("frames.npy")
     assert (cache / "leapjax").stat().st_mode & 0o077 == 0
-    # What others may have put there is not learned from.
+    # A cache that others can write to raises an error.
     shared = cache / "leapjax" / "dqn-replay"
     shared.chmod(0o777)
-    assert f"others can write to {shared}" in refused(data)
+    assert f"others can write to {shared}" in read_error(data)
     shared.chmod(0o700)
     if os.getuid() == 0:
         os.chown(path.parents[1], 1234, -1)
-        assert f"{path.parents[1]} belongs to another user" in refused(data)
+        assert f"{path.parents[1]} belongs to another user" in read_error(data)
 
 
-def test_frames_are_never_all_in_memory(tmp_path):
-    rows = stale(rows_of(episodes([1000, 1000])))
+def test_reading_never_holds_all_frames_in_memory(tmp_path):
+    rows = add_stale(make_rows(make_episodes([1000, 1000])))
     for number in range(4):
-        put(tmp_path, rows, number)
+        store_shard(tmp_path, rows, number)
     del rows
-    read(tmp_path, 1, seed=7)  # what is imported and kept for good is not of this
+    read(tmp_path, 1, seed=7)  # imports and caches do not count
     tracemalloc.start()
     assert len(read(tmp_path, 1001).demonstrations) == 2
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < 1000 * 84 * 84 / 2  # not even one of the two was in memory as a whole
+    assert peak < 1000 * 84 * 84 / 2  # half of an episode
 
 
-def test_no_such_folder_game_run_or_shard(tmp_path, monkeypatch):
-    message = refused(tmp_path / "absent")
+def test_missing_folder_game_run_or_disk_space_raises_an_error(tmp_path, monkeypatch):
+    message = read_error(tmp_path / "absent")
     assert "Pong/1/replay_logs" in message and "gs://atari-replay-datasets" in message
-    put(tmp_path, episodes([5]), dqn_seed=2)
-    assert f"no data of Breakout in {tmp_path}, only of Pong" in refused(
+    store_shard(tmp_path, make_episodes([5]), dqn_seed=2)
+    assert f"no data of Breakout in {tmp_path}, only of Pong" in read_error(
         tmp_path, GAMES["Breakout"]
     )
-    assert f"no DQN of seed 1 of Pong in {tmp_path}, only 2" in refused(tmp_path)
+    assert f"no DQN of seed 1 of Pong in {tmp_path}, only 2" in read_error(tmp_path)
     monkeypatch.setattr(files, "SPARE", 2**60)
-    assert "make room" in refused(tmp_path, dqn_seed=2)
+    assert "make room" in read_error(tmp_path, dqn_seed=2)
 
 
 class Bomb:
@@ -263,45 +263,45 @@ class Bomb:
         return pytest.fail, ("it was unpickled",)
 
 
-def pickled(whole):
+def pickle_objects(content):
     file = io.BytesIO()
     np.save(file, np.array([Bomb()], object), allow_pickle=True)
     return gzip.compress(file.getvalue())
 
 
-def claims(whole):
-    """A header of far more rows than there are."""
-    array = np.load(io.BytesIO(gzip.decompress(whole)))
+def claim_more_rows(content):
+    """Makes a header that claims far more rows than the data have."""
+    array = np.load(io.BytesIO(gzip.decompress(content)))
     file = io.BytesIO()
     write_header(file, array.dtype, (10**15, *array.shape[1:]))
     return gzip.compress(file.getvalue() + bytes(10))
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
-        (lambda whole: whole[: len(whole) // 2], "copy it again"),
-        (lambda whole: b"<html>Not found</html>", "Not a gzipped file"),
-        (lambda whole: gzip.compress(np.array([Bomb()], object).dumps()), "cannot read"),
-        (pickled, "holds object"),
-        (lambda whole: gzip.compress(gzip.decompress(whole)[:-9]), "ends before its last row"),
-        (claims, "claims to hold 4000000000000000 bytes"),
-        (lambda whole: b"", "is empty"),
-        (lambda whole: None, "is missing"),
+        (lambda content: content[: len(content) // 2], "copy it again"),
+        (lambda content: b"<html>Not found</html>", "Not a gzipped file"),
+        (lambda content: gzip.compress(np.array([Bomb()], object).dumps()), "cannot read"),
+        (pickle_objects, "holds object"),
+        (lambda content: gzip.compress(gzip.decompress(content)[:-9]), "ends before its last row"),
+        (claim_more_rows, "claims to hold 4000000000000000 bytes"),
+        (lambda content: b"", "is empty"),
+        (lambda content: None, "is missing"),
     ],
 )
-def test_a_part_that_is_damaged(tmp_path, change, said):
-    logs = put(tmp_path, episodes([50]))
-    for part in READ if change is claims else [ACTION]:  # of all parts the first is told
+def test_damaged_files_raise_an_error(tmp_path, change, reason):
+    logs = store_shard(tmp_path, make_episodes([50]))
+    for part in READ if change is claim_more_rows else [ACTION]:  # the error names the first
         path = logs / f"{part}_ckpt.0.gz"
         changed = change(path.read_bytes())
         path.unlink() if changed is None else path.write_bytes(changed)
-    message = refused(tmp_path)
-    assert f"{ACTION}_ckpt.0.gz" in message and said in message and not conversions(tmp_path)
+    message = read_error(tmp_path)
+    assert f"{ACTION}_ckpt.0.gz" in message and reason in message and not list_conversions(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "said"),
+    ("name", "change", "reason"),
     [
         ("observation", lambda x: x[:, :42], "holds uint8 of shape (9, 42, 84)"),
         ("observation", lambda x: np.asfortranarray(x), "(9, 84, 84)"),
@@ -314,18 +314,18 @@ def test_a_part_that_is_damaged(tmp_path, change, said):
         ("terminal", lambda x: np.zeros_like(x), "no whole trajectory in"),
     ],
 )
-def test_arrays_of_another_kind(tmp_path, name, change, said):
-    rows = stale(rows_of(episodes([5])))
-    logs = put(tmp_path, {**rows, name: change(rows[name])})
-    message = refused(tmp_path)
-    assert str(logs) in message and said in message
+def test_unexpected_arrays_raise_an_error(tmp_path, name, change, reason):
+    rows = add_stale(make_rows(make_episodes([5])))
+    logs = store_shard(tmp_path, {**rows, name: change(rows[name])})
+    message = read_error(tmp_path)
+    assert str(logs) in message and reason in message
 
 
-def test_what_is_written_is_in_the_format(tmp_path):
-    some = episodes([4, 9])
+def test_written_shards_have_dopamines_format(tmp_path):
+    episodes = make_episodes([4, 9])
     logs = replay.replay_logs(tmp_path, PONG, 1)
-    replay.write_shard(logs, 0, [e._replace(rewards=e.rewards * 7) for e in some])
-    assert_are(read(tmp_path).demonstrations, some)  # whose rewards are within [-1, 1]
+    replay.write_shard(logs, 0, [e._replace(rewards=e.rewards * 7) for e in episodes])
+    assert_same_episodes(read(tmp_path).demonstrations, episodes)  # with rewards clipped to [-1, 1]
     assert replay.has_shard(logs, 0) and not replay.has_shard(logs, 3)
     arrays = {}
     for path in logs.iterdir():
@@ -334,7 +334,7 @@ def test_what_is_written_is_in_the_format(tmp_path):
             assert not file.read()
     assert arrays.pop("add_count_ckpt.0.gz") == 19
     np.testing.assert_array_equal(arrays.pop("invalid_range_ckpt.0.gz"), [18, 19, 0, 1, 2])
-    for name, rows in rows_of(some).items():
+    for name, rows in make_rows(episodes).items():
         array = arrays.pop(f"$store$_{name}_ckpt.0.gz")
         assert array.dtype == STORED[name] and not array[-1].any()
         np.testing.assert_array_equal(array[:-1], rows)
@@ -342,18 +342,18 @@ def test_what_is_written_is_in_the_format(tmp_path):
 
 
 @pytest.mark.parametrize("written_before", [False, True])
-def test_a_writer_that_is_killed_leaves_no_shard(tmp_path, monkeypatch, written_before):
+def test_killed_writer_leaves_no_shard(tmp_path, monkeypatch, written_before):
     if written_before:
-        replay.write_shard(tmp_path, 0, episodes([4]))
+        replay.write_shard(tmp_path, 0, make_episodes([4]))
     write, calls = writing._write_part, []
 
-    def killed(*args):
+    def interrupt(*args):
         if len(calls) == 5 * (not written_before):
             raise KeyboardInterrupt
         calls.append(args)
         write(*args)
 
-    monkeypatch.setattr(writing, "_write_part", killed)
+    monkeypatch.setattr(writing, "_write_part", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        replay.write_shard(tmp_path, 0, episodes([5, 6]))
+        replay.write_shard(tmp_path, 0, make_episodes([5, 6]))
     assert not replay.has_shard(tmp_path, 0)

@@ -1,4 +1,4 @@
-"""What works without the extras of the package, and what is said where one is missing."""
+"""The core works without extras, and error messages name a missing extra."""
 
 import contextlib
 import importlib.metadata
@@ -21,7 +21,7 @@ HEAVY = {*extras.EXTRAS, "chex", "flax"}
 
 README = (ROOT / "README.md").read_text()
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-# The two that plan, and an environment of one's own.
+# Both planning snippets, and a rollout in a custom environment.
 PLANNING = f"""
 {"".join(SNIPPETS[:2])}
 import sys
@@ -46,8 +46,8 @@ loaded = {{name.partition(".")[0] for name in sys.modules}} & {HEAVY!r}
 assert not loaded, loaded
 """
 
-# A module that Python imports when it starts.
-WITHOUT = """
+# Code of `sitecustomize`, which Python imports at its start.
+HIDE_MODULES = """
 import sys
 
 class Missing:
@@ -59,35 +59,35 @@ sys.meta_path.insert(0, Missing())
 """
 
 
-def distribution(need):
-    """The normalised name in a requirement such as `orbax_checkpoint>=0.12`."""
-    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", need)[0]).lower()
+def normalise_name(requirement):
+    """Returns the normalised name in a requirement such as `orbax_checkpoint>=0.12`."""
+    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
 
 
-def installed_with(needs):
-    """The distributions that requirements bring, extras left out."""
-    found, waiting = set(), list(needs)
-    while waiting:
-        need = waiting.pop()
-        name = distribution(need)
-        if name not in found and "extra ==" not in need:
-            found.add(name)
-            with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # of older Pythons
-                waiting += importlib.metadata.requires(name) or []
-    return found
+def find_installed(requirements):
+    """Lists the distributions that requirements install, without optional extras."""
+    installed, pending = set(), list(requirements)
+    while pending:
+        requirement = pending.pop()
+        name = normalise_name(requirement)
+        if name not in installed and "extra ==" not in requirement:
+            installed.add(name)
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # for older Pythons
+                pending += importlib.metadata.requires(name) or []
+    return installed
 
 
 @pytest.fixture(scope="module")
-def core_alone(tmp_path_factory):
-    """The environment of a process that has nothing but the core of the package."""
-    core, ours = installed_with(PROJECT["dependencies"]), {"leapjax", "experiments", "tests"}
+def core_only(tmp_path_factory):
+    """Returns environment variables for a process that can import only the core."""
+    core, ours = find_installed(PROJECT["dependencies"]), {"leapjax", "experiments", "tests"}
     missing = {
         module
         for module, names in importlib.metadata.packages_distributions().items()
-        if core.isdisjoint(map(distribution, names))
+        if core.isdisjoint(map(normalise_name, names))
     }
     folder = tmp_path_factory.mktemp("core")
-    (folder / "sitecustomize.py").write_text(WITHOUT.format(missing=missing - ours))
+    (folder / "sitecustomize.py").write_text(HIDE_MODULES.format(missing=missing - ours))
     return {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
 
 
@@ -107,12 +107,12 @@ assert "orbax" not in sys.modules
 
 
 @pytest.mark.parametrize("code", [pytest.param(PLANNING, marks=only_long), LOADING])
-def test_what_is_not_needed_is_not_loaded_although_it_is_installed(code):
-    ended = run(["-c", code], {})
-    assert ended.returncode == 0, ended.stderr
+def test_installed_extras_are_not_imported_unless_needed(code):
+    process = run(["-c", code], {})
+    assert process.returncode == 0, process.stderr
 
 
-def test_the_core_alone_plans_and_names_the_extra_of_a_published_planner(core_alone):
+def test_core_plans_and_names_the_extra_of_a_published_planner(core_only):
     loading = """
 for path in ("GoToLocalS7N5", "no-such-run"):
     try:
@@ -120,9 +120,9 @@ for path in ("GoToLocalS7N5", "no-such-run"):
     except leap.UserError as error:
         print(error)
 """
-    ended = run(["-c", PLANNING + loading], core_alone)
-    assert ended.returncode == 0, ended.stderr
-    *_, needed, unknown = ended.stdout.splitlines()
+    process = run(["-c", PLANNING + loading], core_only)
+    assert process.returncode == 0, process.stderr
+    *_, needed, unknown = process.stdout.splitlines()
     assert 'is not installed: pip install ".[babyai]"' in needed
     assert unknown.startswith("no-such-run is not a checkpoint")
 
@@ -135,34 +135,34 @@ for path in ("GoToLocalS7N5", "no-such-run"):
         ("experiments.stars", "train"),
     ],
 )
-def test_a_program_without_its_extra_is_one_line(core_alone, arguments, extra):
-    ended = run(["-m", *arguments.split()], core_alone)
-    assert (ended.returncode, ended.stdout) == (2, "")
+def test_programs_print_one_line_if_their_extra_is_missing(core_only, arguments, extra):
+    process = run(["-m", *arguments.split()], core_only)
+    assert (process.returncode, process.stdout) == (2, "")
     assert re.fullmatch(
-        rf'error: \w+ is not installed: pip install "\.\[{extra}\]".*\n', ended.stderr
+        rf'error: \w+ is not installed: pip install "\.\[{extra}\]".*\n', process.stderr
     )
 
 
-def test_the_table_of_extras_is_that_of_the_package():
+def test_table_of_extras_matches_pyproject():
     listed = PROJECT["optional-dependencies"]
     names = importlib.metadata.packages_distributions()
-    brought = {
-        distribution(name): extra
+    table = {
+        normalise_name(name): extra
         for module, extra in extras.EXTRAS.items()
         for name in names.get(module, [module])
     }
-    needs = {
-        distribution(need): extra
+    requirements = {
+        normalise_name(requirement): extra
         for extra in {*extras.EXTRAS.values()}
-        for need in listed[extra]
-        if need != "leapjax[train]"
+        for requirement in listed[extra]
+        if requirement != "leapjax[train]"
     }
-    assert needs.items() <= brought.items() and len(needs) == len(extras.EXTRAS)
+    assert requirements.items() <= table.items() and len(requirements) == len(extras.EXTRAS)
     assert {name for name in listed if "leapjax[train]" in listed[name]} == {*extras.WITH_TRAIN}
 
 
 @pytest.mark.parametrize(
-    ("module", "asked", "named"),
+    ("module", "requested", "expected"),
     [
         ("minari", "train", "train"),
         ("minari", "atari", "atari"),
@@ -170,10 +170,10 @@ def test_the_table_of_extras_is_that_of_the_package():
         ("wandb", "babyai", "wandb"),
     ],
 )
-def test_one_extra_is_named_that_brings_all(monkeypatch, module, asked, named):
+def test_error_names_one_extra_that_installs_everything(monkeypatch, module, requested, expected):
     monkeypatch.setitem(sys.modules, module, None)
     with (
-        pytest.raises(UserError, match=rf'{module} is not installed: .*"\.\[{named}\]"'),
-        extras.report_missing(asked),
+        pytest.raises(UserError, match=rf'{module} is not installed: .*"\.\[{expected}\]"'),
+        extras.report_missing(requested),
     ):
         importlib.import_module(module)

@@ -1,4 +1,4 @@
-"""Why episodes fail: causes, detours, and the command on a toy run."""
+"""Causes of failed episodes, detours, and the command on a toy run."""
 
 from minigrid.envs.babyai.core.verifier import AfterInstr, AndInstr, GoToInstr, ObjDesc
 from PIL import Image
@@ -13,14 +13,14 @@ from tests.programs import only_long, untrained_run
 LEFT, FORWARD, PICKUP = 0, 2, 3
 
 
-def recorder(level: str, seed: int = 0) -> failures.Recorder:
-    found = failures.Recorder(find_level(level))
-    found.reset(seed)
-    return found
+def start_recorder(level: str, seed: int = 0) -> failures.Recorder:
+    recorder = failures.Recorder(find_level(level))
+    recorder.reset(seed)
+    return recorder
 
 
-def test_causes_of_failure():
-    idle = recorder("GoToLocalS7N5")
+def test_failures_are_classified_by_cause():
+    idle = start_recorder("GoToLocalS7N5")
     assert failures.find_cause(idle) == Cause.GAVE_UP
     idle.step(LEFT)
     assert failures.find_cause(idle) == Cause.GAVE_UP
@@ -28,7 +28,7 @@ def test_causes_of_failure():
         idle.step(LEFT)
     assert failures.find_cause(idle) == Cause.CIRCLES
 
-    walker = recorder("GoToObjMazeS7")
+    walker = start_recorder("GoToObjMazeS7")
     walker.cells += [(x, 0) for x in range(20)]
     walker.last = idle.last
     assert failures.find_cause(walker) == Cause.WANDERS
@@ -36,44 +36,44 @@ def test_causes_of_failure():
     assert failures.find_cause(walker) == Cause.HOLDS
 
 
-def test_a_detour_is_what_the_way_is_longer_than_straight():
-    found = recorder("GoToLocalS7N5")
-    found.env.grid.horz_wall(1, 3, 4)  # open at x = 5 only
-    found.env.agent_pos, found.goal = (1, 2), (1, 4)
+def test_detour_is_the_path_length_beyond_a_straight_path():
+    recorder = start_recorder("GoToLocalS7N5")
+    recorder.env.grid.horz_wall(1, 3, 4)  # open at x = 5 only
+    recorder.env.agent_pos, recorder.goal = (1, 2), (1, 4)
     for x in range(1, 6):
         for y in (2, 4):
-            found.env.grid.set(x, y, None)
-    found.env.grid.set(5, 3, None)
-    assert failures.measure_detour(found) == 8
-    found.env.grid.horz_wall(1, 3, 5)
-    assert failures.measure_detour(found) is None
+            recorder.env.grid.set(x, y, None)
+    recorder.env.grid.set(5, 3, None)
+    assert failures.measure_detour(recorder) == 8
+    recorder.env.grid.horz_wall(1, 3, 5)
+    assert failures.measure_detour(recorder) is None
 
 
-def test_a_recorder_knows_the_way_that_was_walked():
-    found = recorder("GoToObjMazeS4", seed=3)
-    bot, action = FullViewBot(found.env), None
-    while found.last is None or not found.last.terminated:
+def test_recorder_lists_the_visited_cells():
+    recorder = start_recorder("GoToObjMazeS4", seed=3)
+    bot, action = FullViewBot(recorder.env), None
+    while recorder.last is None or not recorder.last.terminated:
         action = int(bot.replan(action))
         assert action != END
-        found.step(action)
-    assert len(found.cells) == found.env.step_count + 1
-    assert found.cells[-1] == tuple(found.env.agent_pos)
+        recorder.step(action)
+    assert len(recorder.cells) == recorder.env.step_count + 1
+    assert recorder.cells[-1] == tuple(recorder.env.agent_pos)
 
 
 @only_long
-def test_the_command_counts_and_draws(tmp_path, monkeypatch, capsys):
+def test_command_counts_and_draws_failures(tmp_path, monkeypatch, capsys):
     run = untrained_run(tmp_path / "run", "--method", "random")
     assert failures.main([str(run), "--episodes", "6"]) == 0
-    said = capsys.readouterr().out
-    assert "of 6 episodes failed" in said and "what happened" in said
-    assert "tasks of the instruction" not in said  # there is one only
+    output = capsys.readouterr().out
+    assert "of 6 episodes failed" in output and "what happened" in output
+    assert "tasks of the instruction" not in output  # the instruction has only one
     assert Image.open(run / "failures.png").size[0] >= 336
     assert failures.main([str(run), "--episodes", "2", "--executed", "9"]) == 2
     error = capsys.readouterr().err
     assert "not in 1 .. 1" in error and str(run) in error
 
 
-def test_tasks_that_are_done_are_counted_through_nested_instructions():
+def test_completed_tasks_of_nested_instructions_are_listed():
     def goto():
         return GoToInstr(ObjDesc("ball"))
 

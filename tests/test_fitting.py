@@ -1,4 +1,4 @@
-"""Training in one call."""
+"""`leap.fit` trains and saves planners."""
 
 import dataclasses
 import functools
@@ -22,49 +22,49 @@ SMALL = ModelConfig(width=16, heads=2, layers=1, dropout=0.0)
 
 @pytest.fixture(scope="module")
 def star():
-    """A level, and demonstrations of it."""
+    """A domain and six demonstrations of it."""
     domain = leap.make_domain("stars", "Star2x3")
     return domain, domain.demonstrations.collect(6, 0, lambda count: None).demonstrations
 
 
-def test_what_is_fitted_is_what_is_saved(star, tmp_path):
+def test_saved_planner_equals_the_fitted_planner(star, tmp_path):
     domain, data = star
-    seen = []
+    reports = []
     training = TrainingConfig(batch=4)
     planner = leap.fit(
         data, domain, steps=3, model=SMALL, training=training,
-        progress=lambda step, means: seen.append((step, sorted(means))),
+        progress=lambda step, means: reports.append((step, sorted(means))),
     )  # fmt: skip
-    assert seen == [(3, ["accuracy", "gradient_norm", "loss"])]
+    assert reports == [(3, ["accuracy", "gradient_norm", "loss"])]
     assert planner.specification.training == dataclasses.replace(training, steps=3)
     untrained = leap.fit(data, domain, steps=0, model=SMALL, training=training)
     assert not np.array_equal(*(jax.tree.leaves(p.params)[0] for p in (planner, untrained)))
     planner.save(tmp_path / "mine")
-    again = leap.load(tmp_path / "mine")
-    jax.tree.map(np.testing.assert_array_equal, again.params, planner.params)
-    assert again.specification == planner.specification and again.domain.level == "Star2x3"
-    plans = [each.plan_for(each.domain.make_adapter(), seed=5) for each in (planner, again)]
+    loaded = leap.load(tmp_path / "mine")
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, planner.params)
+    assert loaded.specification == planner.specification and loaded.domain.level == "Star2x3"
+    plans = [each.plan_for(each.domain.make_adapter(), seed=5) for each in (planner, loaded)]
     np.testing.assert_array_equal(*(plan.trace for plan in plans))
     pretrained.publish(str(tmp_path / "mine"), str(tmp_path / "small"))
     files = {path.name for path in (tmp_path / "small").iterdir()}
     assert files == {"specification.json", "weights.npz"}
-    small = leap.load(tmp_path / "small")
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-6)
-    jax.tree.map(close, small.params, planner.params)
+    published = leap.load(tmp_path / "small")
+    assert_close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-6)
+    jax.tree.map(assert_close, published.params, planner.params)
     with pytest.raises(leap.UserError, match="is there already"):
         planner.save(tmp_path / "mine")
 
 
-def test_what_is_fitted_on_an_environment_of_ones_own_is_saved_with_its_scales(tmp_path):
+def test_planner_of_a_gymnasium_environment_saves_its_statistics(tmp_path):
     domain = leap.make_domain("gymnasium", "CartPole-v1")
     states = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
     episode = leap.Demonstration(states, np.arange(5) % 2, np.ones(5, np.float32), False, True, 0)
     planner = leap.fit([episode], domain, "bc", steps=0, model=SMALL)
-    assert planner.specification.statistics  # its network was built around them
+    assert planner.specification.statistics  # the network was built with them
     planner.save(tmp_path / "mine")
-    again = leap.load(tmp_path / "mine")
-    assert again.specification == planner.specification
-    plans = [each.plan_for(each.domain.make_adapter(), seed=0) for each in (planner, again)]
+    loaded = leap.load(tmp_path / "mine")
+    assert loaded.specification == planner.specification
+    plans = [each.plan_for(each.domain.make_adapter(), seed=0) for each in (planner, loaded)]
     np.testing.assert_array_equal(*(plan.trace for plan in plans))
 
 
@@ -72,7 +72,7 @@ def test_what_is_fitted_on_an_environment_of_ones_own_is_saved_with_its_scales(t
     ("domain", "level", "method"),
     [("babyai", "GoToLocalS7N5", "leap"), ("gymnasium", "CartPole-v1", "dt")],
 )
-def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypatch):
+def test_fit_uses_the_defaults_of_the_command_line(domain, level, method, monkeypatch):
     monkeypatch.setattr(fitting, "make_begin", make_begin)
     monkeypatch.setattr(fitting, "train", lambda step, state, *rest: state)
     made = leap.make_domain(domain, level)
@@ -81,14 +81,14 @@ def test_defaults_are_those_of_the_command_line(domain, level, method, monkeypat
         np.zeros(2, np.int32), np.ones(2, np.float32), True, False, 0,
     )  # fmt: skip
     made = made._replace(demonstrations=Demonstrations())
-    found = leap.fit([episode], made, method).specification
+    fitted = leap.fit([episode], made, method).specification
     chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
     if method == "dt":  # its target is the best return of the data
         chosen = change(chosen, method_settings={"target_return": 2.0})
-    assert dataclasses.replace(found, statistics=()) == specify(chosen, 0, made)
+    assert dataclasses.replace(fitted, statistics=()) == specify(chosen, 0, made)
 
 
-def test_a_domain_that_no_table_has_can_be_fitted_and_not_saved(monkeypatch, tmp_path):
+def test_planner_of_an_unregistered_domain_cannot_be_saved(monkeypatch, tmp_path):
     monkeypatch.setattr(fitting, "make_begin", make_begin)
     lake = frozen_lake.make(frozen_lake.LEVEL, None)
     data = lake.demonstrations.collect(2, 0, lambda count: None).demonstrations
@@ -114,7 +114,7 @@ def test_a_domain_that_no_table_has_can_be_fitted_and_not_saved(monkeypatch, tmp
         (list, {"method": "bc", "planner": leap.GibbsConfig(2)}, "horizon is 1"),
     ],
 )  # fmt: skip
-def test_mistakes_are_found_before_training(change, options, message, star, monkeypatch):
+def test_invalid_arguments_fail_before_training(change, options, message, star, monkeypatch):
     monkeypatch.setattr(fitting, "train", lambda *given: pytest.fail("trained"))
     domain, data = star
     with pytest.raises(leap.UserError, match=message):

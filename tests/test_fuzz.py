@@ -1,6 +1,6 @@
-"""Damaged and adversarial input: a correct load or one line that says what is wrong.
+"""Damaged and adversarial input either loads correctly or raises a one-line error.
 
-Never a traceback, a hang, much memory, or code that the data chose.
+No input causes a traceback, a hang or much use of memory, or runs code of its own.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ from tests.test_storage import LEVEL, NAME, SIDE
 
 CASES = 600 if LONG else 25  # for each of seven kinds of input
 
-# The same cases every time.
+# Every run tests the same cases.
 cases = settings(
     max_examples=CASES, derandomize=True, database=None, deadline=None,
     suppress_health_check=list(HealthCheck),
@@ -46,20 +46,20 @@ cases = settings(
 
 
 class Hang(BaseException):
-    """What a reader does that does not come back. Nothing catches it by mistake."""
+    """A reader hangs. As a BaseException, it passes every `except Exception`."""
 
 
-def hang(*_):
+def raise_hang(*_):
     raise Hang
 
 
-def outcome(read):
-    """What a reader returns, or None where it refused in one line.
+def try_read(read):
+    """Returns the result of a reader, unless it raises a one-line `UserError`.
 
-    Fails what takes 20 seconds (a read takes less than one), or 512 MiB more memory.
+    Fails if the reader takes 20 seconds (usually less than one) or 512 MiB more memory.
     """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    previous = signal.signal(signal.SIGALRM, hang)
+    previous = signal.signal(signal.SIGALRM, raise_hang)
     signal.alarm(20)
     try:
         return read()
@@ -72,8 +72,8 @@ def outcome(read):
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 512 * 1024
 
 
-def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Truncated, with bits flipped, bytes overwritten, or a part repeated, removed or zeroed."""
+def damage(data: bytes, rng: np.random.Generator) -> bytes:
+    """Truncates data, flips bits, overwrites bytes, or repeats, removes or zeroes a part."""
     at = int(rng.integers(len(data)))
     length = int(rng.integers(1, min(len(data), 2000) + 1))
     width = int(rng.choice([2, 4, 8]))
@@ -88,7 +88,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
         before + bytes(length) + after,
         before + part * int(rng.integers(2, 50)) + after,
         before + after,
-        # A length or an address that claims very much.
+        # A huge length or address.
         before + b"\xff" * (width - 1) + b"\x7f" + data[at + width :],
     )[rng.integers(7)]
 
@@ -103,24 +103,24 @@ JSON = st.recursive(
 )  # fmt: skip
 
 
-def places(value, path=()):
-    """The paths of everything in a JSON value."""
+def list_paths(value, path=()):
+    """Lists the paths of all values inside a JSON value."""
     found = [path]
     if isinstance(value, dict | list):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            found += places(inner, (*path, key))
+            found += list_paths(inner, (*path, key))
     return found
 
 
 @st.composite
-def changed_json(draw, original):
-    """A JSON value some of whose parts were replaced, removed or added; or its damaged text."""
+def change_json(draw, original):
+    """Replaces, removes or adds parts of a JSON value, or damages its text."""
     if draw(st.integers(0, 2)) == 0:
-        text = damaged(json.dumps(original).encode(), np.random.default_rng(draw(SEEDS)))
+        text = damage(json.dumps(original).encode(), np.random.default_rng(draw(SEEDS)))
         return draw(st.sampled_from([text, b"[" * 100_000, b"\xff\xfe", b"", text * 2]))
     value = copy.deepcopy(original)
     for _ in range(draw(st.integers(1, 3))):
-        path = draw(st.sampled_from(places(value)))
+        path = draw(st.sampled_from(list_paths(value)))
         if not path:
             return json.dumps(draw(JSON)).encode()
         parent = value
@@ -139,7 +139,7 @@ def changed_json(draw, original):
 
 @pytest.fixture(scope="module")
 def data_set(local_demonstrations, tmp_path_factory):
-    """A Minari data set, whole, in a Minari folder of its own."""
+    """Saves an intact data set in its own Minari folder; returns the folder."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(folder))
@@ -147,11 +147,11 @@ def data_set(local_demonstrations, tmp_path_factory):
     return folder
 
 
-def read_data_set(whole, change):
-    """The demonstrations of a changed copy of the data set."""
+def read_data_set(intact, change):
+    """Reads the demonstrations of a changed copy of the data set."""
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         copied = Path(folder) / "datasets"
-        shutil.copytree(whole, copied)
+        shutil.copytree(intact, copied)
         change(copied / NAME / "data")
         patch.setenv("MINARI_DATASETS_PATH", str(copied))
         return storage.load(NAME, LEVEL).demonstrations
@@ -159,14 +159,14 @@ def read_data_set(whole, change):
 
 @cases
 @given(seed=SEEDS)
-def test_damaged_arrays(data_set, seed):
+def test_damaged_arrays_load_valid_values_or_raise_an_error(data_set, seed):
     def change(folder):
         path = folder / "main_data.hdf5"
-        path.write_bytes(damaged(path.read_bytes(), np.random.default_rng(seed)))
+        path.write_bytes(damage(path.read_bytes(), np.random.default_rng(seed)))
 
-    loaded = outcome(lambda: read_data_set(data_set, change))
+    loaded = try_read(lambda: read_data_set(data_set, change))
     for demonstration in loaded or []:
-        # HDF5 keeps no checksums: what is loaded need not be what was saved, but it is sound.
+        # HDF5 keeps no checksums: loaded values may differ from saved ones, but they are valid.
         grid, actions = demonstration.observations.grid, demonstration.actions
         assert grid.shape == (len(actions) + 1, SIDE, SIDE, 3) and len(actions) > 0
         assert actions.min() >= 0 and actions.max() < 7 and grid[..., 0].max() <= 10
@@ -174,28 +174,28 @@ def test_damaged_arrays(data_set, seed):
 
 @cases
 @given(data=st.data())
-def test_damaged_metadata(data_set, data):
+def test_damaged_metadata_loads_or_raises_an_error(data_set, data):
     def change(folder):
         path = folder / "metadata.json"
         original = json.loads(path.read_text())
         for name in ("observation_space", "action_space"):
             if data.draw(st.booleans()):
-                text = data.draw(changed_json(json.loads(original[name])))
+                text = data.draw(change_json(json.loads(original[name])))
                 original[name] = text.decode(errors="replace")
-        path.write_bytes(data.draw(changed_json(original)))
+        path.write_bytes(data.draw(change_json(original)))
 
-    outcome(lambda: read_data_set(data_set, change))
+    try_read(lambda: read_data_set(data_set, change))
 
 
-def test_data_cannot_have_code_run(data_set, tmp_path):
-    """Without spaces Minari makes the environment that the data names."""
+def test_data_cannot_run_code(data_set, tmp_path):
+    """Without an action space, Minari would make the environment that the data names."""
     trap = tmp_path / "trap"
-    made = EnvSpec("Trap-v0", "pathlib:Path.touch", kwargs={"self": str(trap)})
+    spec = EnvSpec("Trap-v0", "pathlib:Path.touch", kwargs={"self": str(trap)})
 
     def change(folder):
         values = json.loads((folder / "metadata.json").read_text())
         del values["action_space"]
-        values["env_spec"] = made.to_json()
+        values["env_spec"] = spec.to_json()
         (folder / "metadata.json").write_text(json.dumps(values))
 
     with pytest.raises(UserError, match="metadata.json has no action_space"):
@@ -204,9 +204,9 @@ def test_data_cannot_have_code_run(data_set, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("says", "link", "options"),
+    ("message", "link", "options"),
     [
-        # Chunks that were never written take no room in the file: 8 TB of zeros.
+        # 8 TB of zeros: chunks that were never written take no room in the file.
         ("claims 8000000", None, {"shape": (10**12,), "dtype": "i8", "chunks": (1000,)}),
         ("is a link", h5py.ExternalLink("/etc/passwd", "/"), None),
         ("is a link", h5py.SoftLink("/episode_1/actions"), None),
@@ -214,7 +214,7 @@ def test_data_cannot_have_code_run(data_set, tmp_path):
          {"shape": (9,), "dtype": "i8", "external": [("/etc/passwd", 0, 72)]}),
     ],
 )  # fmt: skip
-def test_arrays_that_are_not_there(data_set, says, link, options):
+def test_links_and_unwritten_arrays_raise_an_error(data_set, message, link, options):
     def change(folder):
         with h5py.File(folder / "main_data.hdf5", "r+") as file:
             del file["episode_0/actions"]
@@ -224,10 +224,10 @@ def test_arrays_that_are_not_there(data_set, says, link, options):
                 file["episode_0/actions"] = link
 
     def read():
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=message):
             read_data_set(data_set, change)
 
-    outcome(read)
+    try_read(read)
 
 
 ROW = toy_row(
@@ -237,11 +237,11 @@ ROW = toy_row(
 
 @cases
 @given(data=st.data())
-def test_damaged_lines(tmp_path_factory, data):
+def test_damaged_rows_load_or_raise_an_error(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("rows") / "rows.jsonl"
     other = {**ROW, "hash": "y"}
-    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(changed_json(other)) + b"\n")
-    rows = outcome(lambda: results.read(path))
+    path.write_bytes(json.dumps(ROW).encode() + b"\n" + data.draw(change_json(other)) + b"\n")
+    rows = try_read(lambda: results.read(path))
     for table in (results.make_success_table, results.make_time_table) if rows else ():
         assert table(rows).row_count >= len(rows) >= 1
 
@@ -253,13 +253,13 @@ SPECIFICATION = specify(
 
 @cases
 @given(data=st.data())
-def test_a_damaged_specification(tmp_path_factory, data):
+def test_damaged_specifications_load_or_raise_an_error(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("run")
     pretrained.save_specification(folder, SPECIFICATION)
     assert pretrained.parse_specification(folder) == SPECIFICATION
     path = folder / pretrained.SPECIFICATION
-    path.write_bytes(data.draw(changed_json(json.loads(path.read_text()))))
-    found = outcome(lambda: pretrained.parse_specification(folder))
+    path.write_bytes(data.draw(change_json(json.loads(path.read_text()))))
+    found = try_read(lambda: pretrained.parse_specification(folder))
     assert found is None or isinstance(found, pretrained.Specification)
 
 
@@ -281,8 +281,8 @@ OPTIONS = st.lists(st.tuples(st.sampled_from(WORDS), VALUES), max_size=4).map(
 )
 
 
-def parsed(domain, arguments):
-    """The configurations of a command line; none if it is refused, or help is shown."""
+def check_command_line(domain, arguments):
+    """Parses a command line and checks its configurations: [] if it is invalid or shows help."""
 
     def parse():
         quiet = io.StringIO()
@@ -293,7 +293,7 @@ def parsed(domain, arguments):
             assert stopped.code in (0, 2)
             return None
 
-    found = outcome(parse) or []
+    found = try_read(parse) or []
     for each in found:
         assert len(hash_config(each, each.seeds[0])) == 12
         assert "NaN" not in json.dumps(list_settings(each, each.seeds[0]))
@@ -304,8 +304,8 @@ def parsed(domain, arguments):
 
 @cases
 @given(arguments=OPTIONS | st.lists(st.sampled_from(WORDS) | VALUES, max_size=6))
-def test_any_command_line(arguments):
-    parsed("babyai", arguments)
+def test_any_command_line_parses_or_exits_cleanly(arguments):
+    check_command_line("babyai", arguments)
 
 
 COUNTS = ("-1", "0", "2", "100000", "2147483647", "2147483648", "9223372036854775808", "9" * 5000)
@@ -317,8 +317,8 @@ LEVELS = {
 }  # fmt: skip
 
 
-def numeric(settings):
-    """Each option that takes a number, with every number."""
+def list_numeric_options(settings):
+    """Yields every numeric option with every value to test."""
     for name, kind in typing.get_type_hints(type(settings)).items():
         parts = typing.get_args(kind) or (kind,)
         pair = typing.get_origin(kind) is tuple and ... not in parts
@@ -328,17 +328,17 @@ def numeric(settings):
 
 @only_long
 @pytest.mark.parametrize("domain", LEVELS)
-def test_any_number_that_an_option_takes(domain):
+def test_any_number_parses_or_raises_an_error(domain):
     accepted, base = 0, ["--level", LEVELS[domain]]
-    if domain == "gymnasium":  # nobody demonstrates it
+    if domain == "gymnasium":  # it has no demonstrations
         base += ["--demos", "0", "--steps", "0"]
     for method in METHODS if domain == "babyai" else ("leap", "iql"):
-        of = make_config(domain, LEVELS[domain], method)
-        parts = [of.method_settings, of.planner]
-        if method == "leap":  # what all methods have
-            parts += [of, of.model, of.training, of.cluster, of.domain_settings]
-        for option in (option for part in parts for option in numeric(part)):
-            accepted += len(parsed(domain, [*base, "--method", method, *option]))
+        config = make_config(domain, LEVELS[domain], method)
+        parts = [config.method_settings, config.planner]
+        if method == "leap":  # settings that all methods share
+            parts += [config, config.model, config.training, config.cluster, config.domain_settings]
+        for option in (option for part in parts for option in list_numeric_options(part)):
+            accepted += len(check_command_line(domain, [*base, "--method", method, *option]))
     assert accepted > 50
 
 
@@ -361,7 +361,7 @@ def two_checkpoints(tmp_path_factory):
 
 @cases
 @given(seed=SEEDS, whole_state=st.booleans())
-def test_a_damaged_checkpoint(two_checkpoints, seed, whole_state):
+def test_damaged_checkpoints_restore_exactly_or_raise_an_error(two_checkpoints, seed, whole_state):
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -369,30 +369,30 @@ def test_a_damaged_checkpoint(two_checkpoints, seed, whole_state):
         shutil.copytree(two_checkpoints, folder)
         files = sorted(path for path in (folder / "2").rglob("*") if path.is_file())
         path = files[rng.integers(len(files))]
-        path.write_bytes(damaged(path.read_bytes(), rng))
+        path.write_bytes(damage(path.read_bytes(), rng))
         if whole_state:
             saved = Checkpoints(folder)
-            restored = outcome(lambda: saved.restore(STATE))
+            restored = try_read(lambda: saved.restore(STATE))
             saved.close()
             params = restored and restored.params
             assert restored is None or int(restored.step) in (1, 2)
         else:
-            sizes = outcome(lambda: checkpoints.check_identity(folder, ""))
+            sizes = try_read(lambda: checkpoints.check_identity(folder, ""))
             assert sizes in (None, [30, 600])
-            params = outcome(lambda: checkpoints.restore_params(folder, STATE.params))
-        if params:  # not one bit of them is wrong
+            params = try_read(lambda: checkpoints.restore_params(folder, STATE.params))
+        if params:  # equal, bit for bit
             for name, value in STATE.params.items():
                 np.testing.assert_array_equal(params[name], value)
 
 
 @cases
 @given(seed=SEEDS)
-def test_damaged_weights(tmp_path_factory, seed):
+def test_damaged_weights_load_correctly_or_raise_an_error(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("damaged") / "weights.npz"
     weights.write(path, STATE.params, "mine")
-    path.write_bytes(damaged(path.read_bytes(), np.random.default_rng(seed)))
-    sizes = outcome(lambda: weights.check_identity(path, "mine"))
+    path.write_bytes(damage(path.read_bytes(), np.random.default_rng(seed)))
+    sizes = try_read(lambda: weights.check_identity(path, "mine"))
     assert sizes is None or len(sizes) <= 2
-    params = outcome(lambda: weights.read(path, STATE.params, "mine"))
+    params = try_read(lambda: weights.read(path, STATE.params, "mine"))
     for name, value in STATE.params.items() if params else ():
         np.testing.assert_allclose(params[name], value, rtol=1e-3)

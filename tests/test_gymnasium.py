@@ -1,4 +1,4 @@
-"""Environments of one's own: what they may look like, what goes wrong, the program at toy size."""
+"""Users' own environments: spaces, data sets, errors, and the program at toy size."""
 
 import dataclasses
 import itertools
@@ -44,15 +44,15 @@ from tests import toy
 from tests.parameters import random_like
 from tests.programs import RANDOM, SMALL
 
-WAY = 5
+LENGTH = 5
 
 
 class Corridor(gym.Env):
-    """Go right until the end; what is seen is a picture, a number, and a choice."""
+    """Walk right to the end; an observation holds a picture, numbers and a choice."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Dict(
-        picture=spaces.Box(0, 255, (WAY, 3, 3), np.uint8),
+        picture=spaces.Box(0, 255, (LENGTH, 3, 3), np.uint8),
         here=spaces.Box(-np.inf, np.inf, (2,)),
         lamp=spaces.Discrete(3),
     )
@@ -60,18 +60,18 @@ class Corridor(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.place = 0
-        return self.seen(), {}
+        return self.view(), {}
 
-    def seen(self):
-        picture = np.zeros((WAY, 3, 3), np.uint8)
+    def view(self):
+        picture = np.zeros((LENGTH, 3, 3), np.uint8)
         picture[self.place] = 200
         here = np.array([self.place, 0.01], np.float32)
         return {"picture": picture, "here": here, "lamp": self.place % 3}
 
     def step(self, action):
         self.place = max(0, self.place + 2 * int(action) - 1)
-        over = self.place == WAY - 1
-        return self.seen(), float(over), over, False, {}
+        over = self.place == LENGTH - 1
+        return self.view(), float(over), over, False, {}
 
 
 class Raises(Corridor):
@@ -81,7 +81,7 @@ class Raises(Corridor):
 
 class Grows(Corridor):
     def step(self, action):
-        return {**self.seen(), "here": np.zeros(3, np.float32)}, *super().step(action)[1:]
+        return {**self.view(), "here": np.zeros(3, np.float32)}, *super().step(action)[1:]
 
 
 class Deep(Corridor):
@@ -91,13 +91,13 @@ class Deep(Corridor):
         )
     )
 
-    def seen(self):
+    def view(self):
         below = OrderedDict(level=self.place - 2, two=np.array([0, -1]))
         return OrderedDict(below=below)
 
 
 class Held(Corridor):
-    """Counts how many are open; the third cannot be closed."""
+    """Counts how many are made and closed; closing the third fails."""
 
     made = closed = 0
 
@@ -112,7 +112,7 @@ class Held(Corridor):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def registered():
+def register_environments():
     before = {*gym.registry}
     for kind in (Corridor, Raises, Grows, Deep, Held):
         entry = f"tests.test_gymnasium:{kind.__name__}"
@@ -129,14 +129,14 @@ def registered():
 
 
 def recorded(name, level, policy, episodes, wrap=lambda env: env, **arguments):
-    """A data set of a policy, as Minari's collector writes it."""
+    """Records episodes of a policy with Minari's collector; returns the data set's name."""
     made = wrap(gym.make(level, disable_env_checker=True, **arguments))
     env = DataCollector(made, jpeg_encoding=False)
     for seed in range(episodes):
-        seen, _ = env.reset(seed=seed)
+        view, _ = env.reset(seed=seed)
         over = False
         while not over:
-            seen, _, terminated, truncated, _ = env.step(policy(seen))
+            view, _, terminated, truncated, _ = env.step(policy(view))
             over = terminated or truncated
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -145,7 +145,7 @@ def recorded(name, level, policy, episodes, wrap=lambda env: env, **arguments):
     return name
 
 
-def test_a_state_is_a_token_and_its_parts_are_read():
+def test_encoder_reads_all_parts_of_a_state_into_one_token():
     domain = make("Corridor-v0", Settings())
     context = blank_context(domain, 2)
     for num_actions in (0, 3):  # 0: past actions are not read
@@ -156,40 +156,40 @@ def test_a_state_is_a_token_and_its_parts_are_read():
         assert tokens.shape == (3, 8)
         for field, value in {"here": [0.0, 0.5], "lamp": 2, "picture": 9}.items():
             other = np.full_like(context.observation[field], value)
-            seen = context._replace(observation={**context.observation, field: other})
-            changed = encode(params, seen)
+            view = context._replace(observation={**context.observation, field: other})
+            changed = encode(params, view)
             np.testing.assert_allclose(changed[:-1], tokens[:-1], atol=1e-6)
             assert np.abs(changed[-1] - tokens[-1]).max() > 1e-3, field
         acted = encode(params, context._replace(actions=np.array([0, 1], np.int32)))
         assert np.any(acted != tokens) == bool(num_actions)
 
 
-def test_success_is_what_the_environment_says_or_the_user():
+def test_success_is_defined_by_the_environment_or_a_given_return():
     def play(domain, actions):
         adapter = domain.make_adapter()
         adapter.reset(0)
         return [adapter.step(action).success for action in actions]
 
-    for level, least, actions, successes in [
+    for level, threshold, actions, successes in [
         ("Corridor-v0", None, [1] * 4, [False, False, False, True]),
         ("Corridor-v0", 2.0, [1] * 4, [False] * 4),
-        # CartPole's authors ask for a return of 475: to fall is no success, though it is rewarded.
+        # CartPole's authors require a return of 475: falling is rewarded, but no success.
         ("CartPole-v1", None, [0] * 11, [False] * 11),
-        # What is given up by the rollout is judged by what it had until then.
+        # Episodes that the rollout gives up are judged by their return so far.
         ("CartPole-v1", 2.0, [0] * 3, [False, True, True]),
-        # What is asked of MountainCar is not to lose more than 110, which nobody has at the start.
+        # MountainCar requires a return of -110: unfinished episodes have more, but no success.
         ("MountainCar-v0", None, [1] * 20, [False] * 20),
     ]:
-        assert play(make(level, Settings(success_return=least)), actions) == successes
+        assert play(make(level, Settings(success_return=threshold)), actions) == successes
     assert make("Endless-v0", Settings(max_steps=7)).max_steps == 7
     adapter = make("Corridor-v0", Settings(max_steps=2)).make_adapter()
     adapter.reset(0)
     assert [adapter.step(0).truncated for _ in range(2)] == [False, True]
 
 
-def test_demonstrations_are_judged_as_episodes_that_are_played():
-    for least in (None, 1.0, 0.0, 0.5):
-        domain = make("Corridor-v0", Settings(success_return=least))
+def test_demonstrations_are_judged_like_played_episodes():
+    for threshold in (None, 1.0, 0.0, 0.5):
+        domain = make("Corridor-v0", Settings(success_return=threshold))
         data, played = [], []
         for actions in ([1] * 4, [0] * 12, [1, 0, 1, 1, 1, 1]):
             adapter = domain.make_adapter()
@@ -202,7 +202,7 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
             played.append(steps[-1].success)
         found = judge_data(data, domain)
         assert found == {"success": np.mean(played), "return": pytest.approx(2 / 3)}
-        assert found["success"] == (1.0 if least == 0 else pytest.approx(2 / 3))
+        assert found["success"] == (1.0 if threshold == 0 else pytest.approx(2 / 3))
     assert (
         judge_data(data, domain._replace(demonstrations=Demonstrations()))
         is judge_data([], domain)
@@ -210,7 +210,7 @@ def test_demonstrations_are_judged_as_episodes_that_are_played():
     )
 
 
-def test_a_criterion_says_where_it_comes_from():
+def test_success_criterion_names_its_source():
     found, given = (
         make("CartPole-v1", Settings(success_return=x)).demonstrations.criterion
         for x in (None, 3.0)
@@ -222,10 +222,10 @@ def test_a_criterion_says_where_it_comes_from():
 
 
 @pytest.mark.parametrize(
-    ("level", "says"),
+    ("level", "text"),
     [
         ("CartPol-v1", "no 'CartPol-v1' is registered; .* MODULE:CartPol-v1; did you .*CartPole"),
-        # No other name is proposed where the cause is another.
+        # The error suggests a name only if the name is wrong.
         ("no_such_module:Own-v0", "cannot be made: no module 'no_such_module': install it"),
         ("Pendulum-v1", "has actions Box.*: expected Discrete"),
         ("Endless-v0", "no limit of steps, so an episode may never end"),
@@ -235,44 +235,44 @@ def test_a_criterion_says_where_it_comes_from():
         ("Grows-v0", "gave an observation of shape .*its observation space says"),
     ],
 )
-def test_environments_that_cannot_be_used_are_one_line(level, says, tmp_path, monkeypatch, capsys):
-    with pytest.raises(UserError, match=says) as raised:
+def test_unusable_environments_raise_one_line_errors(level, text, tmp_path, monkeypatch, capsys):
+    with pytest.raises(UserError, match=text) as raised:
         adapter = make(level, Settings()).make_adapter()
         adapter.reset(0)
         adapter.step(1)
-    assert ("did you mean" in str(raised.value)) == ("did you" in says)
+    assert ("did you mean" in str(raised.value)) == ("did you" in text)
     monkeypatch.chdir(tmp_path)
     random = "--method random --demos 0 --episodes 2 --no-pictures".split()
     assert program.main(["--env", level, *random]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_it_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
+def test_program_learns_from_a_data_set_and_plays(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert program.main(["--env=Corridor-v0", *SMALL, "--steps", "1"]) == 2
     assert "Corridor-v0 has no demonstrator: name a Minari data set" in capsys.readouterr().err
-    name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 4)
+    name = recorded("my/corridor-v0", "Corridor-v0", lambda view: 1, 4)
     (chosen,) = command_line.parse("gymnasium", ["--demonstrations", name])
-    assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # as the data say
+    assert (chosen.level, chosen.demos) == ("Corridor-v0", 4)  # from the data set
     options = [*SMALL, "--horizon", "3", "--context", "1", "--steps", "40"]
     monkeypatch.setattr(
         train, "judge_values", lambda _, data, means: f"{len(data)} of {means['step']}"
     )
     assert program.main(["--dataset", name, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "gymnasium.jsonl")
-    assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == WAY - 1
+    assert row["successes"] == 3 and row["mean_return"] == 1.0 and row["mean_length"] == LENGTH - 1
     assert (row["data_success"], row["data_return"], row["criterion_given"]) == (1.0, 1.0, False)
-    said = capsys.readouterr().out
-    assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(said.split())
-    assert "warning: 4 of 40" in said
-    assert "success: a positive reward at the end (nobody has named a return)" in said
+    output = capsys.readouterr().out
+    assert "mean return 1.00 (data: 1.00), success 100.0%" in " ".join(output.split())
+    assert "warning: 4 of 40" in output
+    assert "success: a positive reward at the end (nobody has named a return)" in output
     assert domains.find_domain("gymnasium") is GYMNASIUM
 
 
-def test_a_target_return_is_a_high_one_of_the_data(tmp_path, monkeypatch, capsys):
-    """Unless one is given; a checkpoint is played with the target of its data."""
+def test_target_return_defaults_to_a_high_return_of_the_data(tmp_path, monkeypatch, capsys):
+    """A given target takes precedence; a checkpoint keeps the target of its data."""
     monkeypatch.chdir(tmp_path)
-    name = recorded("my/corridor-v0", "Corridor-v0", lambda seen: 1, 2)
+    name = recorded("my/corridor-v0", "Corridor-v0", lambda view: 1, 2)
     options = [*SMALL, "--dataset", name, "--method", "dt", "--steps", "0"]
     assert program.main(options) == 0
     assert "target return: 1, from the demonstrations" in " ".join(capsys.readouterr().out.split())
@@ -285,101 +285,101 @@ def test_a_target_return_is_a_high_one_of_the_data(tmp_path, monkeypatch, capsys
     assert row["configuration"]["method_settings"]["target_return"] == 1.0
 
 
-def test_data_of_an_environment_that_a_module_registers(tmp_path, monkeypatch):
-    """Data know the environment by its id, without the module."""
+def test_data_match_an_environment_given_with_its_module(tmp_path, monkeypatch):
+    """Data sets store the environment's id without its module."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     register = 'gym.register("Theirs-v0", "tests.test_gymnasium:Corridor", max_episode_steps=12)'
     (tmp_path / "their_corridor.py").write_text(f"import gymnasium as gym\n{register}\n")
-    name = recorded("my/theirs-v0", "their_corridor:Theirs-v0", lambda seen: 1, 2)
+    name = recorded("my/theirs-v0", "their_corridor:Theirs-v0", lambda view: 1, 2)
     options = [*RANDOM, "--demos", "2", "--steps", "0"]
     assert program.main(["--env", "their_corridor:Theirs-v0", "--dataset", name, *options]) == 0
 
 
-def loaded(name, level, **options):
+def load_demonstrations(name, level, **options):
     return storage.load(name, make(level, Settings(**options))).demonstrations
 
 
-def test_data_of_other_arguments_are_refused_until_they_are_given():
+def test_data_recorded_with_other_arguments_raise_an_error():
     large = {"map_name": "8x8", "is_slippery": False}
-    name = recorded("my/lake-v0", "FrozenLake-v1", lambda seen: 2, 2, **large)
+    name = recorded("my/lake-v0", "FrozenLake-v1", lambda view: 2, 2, **large)
     for other in ("{}", '{"is_slippery": false}', '{"map_name": "8x8"}'):
         with pytest.raises(UserError, match="recorded in FrozenLake-v1 with other arg") as raised:
-            loaded(name, "FrozenLake-v1", arguments=other)
+            load_demonstrations(name, "FrozenLake-v1", arguments=other)
         assert f"give it {json.dumps(large)}" in str(raised.value)  # all of them
-    assert len(loaded(name, "FrozenLake-v1", arguments=json.dumps(large))) == 2
+    assert len(load_demonstrations(name, "FrozenLake-v1", arguments=json.dumps(large))) == 2
     for wrong in ("[]", "{", "[" * 100_000):
         with pytest.raises(ValueError, match="arguments must be a JSON object like"):
             Settings(arguments=wrong)
 
 
 class Dimmed(gym.ObservationWrapper):
-    """A wrapper of the user's own, which says nothing of its arguments."""
+    """A user's wrapper, which does not report its arguments."""
 
     def observation(self, observation):
         return {**observation, "here": observation["here"] / 2}
 
 
 class Renamed(Dimmed):
-    """Another."""
+    """A wrapper with another name."""
 
 
-def test_data_recorded_through_other_wrappers_are_refused_by_name():
+def test_data_recorded_with_other_wrappers_raise_an_error():
     scaled = recorded(
-        "my/scaled-v0", "MountainCar-v0", lambda seen: 1, 1,
+        "my/scaled-v0", "MountainCar-v0", lambda view: 1, 1,
         lambda env: RescaleObservation(env, -1.0, 1.0),
     )  # fmt: skip
-    (found,) = loaded(scaled, "Scaled-v0")
+    (found,) = load_demonstrations(scaled, "Scaled-v0")
     adapter = make("Scaled-v0", Settings()).make_adapter()
     np.testing.assert_allclose(adapter.reset(0), found.observations[0], atol=1e-6)
-    dimmed = recorded("my/dimmed-v0", "Corridor-v0", lambda seen: 1, 1, Dimmed)
-    assert len(loaded(dimmed, "Dim-v0")) == 1
-    plain = recorded("my/plain-v0", "MountainCar-v0", lambda seen: 1, 1)
-    renamed = recorded("my/renamed-v0", "Corridor-v0", lambda seen: 1, 1, Renamed)
+    dimmed = recorded("my/dimmed-v0", "Corridor-v0", lambda view: 1, 1, Dimmed)
+    assert len(load_demonstrations(dimmed, "Dim-v0")) == 1
+    plain = recorded("my/plain-v0", "MountainCar-v0", lambda view: 1, 1)
+    renamed = recorded("my/renamed-v0", "Corridor-v0", lambda view: 1, 1, Renamed)
     sticky = recorded(
-        "my/sticky-v0", "MountainCar-v0", lambda seen: 1, 1, lambda env: StickyAction(env, 0.25)
+        "my/sticky-v0", "MountainCar-v0", lambda view: 1, 1, lambda env: StickyAction(env, 0.25)
     )
-    for name, level, says in [
+    for name, level, text in [
         (plain, "Scaled-v0", "was recorded with no wrappers, and .*RescaleObs"),
         (scaled, "MountainCar-v0", "RescaleObservation .*min_obs.*-1.0"),
         (sticky, "MountainCar-v0", "was recorded with the wrappers StickyAction"),
         (renamed, "Dim-v0", "was recorded with the wrappers .*Renamed"),
         (dimmed, "Corridor-v0", "was recorded with the wrappers .*Dimmed"),
     ]:
-        with pytest.raises(UserError, match=says):
-            loaded(name, level)
+        with pytest.raises(UserError, match=text):
+            load_demonstrations(name, level)
 
 
 @pytest.mark.parametrize(
-    ("wrap", "says"),
+    ("wrap", "text"),
     [
         (lambda env: TransformReward(env, abs), "reward at step 0"),
         (lambda env: TransformObservation(env, lambda x: x[::-1], None), "first observation"),
         (lambda env: TransformAction(env, lambda a: 2 - a, None), "observation after step 0"),
-        (RecordEpisodeStatistics, None),  # only watches
+        (RecordEpisodeStatistics, None),  # changes no data
     ],
 )
-def test_wrappers_that_data_cannot_name_are_found_by_playing_again(wrap, says):
-    """Minari keeps nothing of an environment if a wrapper was given a function."""
-    name = recorded("my/wrapped-v0", "MountainCar-v0", lambda seen: 0, 1, wrap)
+def test_replayed_actions_reveal_unrecorded_wrappers(wrap, text):
+    """Minari stores no description of an environment if a wrapper takes a function."""
+    name = recorded("my/wrapped-v0", "MountainCar-v0", lambda view: 0, 1, wrap)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        loaded(name, "MountainCar-v0")
-    told = [str(each.message) for each in warned if "may not have been" in str(each)]
-    assert len(told) == (says is not None)
-    assert says is None or f"with its seed 0 has another {says}; look for wrappers" in told[0]
+        load_demonstrations(name, "MountainCar-v0")
+    messages = [str(each.message) for each in warned if "may not have been" in str(each)]
+    assert len(messages) == (text is not None)
+    assert text is None or f"with its seed 0 has another {text}; look for wrappers" in messages[0]
 
 
-def test_a_limit_of_steps_that_differs_is_the_users_choice():
-    name = recorded("my/short-v0", "Corridor-v0", lambda seen: 1, 1, max_episode_steps=7)
+def test_different_step_limits_need_an_explicit_choice():
+    name = recorded("my/short-v0", "Corridor-v0", lambda view: 1, 1, max_episode_steps=7)
     with pytest.raises(UserError, match=r"at most 7 steps, and Corridor-v0 ends them after 12: .*"):
-        loaded(name, "Corridor-v0")
+        load_demonstrations(name, "Corridor-v0")
     for chosen in (7, 12, 9):
-        assert len(loaded(name, "Corridor-v0", max_steps=chosen)) == 1
+        assert len(load_demonstrations(name, "Corridor-v0", max_steps=chosen)) == 1
 
 
-def saved_spaces(name, change):
-    """Changes what a data set says of its spaces, as if it came from somewhere else."""
+def edit_spaces(name, change):
+    """Changes the spaces in a data set's metadata, as if it came from another environment."""
     path = storage.find_datasets_folder() / name / "data" / "metadata.json"
     metadata = json.loads(path.read_text())
     spaces = {each: json.loads(metadata[each]) for each in SPACES}
@@ -388,11 +388,11 @@ def saved_spaces(name, change):
     path.write_text(json.dumps(metadata))
 
 
-LARGEST = float(np.finfo(np.float32).max)  # as environments of earlier versions have infinity
+LARGEST = float(np.finfo(np.float32).max)  # how older environments write infinity
 
 
 @pytest.mark.parametrize(
-    ("level", "change", "says"),
+    ("level", "change", "text"),
     [
         ("MountainCar", lambda s, a: s["low"].__setitem__(0, -0.5), "each observation is in Box"),
         ("MountainCar", lambda s, a: a.update(n=4), r"each action is in Discrete\(4\), and"),
@@ -403,18 +403,18 @@ LARGEST = float(np.finfo(np.float32).max)  # as environments of earlier versions
         ("Corridor", lambda s, a: s["subspaces"]["lamp"].update(n=4), "each observation.*lamp"),
     ],
 )
-def test_spaces_that_are_not_those_of_the_environment(level, change, says):
-    name = recorded("my/car-v0", f"{level}-v0", lambda seen: 1, 1)
-    saved_spaces(name, change)
-    if says is None:
-        assert len(loaded(name, f"{level}-v0")) == 1
+def test_data_with_other_spaces_raise_an_error(level, change, text):
+    name = recorded("my/car-v0", f"{level}-v0", lambda view: 1, 1)
+    edit_spaces(name, change)
+    if text is None:
+        assert len(load_demonstrations(name, f"{level}-v0")) == 1
     else:
-        with pytest.raises(UserError, match=says):
-            loaded(name, f"{level}-v0")
+        with pytest.raises(UserError, match=text):
+            load_demonstrations(name, f"{level}-v0")
 
 
-def test_choices_below_zero_are_told_apart():
-    """A one-hot code that is counted from 0 would be nothing for all of them."""
+def test_encoder_distinguishes_negative_choices():
+    """A one-hot code that starts at 0 would be all zeros for every negative choice."""
     module = StateTokens(parts_of(Deep.observation_space), 8, 0)
     context = blank_context(make("Deep-v0", Settings()), 0)
     params = random_like(jax.eval_shape(module.init, jax.random.key(0), context))
@@ -429,7 +429,7 @@ def test_choices_below_zero_are_told_apart():
 
 
 class Moody(gym.Env):
-    """Each observation is another kind of mapping."""
+    """Each observation is a different kind of mapping."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Dict(b=spaces.Discrete(9), a=spaces.Discrete(9))
@@ -437,19 +437,19 @@ class Moody(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         self.count = seed  # episodes begin with different kinds
-        return self.seen(), {}
+        return self.view(), {}
 
-    def seen(self):
+    def view(self):
         self.count += 1
         values = {"b": np.int64(self.count % 9), "a": np.int64(0)}
         return self.kinds[self.count % len(self.kinds)](values)
 
     def step(self, action):
-        return self.seen(), 1.0, False, self.count > 12, {}
+        return self.view(), 1.0, False, self.count > 12, {}
 
 
 class Bare:
-    """An adapter that is not ours: observations are as they come."""
+    """A user's adapter, which passes observations on unchanged."""
 
     num_actions = 3
 
@@ -464,7 +464,7 @@ class Bare:
 
 
 @pytest.mark.parametrize("adapter", [GymnasiumAdapter, Bare])
-def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
+def test_rollouts_convert_all_mappings_to_dicts(adapter):
     contexts = []
 
     class Planner:
@@ -472,8 +472,8 @@ def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
 
         def plan_next(self, params, keys, context, cache):
             contexts.append(context)
-            nothing = np.zeros(len(keys), np.int32)
-            return Plan(nothing[:, None], *[nothing] * 4), None
+            filler = np.zeros(len(keys), np.int32)
+            return Plan(filler[:, None], *[filler] * 4), None
 
     episodes = evaluate(lambda: adapter(Moody()), [1, 2, 3], Planner(), (), context=2)
     assert list(episodes.lengths) == [11, 10, 9]
@@ -481,12 +481,12 @@ def test_dicts_of_any_kind_are_one_structure_in_the_rollout(adapter):
     np.testing.assert_array_equal(contexts[2].past["b"], [[2, 3], [3, 4], [4, 5]])
 
 
-def test_dicts_of_any_kind_are_one_structure_in_data():
+def test_data_sets_convert_all_mappings_to_dicts():
     blank = {"b": np.zeros((), np.int64), "a": np.zeros(2, np.float32)}
-    seen = {"b": np.arange(3), "a": np.ones((3, 2), np.float32)}
+    view = {"b": np.arange(3), "a": np.ones((3, 2), np.float32)}
     rest = np.zeros(2, np.int32), np.zeros(2, np.float32), True, False, storage.UNKNOWN_SEED
     kinds = (dict, OrderedDict, FrozenDict)
-    given = [Demonstration(kind(seen), *rest) for kind in kinds]
+    given = [Demonstration(kind(view), *rest) for kind in kinds]
     domains = [toy.DOMAIN._replace(blank=kind(blank)) for kind in kinds]
     storage.save("my/kinds-v0", Collection(given, {}), domains[0], "kinds")
     for domain in domains:
@@ -496,16 +496,16 @@ def test_dicts_of_any_kind_are_one_structure_in_data():
         np.testing.assert_array_equal(joined["b"], [0, 1, 2] * 6)
 
 
-def test_choices_that_there_are_not_are_refused():
+def test_choices_outside_their_space_raise_an_error():
     several = spaces.Dict(one=spaces.Discrete(3, start=2), more=spaces.MultiDiscrete([2, 4]))
     good = {"one": np.array([2, 4]), "more": np.array([[0, 0], [1, 3]])}
     check_choices(several, good, "it")
-    for field, wrong, says in ("one", [1, 4], "1, expected 2"), ("more", [[2, 3]], "2, expected 0"):
-        with pytest.raises(UserError, match=f"it: {field}: a choice of {says}"):
+    for field, wrong, text in ("one", [1, 4], "1, expected 2"), ("more", [[2, 3]], "2, expected 0"):
+        with pytest.raises(UserError, match=f"it: {field}: a choice of {text}"):
             check_choices(several, {**good, field: np.array(wrong)}, "it")
 
 
-def test_what_is_made_is_closed():
+def test_environments_are_closed():
     domain = make("Held-v0", Settings())
     assert (Held.made, Held.closed) == (1, 1)
     domain.make_adapter().close()

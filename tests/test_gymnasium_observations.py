@@ -1,4 +1,4 @@
-"""What an observation space declares reaches the network, or is refused by name."""
+"""Networks read every supported observation space; errors name the other spaces."""
 
 import dataclasses
 import itertools
@@ -42,7 +42,7 @@ from tests.test_gymnasium import recorded
 
 
 class Long(gym.Env):
-    """Integers that int32 does not have."""
+    """Observes an integer that int32 cannot hold."""
 
     action_space = spaces.Discrete(2)
     observation_space = spaces.Box(0, 2**40, (1,), np.int64)
@@ -57,7 +57,7 @@ class Long(gym.Env):
 
 
 class Stray(Long):
-    """A choice that there is not."""
+    """Observes a choice outside its space."""
 
     observation_space = spaces.MultiDiscrete([3])
     state = 3
@@ -72,21 +72,21 @@ def registered():
     del gym.registry["Long-v0"], gym.registry["Stray-v0"]
 
 
-def features_of(states, knots=None):
-    """Features `[n, 16]` of numbers `[n]`, scaled by themselves.
+def compute_features(states, knots=None):
+    """Returns features `[n, 16]` of numbers `[n]`, by default with knots of these numbers.
 
-    They are computed beside others, so that all tests share a few programs of one shape.
+    The numbers are padded to one shape, so all tests share a few programs.
     """
     states = np.asarray(states)
     knots = find_knots(states[:, None], BINS) if knots is None else knots
     table = np.zeros((12, 2), states.dtype)
     table[: len(states), 0] = states
     others = tuple(float(number) for number in range(BINS + 1))
-    found = scale_numbers(jnp.asarray(table), (*knots, others))
-    return np.asarray(found)[: len(states), :BINS]
+    features = scale_numbers(jnp.asarray(table), (*knots, others))
+    return np.asarray(features)[: len(states), :BINS]
 
 
-FEW = [
+SAMPLES = [
     ([100, 200], "float32"), ([1e-6, 2e-6], "float32"), ([1e9, 1.1e9], "float32"),
     ([1e6 - 1, 1e6, 1e6 + 1], "float32"), ([-3.4e38, 0, 3.4e38], "float32"),
     ([0, 0.5, 1, 1e9], "float32"), ([-1e-30, 1e-30, 1], "float32"),
@@ -96,20 +96,20 @@ FEW = [
 ]  # fmt: skip
 
 
-def test_states_of_any_size_and_type_are_far_apart():
-    for states, dtype in FEW:
-        found = features_of(np.array(states, dtype))
-        assert np.isfinite(found).all()
-        for one, other in itertools.combinations(found, 2):
+def test_distinct_numbers_of_any_size_and_type_have_distant_features():
+    for states, dtype in SAMPLES:
+        features = compute_features(np.array(states, dtype))
+        assert np.isfinite(features).all()
+        for one, other in itertools.combinations(features, 2):
             assert np.abs(one - other).max() == 2  # from one end of an interval to the other
 
 
-def test_many_values_are_told_apart_where_they_are():
+def test_features_resolve_values_where_data_are_dense():
     rng = np.random.default_rng(0)
     usual = rng.uniform(0, 1, 2000)
-    odd = np.where(rng.random(2000) < 0.05, 1e9, usual)  # "nothing seen"
+    odd = np.where(rng.random(2000) < 0.05, 1e9, usual)  # 1e9 marks missing values
     two = np.concatenate([usual, 1e6 + usual])
-    tail = np.where(rng.random(2000) < 0.99, 0, rng.integers(1, 256, 2000))  # dark pictures
+    tail = np.where(rng.random(2000) < 0.99, 0, rng.integers(1, 256, 2000))  # as in dark pictures
     counts = np.floor(rng.pareto(1.0, 2000) * 5)
     for states, one, other in [
         (odd, 0.3, 0.6), (two, 0.25, 0.75), (two, 1e6 + 0.25, 1e6 + 0.75), (tail, 0, 20),
@@ -117,22 +117,22 @@ def test_many_values_are_told_apart_where_they_are():
     ]:  # fmt: skip
         knots = find_knots(states.astype(np.float32)[:, None], BINS)
         assert len(knots[0]) <= BINS + 1 and list(knots[0]) == sorted(set(knots[0]))
-        assert set(knots[0]) <= set(states.astype(np.float32).tolist())  # so that they are exact
-        found = features_of(np.array([one, other], np.float32), knots)
-        assert np.abs(found[0] - found[1]).sum() > 0.5, (one, other)
+        assert set(knots[0]) <= set(states.astype(np.float32).tolist())  # exact: from the data
+        features = compute_features(np.array([one, other], np.float32), knots)
+        assert np.abs(features[0] - features[1]).sum() > 0.5, (one, other)
 
 
-def test_beyond_the_training_data_features_go_on_and_stay_small():
+def test_features_beyond_the_training_data_are_monotonic_and_small():
     knots = ((0.0, 1.0, 3.0),)
     states = np.array([-1e30, -10, -1, -1e-3, 0, 0.5, 1, 2, 3, 3.001, 9, 3e38], np.float32)
-    found = features_of(states, knots)
-    assert np.isfinite(found).all() and np.abs(found).max() < 200
-    assert (np.diff(found.sum(axis=1)) > 0).all()
-    assert found[3, :3] == pytest.approx([-1.002, -1, 0], abs=1e-5)
-    # Of what never changed nothing could be learned.
-    assert not features_of(np.array([5, 7], np.float32), ((5.0,),)).any()
-    # Without data no size is expected.
-    seen = features_of(np.array([-1e6, -3, -0.02, 0, 0.005, 2, 100, 200, 1e9]), UNMEASURED)
+    features = compute_features(states, knots)
+    assert np.isfinite(features).all() and np.abs(features).max() < 200
+    assert (np.diff(features.sum(axis=1)) > 0).all()
+    assert features[3, :3] == pytest.approx([-1.002, -1, 0], abs=1e-5)
+    # A number that is constant in the data has no features.
+    assert not compute_features(np.array([5, 7], np.float32), ((5.0,),)).any()
+    # Without data, features resolve numbers of every size.
+    seen = compute_features(np.array([-1e6, -3, -0.02, 0, 0.005, 2, 100, 200, 1e9]), UNMEASURED)
     assert (np.diff(seen.sum(axis=1)) > 0.1).all()
 
 
@@ -146,19 +146,19 @@ def test_beyond_the_training_data_features_go_on_and_stay_small():
         (spaces.MultiBinary([2, 3]), Part("vector"), np.int8),
         (spaces.Discrete(3, dtype=np.uint8), Part("choices", 3), np.int32),
         (spaces.MultiDiscrete([4, 9], start=[1, 1]), Part("choices", 10), np.int32),
-        # Choices far from zero are counted from their first, as those below zero.
+        # Choices far from zero, or below zero, are counted from the first choice.
         (spaces.Discrete(3, start=10**9), Part("choices", 3, 10**9), np.int32),
         (spaces.MultiDiscrete([3, 4], start=[-1, 0]), Part("choices", 5, -1), np.int32),
     ],
 )
-def test_arrays_have_types_that_jax_computes_with(space, part, dtype):
+def test_blank_observations_have_types_that_jax_supports(space, part, dtype):
     blank = blank_of(space, "it")
     assert blank.dtype == dtype and blank.shape == space.shape
     assert parts_of(space) == (part,)
 
 
 @pytest.mark.parametrize(
-    ("space", "says"),
+    ("space", "message"),
     [
         (spaces.Text(5), "it is a Text: expected Box"),
         (spaces.Tuple([spaces.Discrete(2)]), "it is a Tuple: .*FlattenObservation"),
@@ -171,8 +171,8 @@ def test_arrays_have_types_that_jax_computes_with(space, part, dtype):
     ],
     ids=str,
 )
-def test_spaces_that_no_network_reads_are_refused_by_name(space, says):
-    with pytest.raises(UserError, match=says):
+def test_unsupported_spaces_raise_an_error_that_names_them(space, message):
+    with pytest.raises(UserError, match=message):
         blank_of(space, "it")
 
 
@@ -183,14 +183,14 @@ PICTURES = {
 }  # fmt: skip
 
 
-def demonstration(observations):
+def make_demonstration(observations):
     states = len(jax.tree.leaves(observations)[0])
     zeros = np.zeros(states - 1)
     return Demonstration(observations, zeros.astype(np.int32), zeros, True, False, 0)
 
 
-def test_pictures_of_any_layout_and_range_are_read():
-    """Their channels are found, and one number that changes is seen."""
+def test_networks_read_pictures_of_any_layout_and_range():
+    """`parts_of` finds the channels, and one changed number changes the tokens."""
     dark = {name: np.zeros(shape, dtype) for name, (shape, dtype, _) in PICTURES.items()}
     states = {
         name: np.stack([dark[name], np.full_like(dark[name], most)])
@@ -199,7 +199,7 @@ def test_pictures_of_any_layout_and_range_are_read():
     space = {name: spaces.Box(0, 1, zeros.shape, zeros.dtype) for name, zeros in dark.items()}
     parts = parts_of(spaces.Dict(space))
     assert {part.kind for part in parts} == {"picture"}
-    statistics = measure_parts(parts, [demonstration(states)])
+    statistics = measure_parts(parts, [make_demonstration(states)])
     assert [len(knots) for knots in statistics] == [1, 11, 3, 3, 2]  # in alphabetic order
     assert statistics[0] == ((0.0, 1.0),) and statistics[2] == ((0.0, 255.0),) * 3
     module = StateTokens(parts, 8, 0, statistics=statistics)
@@ -214,33 +214,33 @@ def test_pictures_of_any_layout_and_range_are_read():
         assert np.abs(seen - before).max() > 1e-3, name
 
 
-def test_statistics_are_of_the_training_data_and_only_of_numbers():
-    assert measure_parts((Part("choices", 3),), [demonstration(np.zeros(2, np.int32))]) == ()
+def test_statistics_cover_only_numbers_of_the_training_data():
+    assert measure_parts((Part("choices", 3),), [make_demonstration(np.zeros(2, np.int32))]) == ()
     assert measure_parts((Part("vector"),), []) == ()
     rng = np.random.default_rng(0)
-    several = [demonstration(rng.normal(size=(n, 2)).astype(np.float32)) for n in (5, 40, 9)]
+    several = [make_demonstration(rng.normal(size=(n, 2)).astype(np.float32)) for n in (5, 40, 9)]
     (knots,) = measure_parts((Part("vector"),), several)
     states = np.concatenate([each.observations for each in several])
     assert [column[0] for column in knots] == states.min(axis=0).tolist()
     assert [column[-1] for column in knots] == states.max(axis=0).tolist()
-    # All numbers of a large array share their knots: they are kept with the checkpoint.
-    large = demonstration(np.arange(3 * 20_000, dtype=np.float32).reshape(3, 20_000))
+    # The checkpoint stores the knots, so all numbers of a large array share them.
+    large = make_demonstration(np.arange(3 * 20_000, dtype=np.float32).reshape(3, 20_000))
     (shared,) = measure_parts((Part("vector"),), [large])
     assert len(shared) == 1 and len(shared[0]) == count_bins(20_000) + 1 == 5
     assert (shared[0][0], shared[0][-1]) == (0, 3 * 20_000 - 1)
     assert count_bins(1) == BINS and count_bins(MOST_INPUTS // 4) == 4
 
 
-def test_statistics_are_kept_with_the_specification(tmp_path):
+def test_specification_stores_the_statistics(tmp_path):
     domain = make("CartPole-v1", Settings())
-    data = [demonstration(np.arange(12, dtype=np.float32).reshape(3, 4) % 8)]
+    data = [make_demonstration(np.arange(12, dtype=np.float32).reshape(3, 4) % 8)]
     (chosen,) = command_line.parse(
         "gymnasium", ["--level=CartPole-v1", *SMALL, "--steps=0", "--demos=0"]
     )
     before = specify(chosen, 0, domain)
     after = dataclasses.replace(before, statistics=domain.scaling.measure(data))
     assert after.statistics[0][0] == (0.0, 4.0)
-    assert "statistics" not in pretrained.describe_identity(before)  # as of checkpoints from before
+    assert "statistics" not in pretrained.describe_identity(before)  # as in older checkpoints
     assert pretrained.describe_identity(before) != pretrained.describe_identity(after)
     pretrained.save_specification(tmp_path, after)
     assert pretrained.parse_specification(tmp_path) == after
@@ -252,7 +252,7 @@ def test_statistics_are_kept_with_the_specification(tmp_path):
             apply_statistics(domain, wrong)
 
 
-def test_changes_that_float32_cannot_hold_are_refused():
+def test_changes_too_small_for_float32_raise_an_error():
     space = spaces.Dict(now=spaces.Box(0, np.inf, (2,), np.float64), near=spaces.Box(0, 1, (1,)))
     steps = np.arange(4.0)[:, None]
     near = 1 + 1e-9 * steps
@@ -262,13 +262,13 @@ def test_changes_that_float32_cannot_hold_are_refused():
         check_precision(space, {"now": np.hstack([steps, 1.7e9 + steps]), "near": near}, "it")
 
 
-def test_what_does_not_fit_is_refused_in_data_and_in_play():
+def test_out_of_range_observations_raise_an_error_in_data_and_in_play():
     domain = make("Long-v0", Settings())
     name = recorded("my/long-v0", "Long-v0", lambda seen: 0, 1)
-    says = "numbers that do not fit int32, or are not finite, such as 4294967298"
-    with pytest.raises(UserError, match=f"episode 0 of .*: observations: {says}"):
+    message = "numbers that do not fit int32, or are not finite, such as 4294967298"
+    with pytest.raises(UserError, match=f"episode 0 of .*: observations: {message}"):
         storage.load(name, domain)
-    with pytest.raises(UserError, match=f"an observation of Long-v0: {says}"):
+    with pytest.raises(UserError, match=f"an observation of Long-v0: {message}"):
         domain.make_adapter().reset(0)
     with pytest.raises(UserError, match="an observation of Stray-v0: a choice of 3, expected 0 to"):
         make("Stray-v0", Settings()).make_adapter().reset(0)

@@ -1,4 +1,4 @@
-"""Runs that are stopped, killed or out of disk: what is lost, what is said, how they go on."""
+"""Runs survive signals, kills and unreadable checkpoints."""
 
 import errno
 import os
@@ -30,7 +30,7 @@ place = pytest.fixture(place_with_a_run, scope="module")
 
 
 @only_long
-def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
+def test_killed_run_ends_like_an_uninterrupted_run(place):
     rng = np.random.default_rng(0)
     for _ in range(10):
         before = max(place.steps_saved("killed"), default=0)
@@ -44,11 +44,11 @@ def test_a_run_that_is_killed_goes_on_as_if_it_had_not_been(place):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
-def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
+def test_stopped_run_saves_and_prints_the_command_to_continue(
     tmp_path, monkeypatch, capsys, number, code
 ):
-    class Stopped(Meter):
-        """The signal comes at step 20 of the training."""
+    class StoppedMeter(Meter):
+        """Sends the signal at step 20 of the training."""
 
         def update(self, done, note=""):
             if done == 20:
@@ -57,12 +57,12 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
 
     options = [*RANDOM, "--demos", "1", "--steps", "60", "--runs", str(tmp_path / "runs")]
     with monkeypatch.context() as patch, pytest.raises(SystemExit, match=str(code)):
-        patch.setattr(running_train, "Meter", Stopped)
+        patch.setattr(running_train, "Meter", StoppedMeter)
         patch.setattr(jax_setup, "exit_at_once", sys.exit)
         babyai.main(options)
     stopped = f"stopped by {signal.Signals(number).name}; continue with: python -m"
-    said = capsys.readouterr().err
-    assert said == f"{stopped} experiments.babyai {' '.join(options)}\n"
+    messages = capsys.readouterr().err
+    assert messages == f"{stopped} experiments.babyai {' '.join(options)}\n"
     (folder,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     assert [path.name for path in (folder / "checkpoints").iterdir()] == ["20"]
     assert babyai.main(options) == 0
@@ -73,22 +73,22 @@ def test_a_run_that_is_asked_to_stop_saves_and_says_how_to_go_on(
 
 @only_long
 @pytest.mark.parametrize("trial", range(100))
-def test_a_signal_at_any_moment(tmp_path, trial):
-    """Nothing is compiled yet, so that most of the time a compiler runs."""
+def test_signal_at_any_moment_stops_the_run(tmp_path, trial):
+    """No compiled program is cached, so the compiler runs most of the time."""
     rng = np.random.default_rng(trial)
     number, code = ((signal.SIGTERM, 0), (signal.SIGINT, 130))[trial % 2]
     run = Place(tmp_path).start("runs", cache="off")
-    while not (tmp_path / "datasets").exists():  # still importing: Python itself would answer
+    while not (tmp_path / "datasets").exists():  # still importing: Python would handle it
         assert run.poll() is None, run.stderr.read()[-2000:]
         time.sleep(0.01)
     time.sleep(rng.uniform(0, 15))
-    over = run.poll() is not None
+    finished = run.poll() is not None
     run.send_signal(number)
-    assert run.wait(60) == (0 if over else code), run.stderr.read()[-2000:]
+    assert run.wait(60) == (0 if finished else code), run.stderr.read()[-2000:]
 
 
 def catches_signals(process):
-    """Whether a process has a handler of SIGTERM, which Python itself has not."""
+    """Returns whether a process handles SIGTERM; Python itself does not."""
     status = Path(f"/proc/{process.pid}/status").read_text()
     (caught,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
     return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
@@ -96,7 +96,7 @@ def catches_signals(process):
 
 @only_long
 @pytest.mark.parametrize("trial", range(14))
-def test_a_signal_while_a_program_is_imported(tmp_path, trial):
+def test_signal_during_imports_stops_the_program(tmp_path, trial):
     rng = np.random.default_rng(trial)
     number, code = ((signal.SIGINT, 130), (signal.SIGTERM, 0))[trial % 2]
     installed = (
@@ -121,8 +121,8 @@ def test_a_signal_while_a_program_is_imported(tmp_path, trial):
     assert line.startswith(f"stopped by {signal.Signals(number).name}")
 
 
-def test_a_library_has_no_handlers():
-    """`experiments` changes nothing unless it is the program."""
+def test_library_installs_no_handlers():
+    """`experiments` installs handlers only as the main program."""
     check = (
         "import signal, sys, experiments, leapjax.checkpoints\n"
         "leapjax.checkpoints.hush_orbax()\n"
@@ -132,18 +132,18 @@ def test_a_library_has_no_handlers():
     subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True)
 
 
-def test_a_signal_that_python_dropped_is_noticed_at_the_next_look():
+def test_dropped_signal_is_raised_at_the_next_check():
     with catch_signals() as interruption:
-        for look in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
+        for action in (lambda: os.kill(os.getpid(), signal.SIGTERM), interruption.check):
             with pytest.raises(Interrupted, match="SIGTERM"):
-                look()
+                action()
         with pytest.raises(Interrupted, match="SIGTERM"), interruption.defer_signals():
             pytest.fail("long work began")
 
 
-def test_a_deferred_signal_waits_and_a_second_one_does_not():
-    refused = pytest.raises(Interrupted, match="SIGINT")
-    with catch_signals() as interruption, refused, interruption.defer_signals():
+def test_second_signal_interrupts_a_deferral():
+    expects_error = pytest.raises(Interrupted, match="SIGINT")
+    with catch_signals() as interruption, expects_error, interruption.defer_signals():
         os.kill(os.getpid(), signal.SIGINT)
         assert interruption.requested == signal.SIGINT
     with catch_signals() as interruption, pytest.raises(Interrupted), interruption.defer_signals():
@@ -153,7 +153,7 @@ def test_a_deferred_signal_waits_and_a_second_one_does_not():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, number):
+def test_swallowed_signal_ends_the_program_unless_it_is_deferred(monkeypatch, number):
     monkeypatch.setattr("leapjax.running.interruption.GRACE", 0.05)
     ended = []
     with catch_signals(ended.append) as interruption:
@@ -163,9 +163,9 @@ def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, n
         assert not ended
     with catch_signals(ended.append), pytest.raises(Interrupted):
         os.kill(os.getpid(), number)
-    assert not ended  # it had its effect in time
+    assert not ended  # the signal ended the block in time
     with catch_signals(ended.append):
-        with pytest.raises(Interrupted):  # and here, as in a compiler, it has none
+        with pytest.raises(Interrupted):  # swallowed here, as in a compiler
             os.kill(os.getpid(), number)
         deadline = time.monotonic() + 20
         while not ended and time.monotonic() < deadline:
@@ -173,58 +173,58 @@ def test_a_signal_without_effect_ends_the_program_unless_it_waits(monkeypatch, n
     assert [str(stopped) for stopped in ended] == [signal.Signals(number).name]
 
 
-def state(step):
+def make_state(step):
     return TrainState({"w": jnp.full((50, 50), float(step))}, (), jnp.int32(step))
 
 
-def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path):
-    saved, said = Checkpoints(tmp_path), []
+def test_damaged_checkpoint_is_set_aside_and_the_previous_checkpoint_restored(tmp_path):
+    checkpoints, messages = Checkpoints(tmp_path), []
     for step in (1, 2, 3):
-        saved.save(state(step))
-    saved.close()
+        checkpoints.save(make_state(step))
+    checkpoints.close()
     for file in (tmp_path / "3" / "default").rglob("*"):
         if file.is_file():
             file.write_bytes(file.read_bytes()[:20])
-    saved = Checkpoints(tmp_path)
-    restored = saved.restore(state(0), skipped=said.append)
+    checkpoints = Checkpoints(tmp_path)
+    restored = checkpoints.restore(make_state(0), skipped=messages.append)
     assert int(restored.step) == 2
     np.testing.assert_array_equal(restored.params["w"], 2.0)
-    assert len(said) == 1 and re.search("3 is damaged.*the one before is used", said[0])
-    saved.save(state(3))  # the step that was damaged
-    saved.close()
-    assert int(Checkpoints(tmp_path).restore(state(0)).step) == 3
+    assert len(messages) == 1 and re.search("3 is damaged.*the one before is used", messages[0])
+    checkpoints.save(make_state(3))  # replaces the damaged step
+    checkpoints.close()
+    assert int(Checkpoints(tmp_path).restore(make_state(0)).step) == 3
     assert (tmp_path / "3.damaged").is_dir()
 
 
-def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_a_damaged_one(tmp_path, monkeypatch):
-    def busy(*arguments, **more):
+def test_temporarily_unreadable_checkpoint_is_not_treated_as_damaged(tmp_path, monkeypatch):
+    def fail_to_open(*arguments, **more):
         raise OSError(errno.EMFILE, "Too many open files")
 
-    saved = Checkpoints(tmp_path / "checkpoints")
-    saved.save(state(1))
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    checkpoints.save(make_state(1))
     with monkeypatch.context() as patch:
-        patch.setattr(saved._manager, "restore", busy)
+        patch.setattr(checkpoints._manager, "restore", fail_to_open)
         with pytest.raises(UserError, match="now .*Too many open files.* it is left as it is"):
-            saved.restore(state(0))
-    assert int(saved.restore(state(0)).step) == 1
-    saved.close()
+            checkpoints.restore(make_state(0))
+    assert int(checkpoints.restore(make_state(0)).step) == 1
+    checkpoints.close()
 
 
-def test_a_checkpoint_of_another_configuration_is_refused_and_stays(tmp_path):
+def test_checkpoint_of_another_configuration_raises_an_error_and_stays(tmp_path):
     (tmp_path / "below").mkdir()
-    folder = tmp_path / "below" / ".." / "checkpoints"  # which leads to the same
-    saved = Checkpoints(folder)
-    saved.save(state(1))
-    saved.close()
-    found = restore_params(folder, jax.eval_shape(lambda: state(0)).params)
-    np.testing.assert_array_equal(found["w"], 1.0)
+    folder = tmp_path / "below" / ".." / "checkpoints"  # another path of the folder
+    checkpoints = Checkpoints(folder)
+    checkpoints.save(make_state(1))
+    checkpoints.close()
+    weights = restore_params(folder, jax.eval_shape(lambda: make_state(0)).params)
+    np.testing.assert_array_equal(weights["w"], 1.0)
     other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
     with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
         Checkpoints(folder).restore(other)
     assert (folder / "1").is_dir()
 
 
-def test_a_folder_in_use_is_refused_until_its_lock_is_let_go_of(tmp_path):
-    refused = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
-    with lock_folder(tmp_path / "run"), refused, lock_folder(tmp_path / "run"):
+def test_locking_a_folder_twice_raises_an_error(tmp_path):
+    expects_error = pytest.raises(UserError, match=rf"in use by another process \({os.getpid()}\)")
+    with lock_folder(tmp_path / "run"), expects_error, lock_folder(tmp_path / "run"):
         pass

@@ -11,9 +11,9 @@ from leapjax.domains.babyai import levels, vocabulary
 from leapjax.domains.babyai.adapter import BabyAIAdapter
 from leapjax.errors import UserError
 
-# The paper's appendix: side, rooms, objects, doors (table "BabyAI environment setting"), then
-# K, T and N (table "BabyAI environment experiment details"). MiniGrid's limit of steps; that of a
-# sequence is 100 for each of its goals.
+# From the paper's appendix: side, rooms, objects, doors (table "BabyAI environment setting"), then
+# K, T and N (table "BabyAI environment experiment details"). Last, MiniGrid's step limit; a
+# sequence has 100 steps for each goal.
 PAPER = {
     "GoToLocalS7N5": (7, 1, 5, "none", 0, 5, 10, 49),
     "GoToLocalS8N7": (8, 1, 7, "none", 0, 5, 10, 64),
@@ -26,12 +26,12 @@ PAPER = {
 sentences = st.lists(st.sampled_from(vocabulary.WORDS), min_size=1, max_size=30)
 
 
-def of_kind(env, *kinds: str) -> list:
+def list_cells(env, *kinds: str) -> list:
     return [cell for cell in env.grid.grid if cell is not None and cell.type in kinds]
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_the_papers_levels_are_as_in_its_tables(name):
+def test_levels_match_the_tables_of_the_paper(name):
     assert set(levels.LEVELS) == set(PAPER)
     side, rooms, objects, doors, context, horizon, iterations, limit = PAPER[name]
     level = levels.find_level(name)
@@ -46,8 +46,8 @@ def test_the_papers_levels_are_as_in_its_tables(name):
         lengths.add(len(re.findall(r"\w+|,", env.mission)))
         assert env.grid.encode().shape == (side, side, 3)
         assert env.num_rows * env.num_cols == rooms
-        assert len(of_kind(env, "key", "ball", "box")) == objects
-        found = of_kind(env, "door")
+        assert len(list_cells(env, "key", "ball", "box")) == objects
+        found = list_cells(env, "door")
         assert (doors == "none") == (not found)
         if found:
             assert len(found) >= rooms - 1  # every room can be reached
@@ -57,7 +57,7 @@ def test_the_papers_levels_are_as_in_its_tables(name):
     assert (len(limits) > 1) == (limit is None)
 
 
-def test_an_unknown_level_suggests_near_names_or_names_all():
+def test_unknown_level_error_suggests_a_similar_name_or_lists_all():
     with pytest.raises(UserError, match="'gotolocals7n5'.*did you mean GoToLocalS7N5"):
         levels.find_level("gotolocals7n5")
     with pytest.raises(UserError, match="registered BabyAI level$") as raised:
@@ -65,16 +65,16 @@ def test_an_unknown_level_suggests_near_names_or_names_all():
     assert all(name in str(raised.value) for name in PAPER)
 
 
-def test_every_registered_level_can_be_observed_and_speaks_the_vocabulary():
+def test_every_registered_level_can_be_observed_and_encoded():
     names = levels.registered_levels()
-    spoken, oblong = set(), {}
+    used, oblong = set(), {}
     for name in names:
         adapter = BabyAIAdapter(levels.find_level(name))
         observation = adapter.reset(3)
         width, height = adapter.env.width, adapter.env.height
         side = max(width, height)
         assert observation.grid.shape == (side, side, 3), name
-        # What pads a level that is not square is "unseen", which no cell inside is.
+        # Padding of a level that is not square is 0, "unseen"; cells inside are never 0.
         assert (observation.grid[:width, :height, 0] > 0).all(), name
         assert not observation.grid[width:].any() and not observation.grid[:, height:].any(), name
         if width != height:
@@ -83,10 +83,10 @@ def test_every_registered_level_can_be_observed_and_speaks_the_vocabulary():
         ids = vocabulary.encode(mission, vocabulary.LONGEST)
         assert ids.shape == (vocabulary.LONGEST,) and ids.dtype == np.int32
         assert vocabulary.decode(ids) == mission, name
-        spoken |= set(ids.tolist())
+        used |= set(ids.tolist())
     assert len(names) >= 90 and len(oblong) == 18 and oblong["BabyAI-OpenRedDoor-v0"] == (9, 5)
-    # The other way round: nearly every word is one that some level uses.
-    assert len(spoken) > 0.75 * vocabulary.SIZE
+    # Conversely, levels use most words of the vocabulary.
+    assert len(used) > 0.75 * vocabulary.SIZE
 
 
 def test_level_generation_prints_nothing(capsys):
@@ -96,14 +96,14 @@ def test_level_generation_prints_nothing(capsys):
         with levels.silenced() as output:
             env.reset(seed=seed)
         noisy += [seed] if output.getvalue() else []
-    assert noisy  # else there is nothing to silence
+    assert noisy  # without `silenced`, some levels print
     adapter = BabyAIAdapter(level)
     for seed in noisy:
         adapter.reset(seed)
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_seed_is_a_level():
+def test_a_seed_determines_a_level():
     first, second = (BabyAIAdapter(levels.find_level("GoToObjMazeS4")) for _ in range(2))
     grids = set()
     for seed in range(5):
@@ -115,10 +115,8 @@ def test_a_seed_is_a_level():
 
 
 @given(sentences, st.integers(1, 5))
-def test_encoding_is_one_id_per_word_then_padding_and_a_mirror_exchanges_left_and_right(
-    sentence, room
-):
-    ids = vocabulary.encode(" ".join(sentence), len(sentence) + room)
+def test_instructions_are_padded_and_mirroring_swaps_left_and_right(sentence, padding):
+    ids = vocabulary.encode(" ".join(sentence), len(sentence) + padding)
     assert [vocabulary.WORDS[i - 1] for i in ids[: len(sentence)]] == sentence
     assert (ids[: len(sentence)] != vocabulary.PAD).all()
     assert (ids[len(sentence) :] == vocabulary.PAD).all()
@@ -131,7 +129,7 @@ def test_encoding_is_one_id_per_word_then_padding_and_a_mirror_exchanges_left_an
 @pytest.mark.parametrize(
     ("instruction", "unknown"), [("go to the pink ball", "pink"), ("go to the red ball!", "!")]
 )
-def test_an_unknown_word_is_named(instruction, unknown):
+def test_unknown_word_error_names_the_word(instruction, unknown):
     with pytest.raises(UserError, match=f"unknown word '{unknown}'"):
         vocabulary.encode(instruction, 20)
 

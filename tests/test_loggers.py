@@ -1,4 +1,4 @@
-"""Where measurements go, and what is kept of every episode."""
+"""Loggers receive the measurements of a run, and every episode is recorded."""
 
 import csv
 import struct
@@ -18,15 +18,15 @@ TRAINED = [*SMALL, "--demos", "3", "--steps", "4"]
 
 
 def read(folder):
-    """What TensorBoard's files hold: [(name, step, value)], and the steps of their starts."""
+    """Reads TensorBoard's files: [(name, step, value)], and the first step of each session."""
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
     events = []
     for path in sorted(folder.iterdir()):
-        data, place = path.read_bytes(), 0
-        while place < len(data):  # length, its checksum, record, its checksum
-            (length,) = struct.unpack("<Q", data[place : place + 8])
-            events.append(event_pb2.Event.FromString(data[place + 12 : place + 12 + length]))
-            place += length + 16
+        data, offset = path.read_bytes(), 0
+        while offset < len(data):  # length, its checksum, record, its checksum
+            (length,) = struct.unpack("<Q", data[offset : offset + 8])
+            events.append(event_pb2.Event.FromString(data[offset + 12 : offset + 12 + length]))
+            offset += length + 16
     values = [(v.tag, event.step, v.simple_value) for event in events for v in event.summary.value]
     return values, [event.step for event in events if event.HasField("session_log")]
 
@@ -39,34 +39,34 @@ def workplace(tmp_path, monkeypatch, quick_begin):
 
 
 @pytest.fixture
-def sent(monkeypatch):
-    """What Weights & Biases was given, in its place."""
-    heard = SimpleNamespace(begun=[], logged=[], finished=[])
+def wandb(monkeypatch):
+    """Replaces Weights & Biases by a stub; returns the calls that it received."""
+    calls = SimpleNamespace(begun=[], logged=[], finished=[])
 
     def init(**options):
-        heard.begun.append(options)
+        calls.begun.append(options)
         return SimpleNamespace(
-            log=lambda values, step: heard.logged.append((step, values)),
-            finish=lambda: heard.finished.append(True),
+            log=lambda values, step: calls.logged.append((step, values)),
+            finish=lambda: calls.finished.append(True),
         )
 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
-    return heard
+    return calls
 
 
 @only_long
-def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch):
+def test_every_logger_receives_training_and_evaluation(workplace, wandb, monkeypatch):
     monkeypatch.delenv("WANDB_MODE", raising=False)
     arguments = [*TRAINED, "--loggers", "tensorboard", "wandb", "--record"]
     assert running.main(LAKE, arguments) == 0
     (row,) = results.read(workplace / "results" / "lake.jsonl")
     (folder,) = (path for path in (workplace / "runs").iterdir() if path.is_dir())
-    ((_, values), (last, measured)) = sent.logged
+    ((_, values), (last, measured)) = wandb.logged
     assert last == 4 and measured["evaluation/success"] == row["successes"] / row["episodes"]
     (metrics,) = csv.DictReader((folder / "metrics.csv").read_text().splitlines())
     assert values["training/loss"] == pytest.approx(float(metrics["loss"]))
-    (begun,) = sent.begun
-    assert begun["mode"] == "offline" and begun["id"] == row["hash"] and sent.finished == [True]
+    (begun,) = wandb.begun
+    assert begun["mode"] == "offline" and begun["id"] == row["hash"] and wandb.finished == [True]
     assert begun["config"]["training"]["steps"] == 4
     everything = {**values, **measured}
     found, _ = read(folder / "tensorboard")
@@ -78,18 +78,18 @@ def test_training_and_evaluation_go_to_every_logger(workplace, sent, monkeypatch
     assert played["length"].mean() == pytest.approx(row["mean_length"])
 
 
-def test_a_run_that_goes_on_says_where_it_began(tmp_path, sent, monkeypatch):
-    monkeypatch.setenv("WANDB_MODE", "online")  # asked for
+def test_a_resumed_run_tells_loggers_where_it_resumes(tmp_path, wandb, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "online")  # set by the user
     about = loggers.About(tmp_path, "abc", {}, 40)
     with loggers.open_loggers(["wandb", "tensorboard"], lambda: about) as log:
-        assert not sent.begun  # with the first value, and not before
+        assert not wandb.begun  # the first value opens the loggers
         log(60, {"training/loss": 0.5})
-    assert sent.begun[0]["mode"] == "online" and sent.begun[0]["resume"] == "allow"
-    # TensorBoard drops what earlier files have from there on: step 40 was logged, and is not again.
+    assert wandb.begun[0]["mode"] == "online" and wandb.begun[0]["resume"] == "allow"
+    # Step 40 was logged before: TensorBoard drops values of earlier files from step 41 on.
     assert read(tmp_path / "tensorboard") == ([("training/loss", 60, 0.5)], [41])
 
 
-def test_loggers_that_there_are_not_are_one_line(monkeypatch):
+def test_unknown_and_missing_loggers_raise_an_error(monkeypatch):
     with pytest.raises(UserError, match="unknown logger 'csv': expected some of tensorboard"):
         command_line.parse("babyai", ["--loggers", "csv"])
     monkeypatch.setitem(sys.modules, "tensorboardX", None)

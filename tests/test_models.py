@@ -23,7 +23,7 @@ from tests.parameters import scaled_like
 from tests.programs import only_long
 from tests.quick import quick_jit
 
-# Of a smaller grid, pooling and normalisation leave the paper's network next to nothing.
+# In a smaller grid, the pooling and normalisation of the paper's network remove almost all signal.
 SIDE = 7
 EMPTY, WALL, BALL = 1, 2, 6
 ACTIONS, HORIZON, WORDS, MAX_STEPS = NUM_ACTIONS, 3, 4, 20
@@ -36,8 +36,8 @@ class Mixing(ContextTokens):
         return positions + tokens + jnp.tanh(jnp.roll(tokens, 1, axis=0))
 
 
-def make(kind, architecture, past, dtype="float32"):
-    """A tiny model of BabyAI's states; "mixing" is ours with an encoder that mixes actions."""
+def make_module(kind, architecture, past, dtype="float32"):
+    """Makes a tiny BabyAI model; "mixing" is leapjax's with an encoder that mixes actions."""
     mixing = architecture == "mixing"
     architecture = "leapjax" if mixing else architecture
     config = ModelConfig(architecture, 2, 2, width=16, dtype=dtype)
@@ -49,19 +49,19 @@ def make(kind, architecture, past, dtype="float32"):
     return kind(config, Sizes(ACTIONS, past, HORIZON, MAX_STEPS), encoder)
 
 
-def everything(module, context, actions):
-    """What touches every parameter."""
+def use_parameters(module, context, actions):
+    """Uses every parameter."""
     return module.logits(module.encode(context), actions, EVERYWHERE)
 
 
 @functools.cache
-def model(architecture, past):
-    """A tiny model with random parameters: `(params, evaluate)`.
+def make_model(architecture, past):
+    """Makes a tiny model with random parameters: `(params, evaluate)`.
 
     `evaluate(params, context, actions, position)` compiles once and returns the logits at all
     positions and at one alone, the conditional energies at one position, and the total energy.
     """
-    module = make(build_masked_model, architecture, past)
+    module = make_module(build_masked_model, architecture, past)
 
     def encode(params, context):
         return module.apply(params, context, method="encode")
@@ -81,7 +81,7 @@ def model(architecture, past):
             "total": energy.total(params, memory, actions),
         }
 
-    initialise = functools.partial(module.init, method=everything)
+    initialise = functools.partial(module.init, method=use_parameters)
     shapes = jax.eval_shape(initialise, jax.random.key(0), random_context(0, past), EVERYWHERE)
     return scaled_like(shapes), evaluate
 
@@ -115,7 +115,7 @@ def random_context(seed, past, goal=True):
 
 
 def run(architecture, past, context, actions, position=0):
-    params, evaluate = model(architecture, past)
+    params, evaluate = make_model(architecture, past)
     results = evaluate(params, context, np.asarray(actions, np.int32), np.int32(position))
     return {name: np.asarray(value) for name, value in results.items()}
 
@@ -127,13 +127,13 @@ def log_softmax(logits):
 
 
 def largest_change(after, before):
-    """Of the logits or energies that are finite."""
+    """Returns the largest change of the finite logits or energies."""
     finite = np.isfinite(before)
     np.testing.assert_array_equal(np.isfinite(after), finite)
     return np.abs(after[finite] - before[finite]).max()
 
 
-# A program for each pair of architecture and length of the past, which all tests of it share.
+# Each pair of architecture and past length has one program, which all its tests share.
 NETWORKS = [
     *((architecture, 2) for architecture in ARCHITECTURES), ("mixing", 0),
     *(pytest.param(architecture, 0, marks=only_long) for architecture in ARCHITECTURES),
@@ -147,14 +147,14 @@ def test_end_is_forbidden_at_the_first_position_only(architecture, past):
     context = random_context(0, past)
     forbidden = np.arange(HORIZON * ACTIONS).reshape(HORIZON, ACTIONS) == END
     for actions in ([MASK] * 3, [0, 1, 2], [END] * 3):
-        found = run(architecture, past, context, actions)
-        np.testing.assert_array_equal(np.isneginf(found["logits"]), forbidden)
-        assert np.isfinite(found["logits"][~forbidden]).all()
-        assert np.isfinite(found["total"]) == (actions == [0, 1, 2])
+        output = run(architecture, past, context, actions)
+        np.testing.assert_array_equal(np.isneginf(output["logits"]), forbidden)
+        assert np.isfinite(output["logits"][~forbidden]).all()
+        assert np.isfinite(output["total"]) == (actions == [0, 1, 2])
 
 
 @EACH_NETWORK
-def test_total_is_a_loop_over_masked_positions(architecture, past):
+def test_total_equals_a_loop_over_masked_positions(architecture, past):
     context = random_context(2, past)
     for actions in ([0, 1, 2], [3, END, END], [1, 1, 0]):
         expected = 0.0
@@ -168,7 +168,7 @@ def test_total_is_a_loop_over_masked_positions(architecture, past):
 
 
 @EACH_NETWORK
-def test_the_action_before_masking_is_not_seen(architecture, past):
+def test_masked_positions_do_not_see_their_own_action(architecture, past):
     context = random_context(4, past)
     for t in range(HORIZON):
         seen, unseen = [], []
@@ -178,13 +178,13 @@ def test_the_action_before_masking_is_not_seen(architecture, past):
             unseen.append(run(architecture, past, context, actions, t)["conditional"])
             seen.append(run(architecture, past, context, actions, (t + 1) % 3)["conditional"])
         np.testing.assert_array_equal(unseen, np.broadcast_to(unseen[0], (ACTIONS, ACTIONS)))
-        # Every other position does see it.
+        # Every other position sees it.
         for other in seen[1:]:
             assert largest_change(other, seen[0]) > 1e-3
 
 
 @EACH_NETWORK
-def test_one_queried_position_has_the_logits_of_all(architecture, past):
+def test_logits_do_not_depend_on_the_queried_positions(architecture, past):
     context = random_context(6, past)
     for t in range(HORIZON):
         result = run(architecture, past, context, [2, MASK, 0], t)
@@ -192,7 +192,7 @@ def test_one_queried_position_has_the_logits_of_all(architecture, past):
 
 
 @EACH_NETWORK
-def test_what_the_model_must_know_changes_its_logits(architecture, past):
+def test_every_field_of_an_observation_changes_the_logits(architecture, past):
     context = random_context(8, past)
     before = run(architecture, past, context, [0, MASK, 1])["logits"]
     o, other = context.observation, random_observation(np.random.default_rng(80))
@@ -207,8 +207,8 @@ def test_what_the_model_must_know_changes_its_logits(architecture, past):
         assert largest_change(after, before) > 1e-4, name
 
 
-def with_kind(context, kind):
-    """The same, with objects of one kind everywhere but where the agent is."""
+def fill_grid(context, kind):
+    """Fills every cell but the agent's with objects of one kind."""
     observation = context.observation
     grid = observation.grid.copy()
     grid[..., 0] = kind
@@ -216,22 +216,22 @@ def with_kind(context, kind):
     return context._replace(observation=observation._replace(grid=grid))
 
 
-def moved_past(context):
+def move_past(context):
     pose = context.past.pose.copy()
     pose[1, :2] = (pose[1, :2] + 2) % SIDE
     return context._replace(past=context.past._replace(pose=pose))
 
 
 @EACH_ARCHITECTURE
-def test_past_states_are_seen_and_rewards_are_not(architecture):
+def test_past_states_change_the_logits_and_rewards_do_not(architecture):
     """Only the paper's model reads past actions."""
-    context = with_kind(random_context(9, 2), BALL)
+    context = fill_grid(random_context(9, 2), BALL)
     before = run(architecture, 2, context, [0, MASK, 1])["logits"]
     swapped = jax.tree.map(lambda x: x[::-1], context.past)
     acted = (context.actions + 1) % (ACTIONS - 1)
     rewarded = {"rewards": context.rewards + 1, "return_so_far": np.float32(-5)}
     for after, seen in [
-        (moved_past(context), True),
+        (move_past(context), True),
         (context._replace(past=swapped), True),
         (context._replace(actions=acted), architecture == "paper"),
         (context._replace(**rewarded), False),
@@ -241,16 +241,16 @@ def test_past_states_are_seen_and_rewards_are_not(architecture):
 
 
 @pytest.mark.parametrize("kind", [EMPTY, WALL])
-def test_ours_remembers_only_what_has_a_name(kind):
-    context = with_kind(random_context(9, 2), kind)
+def test_leapjax_model_does_not_remember_empty_cells_and_walls(kind):
+    context = fill_grid(random_context(9, 2), kind)
     before = run("leapjax", 2, context, [0, MASK, 1])["logits"]
-    after = run("leapjax", 2, moved_past(context), [0, MASK, 1])["logits"]
+    after = run("leapjax", 2, move_past(context), [0, MASK, 1])["logits"]
     np.testing.assert_array_equal(after, before)
 
 
 @pytest.mark.parametrize("faced_now", [False, True])
-def test_ours_sees_what_the_agent_faces_now_and_forgets_what_was_before_the_start(faced_now):
-    context = with_kind(random_context(9, 2), EMPTY)
+def test_leapjax_model_remembers_faced_objects_of_the_episode_only(faced_now):
+    context = fill_grid(random_context(9, 2), EMPTY)
     x, y, direction = context.observation.pose.tolist()
     assert 0 < x < SIDE - 1 and 0 < y < SIDE - 1
     behind = (direction + 2) % 4
@@ -258,16 +258,16 @@ def test_ours_sees_what_the_agent_faces_now_and_forgets_what_was_before_the_star
     context = context._replace(past=context.past._replace(pose=past))
     dx, dy = symmetries.DIRECTION_VECTORS[direction if faced_now else behind]
     context.observation.grid[x + dx, y + dy] = BALL, 2, 0
-    begun = context._replace(actions=np.full(2, PAD, np.int32))
+    starting = context._replace(actions=np.full(2, PAD, np.int32))
     known = run("leapjax", 2, context, [0, MASK, 1])["logits"]
-    unknown = run("leapjax", 2, begun, [0, MASK, 1])["logits"]
-    if faced_now:  # the past adds nothing to it
+    unknown = run("leapjax", 2, starting, [0, MASK, 1])["logits"]
+    if faced_now:  # the past adds no information
         np.testing.assert_array_equal(known, unknown)
     else:
         assert largest_change(known, unknown) > 1e-4
 
 
-def test_episodes_longer_than_expected_stay_finite():
+def test_logits_stay_finite_after_max_steps():
     context = random_context(10, 2)
     last = run("paper", 2, context._replace(step=np.int32(MAX_STEPS)), [0, 1, 2])["logits"]
     later = run("paper", 2, context._replace(step=np.int32(50 * MAX_STEPS)), [0, 1, 2])["logits"]
@@ -276,14 +276,14 @@ def test_episodes_longer_than_expected_stay_finite():
 
 
 @pytest.mark.parametrize("padded", [1, 2])
-def test_steps_before_the_episode_leak_nothing(padded):
+def test_steps_before_the_episode_do_not_change_the_logits(padded):
     context, other = random_context(11, 2), random_context(12, 2).past
 
     def exchange(mine, others):
         return np.concatenate([others[:padded], mine[padded:]])
 
     exchanged = jax.tree.map(exchange, context.past, other)
-    for past_action in (PAD, 0):  # a step that did happen is seen
+    for past_action in (PAD, 0):  # a step before the episode, and one in it
         actions = exchange(context.actions, np.full(2, past_action, np.int32))
         before = context._replace(actions=actions)
         after = before._replace(past=exchanged)
@@ -293,21 +293,21 @@ def test_steps_before_the_episode_leak_nothing(padded):
 
 
 @quick_jit
-def turn(context, quarters):
-    """Every state of a context, seen after so many quarter turns."""
+def rotate_context(context, quarters):
+    """Rotates every state of a context by quarter turns."""
     past = jax.vmap(symmetries.rotate, (0, None))(context.past, quarters)
     return context._replace(observation=symmetries.rotate(context.observation, quarters), past=past)
 
 
 @pytest.mark.parametrize("goal", [True, False])
-def test_turning_the_whole_world_changes_no_logits(goal):
+def test_rotating_the_whole_world_keeps_the_logits(goal):
     context = random_context(13, 2, goal)
     before = run("leapjax", 2, context, [0, MASK, 1])["logits"]
     for quarters in (1, 2, 3):
-        turned = turn(context, quarters)
+        turned = rotate_context(context, quarters)
         after = run("leapjax", 2, turned, [0, MASK, 1])["logits"]
         assert largest_change(after, before) < 1e-5
-        # Turning the agent alone is another world.
+        # Rotating only the agent changes the logits.
         pose = context.observation.pose - np.array([0, 0, quarters], np.int32)
         pose[2] %= 4
         alone = context._replace(observation=context.observation._replace(pose=pose))
@@ -316,14 +316,14 @@ def test_turning_the_whole_world_changes_no_logits(goal):
 
 
 @EACH_ARCHITECTURE
-def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
-    params, _ = model(architecture, 2)
+def test_bfloat16_logits_are_close_to_float32_with_float32_parameters(architecture):
+    params, _ = make_model(architecture, 2)
     context, actions = random_context(0, 2), np.zeros(HORIZON, np.int32)
-    module = make(build_masked_model, architecture, 2, "bfloat16")
-    init = functools.partial(module.init, method=everything)
+    module = make_module(build_masked_model, architecture, 2, "bfloat16")
+    init = functools.partial(module.init, method=use_parameters)
     shapes = jax.eval_shape(init, jax.random.key(0), context, actions)
     assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype("float32")}
-    scores = quick_jit(functools.partial(module.apply, method=everything))
+    scores = quick_jit(functools.partial(module.apply, method=use_parameters))
     program = scores.lower(params, context, actions)
     assert re.search(r"stablehlo.dot_general.*-> tensor<[^>]*xbf16>", program.as_text())
     low = np.asarray(program.compile()(params, context, actions))[:, :-1]
@@ -333,33 +333,32 @@ def test_bfloat16_is_nearly_float32_with_parameters_in_float32(architecture):
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_with_causal_attention_no_action_sees_a_later_one(architecture):
-    """And with full attention every action sees every other."""
-
-    nothing = np.zeros(HORIZON, np.int32)
+def test_causal_attention_hides_later_actions(architecture):
+    """With full attention, every action sees all others."""
+    zero_actions = np.zeros(HORIZON, np.int32)
     context = jax.tree.map(lambda leaf: np.asarray(leaf)[0], mixed.contexts(1))
     everywhere = np.ones((HORIZON, HORIZON), bool)
-    for attention, sees in {"causal": np.tril(everywhere), "full": everywhere}.items():
+    for attention, visible in {"causal": np.tril(everywhere), "full": everywhere}.items():
         config = ModelConfig(architecture, 2, 2, 16, attention=attention)
         encoder = mixed.DOMAIN.encoders[architecture](config, 1)
         module = build_masked_model(config, Sizes(4, 1, HORIZON, 9), encoder)
-        apply = functools.partial(module.apply, method=everything)
-        init = functools.partial(module.init, method=everything)
-        params = scaled_like(jax.eval_shape(init, jax.random.key(0), context, nothing))
+        apply = functools.partial(module.apply, method=use_parameters)
+        init = functools.partial(module.init, method=use_parameters)
+        params = scaled_like(jax.eval_shape(init, jax.random.key(0), context, zero_actions))
         scores = quick_jit(functools.partial(apply, params))
-        before = scores(context, nothing)
+        before = scores(context, zero_actions)
         for changed in range(HORIZON):
             after = scores(context, (np.arange(HORIZON) == changed).astype(np.int32))
-            seen = sees[:, changed].copy()
-            # Ours is read where the action is (it is masked there), the paper's before it.
+            seen = visible[:, changed].copy()
+            # leapjax reads logits at the (masked) action, the paper's network before it.
             seen[changed] &= architecture == "leapjax" or attention == "full"
             differs = np.abs(after - before)[:, :3].max(axis=1) > 1e-7
             np.testing.assert_array_equal(differs, seen)
 
 
 @pytest.mark.parametrize("past", [0, 2])
-def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
-    """The paper's network, conditioned on returns; with full attention it keeps all tokens."""
+def test_causal_attention_with_a_cached_context_equals_attention_over_all_tokens(past):
+    """The paper's network, conditioned on returns, keeps all tokens under full attention."""
     encoder = mixed.DOMAIN.encoders["paper"](ModelConfig("paper", 2, 2, 16), past)
     configs = [ModelConfig("paper", 2, 2, 16, attention=each) for each in ("causal", "full")]
     module, full = (
@@ -372,35 +371,35 @@ def test_causal_attention_over_a_kept_context_is_that_over_all_tokens(past):
     def scores(module, actions):
         return module.logits(module.encode(context, returns=returns), actions, positions)
 
-    def over_all(module, actions):
+    def score_all_tokens(module, actions):
         prefix, tokens = module.encode(context, returns=returns)
         assert prefix is None and len(tokens) == 3 * (past + HORIZON)
-        asked = 3 * (past + np.arange(HORIZON)) + 1
-        x = tokens.at[asked + 1].add(jnp.tanh(module.action(actions)))
-        return module.head(module.transformer(x, asked[positions], mask=causal_mask(len(x))))
+        queried = 3 * (past + np.arange(HORIZON)) + 1
+        x = tokens.at[queried + 1].add(jnp.tanh(module.action(actions)))
+        return module.head(module.transformer(x, queried[positions], mask=causal_mask(len(x))))
 
     initialise = functools.partial(module.init, method=scores)
     params = scaled_like(jax.eval_shape(initialise, jax.random.key(0), actions))
-    found = quick_jit(functools.partial(module.apply, method=scores))(params, actions)
-    wanted = quick_jit(functools.partial(full.apply, method=over_all))(params, actions)
-    assert np.ptp(wanted[0]) > 1e-4
-    # The end is never first.
-    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(found[1, :-1], wanted[1, :-1], rtol=1e-4, atol=1e-6)
+    output = quick_jit(functools.partial(module.apply, method=scores))(params, actions)
+    reference = quick_jit(functools.partial(full.apply, method=score_all_tokens))(params, actions)
+    assert np.ptp(reference[0]) > 1e-4
+    # The end action is never first.
+    np.testing.assert_allclose(output[0], reference[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(output[1, :-1], reference[1, :-1], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("past", "repeat_state"), [(2, False), (0, True)])
-def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
-    """The current one, as equation 4 has it; or what does not depend on where the agent is."""
+def test_repeat_state_shows_the_current_state_at_later_positions(past, repeat_state):
+    """Later positions show the current state (equation 4), or its part without the pose."""
     encoder = StateTokens(SIDE, 16)
     sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
     module = build_masked_model(
         ModelConfig("paper", 1, 2, 16), sizes, encoder, repeat_state=repeat_state
     )
     here = random_context(0, past)
-    initialise = functools.partial(module.init, method=everything)
+    initialise = functools.partial(module.init, method=use_parameters)
     params = scaled_like(jax.eval_shape(initialise, jax.random.key(0), here, EVERYWHERE))
-    params["params"]["position"]["embedding"][:] = 0  # tokens differ by what they show alone
+    params["params"]["position"]["embedding"][:] = 0  # tokens differ only by content
     encode = quick_jit(functools.partial(module.apply, method="encode"))
 
     def states(context):
@@ -421,28 +420,28 @@ def test_what_a_plan_is_told_of_its_later_states(past, repeat_state):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"dtype": "float16"}, "unknown dtype 'float16': .* float32, bfloat16"),
         ({"architecture": "gpt"}, "unknown architecture 'gpt': .* paper, leapjax"),
         ({"width": 10, "heads": 4}, "width 10 is not a multiple of 4 heads"),
     ],
 )
-def test_networks_that_cannot_be_are_refused(options, says):
-    with pytest.raises(ValueError, match=says):
+def test_invalid_settings_raise_an_error(options, message):
+    with pytest.raises(ValueError, match=message):
         ModelConfig(**options)
 
 
-def judge(module, context, actions):
+def find_degree(module, context, actions):
     return module.degree(module.encode(context), actions)
 
 
 @pytest.mark.parametrize(
-    ("kind", "method"), [(build_masked_model, everything), (SequenceClassifier, judge)]
+    ("kind", "method"), [(build_masked_model, use_parameters), (SequenceClassifier, find_degree)]
 )
 @EACH_ARCHITECTURE
-def test_plans_of_another_length_are_refused(kind, method, architecture):
-    init = functools.partial(make(kind, architecture, 0).init, method=method)
+def test_plans_of_another_length_raise_an_error(kind, method, architecture):
+    init = functools.partial(make_module(kind, architecture, 0).init, method=method)
     context = random_context(0, 0)
     for horizon in (HORIZON - 1, HORIZON + 1):
         with pytest.raises(ValueError, match=rf"shape \({horizon},\): .* was made for \(3,\)"):

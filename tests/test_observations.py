@@ -15,8 +15,8 @@ from tests.oracles import slow_path_lengths
 TURN_LEFT, FORWARD = 0, 2
 
 
-def matching_cells(env) -> list[tuple[int, int]]:
-    """Where the instruction's words apply, from its text alone (single clause)."""
+def find_matches(env) -> list[tuple[int, int]]:
+    """Finds the objects that an instruction of a single clause describes, from its text alone."""
     found = re.fullmatch(
         r"(?:go to|pick up|open) (?:the|a)( \w+)? (key|ball|box|door|object)"
         r"( in front of you| behind you| on your left| on your right)?",
@@ -41,7 +41,7 @@ def matching_cells(env) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("name", ["GoToLocalS8N7", "GoToSeqS5R2", "PickUpLoc"])
-def test_an_observation_is_the_whole_state(name):
+def test_an_observation_holds_the_whole_state(name):
     adapter, rng = BabyAIAdapter(levels.find_level(name)), np.random.default_rng(0)
     picked = 0
     for seed in range(5):
@@ -62,7 +62,7 @@ def test_an_observation_is_the_whole_state(name):
             observation = transition.observation
             if transition.terminated:
                 break
-    assert picked > 10  # the walks did carry things
+    assert picked > 10  # the random walks carried objects
 
 
 @pytest.mark.parametrize(
@@ -74,18 +74,16 @@ def test_the_goal_is_the_nearest_match(name, seeds, least):
     for seed in range(seeds):
         with levels.silenced():
             env.reset(seed=seed)
-        matches = matching_cells(env)
+        matches = find_matches(env)
         lengths = slow_path_lengths(env.grid, tuple(map(int, env.agent_pos)))
         # Ties go to the smaller x, then y; these levels' targets can all be reached.
         assert observations.nearest_goal(env) == min((lengths[c], c) for c in matches)[1], seed
         choices += len(matches) > 1
-    assert choices >= least  # there was something to choose
+    assert choices >= least  # several objects matched
 
 
-def hand_made(drawing: list[str], target: str) -> tuple:
-    """A level drawn by hand: # wall, b red ball, k key, D closed door, L locked door, f floor,
-    @ agent.
-    """
+def draw_level(drawing: list[str], target: str) -> tuple:
+    """Makes a drawn level: # wall, b ball, k key, D door, L locked door, f floor, @ agent."""
     env = levels.make_environment(levels.find_level("GoToLocalS7N5"))
     with levels.silenced():
         env.reset(seed=0)
@@ -112,31 +110,31 @@ def hand_made(drawing: list[str], target: str) -> tuple:
 @pytest.mark.parametrize(
     ("drawing", "expected"),
     [
-        # Not as the crow flies: the upper ball is two cells away and behind a wall.
+        # Paths count, not distances: the upper ball is two cells away, but behind a wall.
         (["#@#b..#", "#.#####", "#.....#", "#....b#", "#.....#"], (5, 4)),
         # Ties: smaller x first, then smaller y.
         (["#..b..#", "#.....#", "#b.@.b#", "#.....#", "#..b..#"], (1, 3)),
-        # A ball walled in by keys counts after one that is far but free...
+        # A free ball, even if far, comes before a ball behind keys.
         (["#@kb..#", "#.kkk.#", "#...k.#", "#.kkk.#", "#....b#"], (5, 5)),
-        # ... and where all are walled in, the nearest through the keys.
+        # If keys block all balls, the path through the keys counts.
         (["#@..kb#", "#...kk#", "#.....#", "#kkk..#", "#bkb..#"], (3, 5)),
-        # Doors are on the way, closed or locked; coloured floors are no obstacle.
+        # Paths lead through doors, closed or locked, and over coloured floors.
         (["#@D.b.#", "#.#####", "#.....#", "#.....#", "#....b#"], (4, 1)),
         (["#@L.b.#", "#.#####", "#.....#", "#.....#", "#....b#"], (4, 1)),
         (["#@f.b.#", "#.#####", "#.....#", "#.....#", "#....b#"], (4, 1)),
-        # Behind walls all around: still an answer, after all others.
+        # A ball enclosed by walls comes last, but can be the goal.
         (["#@#b#.#", "#.###.#", "#.....#", "#.....#", "#....b#"], (5, 5)),
         (["#@#b#.#", "#.###.#", "#.....#", "#.....#", "#.....#"], (3, 1)),
     ],
 )
-def test_the_goal_in_levels_drawn_by_hand(drawing, expected):
-    assert observations.nearest_goal(hand_made(drawing, "red ball")) == expected
-    missing = hand_made(drawing, "yellow box")
+def test_walls_and_objects_block_paths_to_the_goal_but_doors_do_not(drawing, expected):
+    assert observations.nearest_goal(draw_level(drawing, "red ball")) == expected
+    missing = draw_level(drawing, "yellow box")
     assert observations.nearest_goal(missing) == observations.NO_GOAL
 
 
 @pytest.mark.parametrize("name", ["GoToSeqS5R2", "BabyAI-PutNextLocal-v0"])
-def test_several_targets_are_no_goal(name):
+def test_instructions_with_several_targets_have_no_goal(name):
     adapter, several = BabyAIAdapter(levels.find_level(name)), 0
     for seed in range(10):
         goal = tuple(adapter.reset(seed).goal)
@@ -146,9 +144,9 @@ def test_several_targets_are_no_goal(name):
     assert several > 4
 
 
-def test_the_goal_stays_for_the_whole_episode():
+def test_the_goal_stays_fixed_during_an_episode():
     adapter, rng = BabyAIAdapter(levels.find_level("GoToLocalS8N7")), np.random.default_rng(1)
-    moved_on = 0
+    nearer = 0
     for seed in range(60):
         goal = tuple(adapter.reset(seed).goal)
         for action in rng.choice([TURN_LEFT, FORWARD, FORWARD], 25).tolist():
@@ -156,11 +154,11 @@ def test_the_goal_stays_for_the_whole_episode():
             assert tuple(transition.observation.goal) == goal
             if transition.terminated:
                 break
-            moved_on += observations.nearest_goal(adapter.env) != goal
-    assert moved_on > 0  # another match became nearer, and the goal still stayed
+            nearer += observations.nearest_goal(adapter.env) != goal
+    assert nearer > 0  # another match became nearer, and the goal stayed
 
 
-def test_a_level_larger_than_the_grid_is_refused():
+def test_a_level_larger_than_the_grid_raises_an_error():
     env = levels.make_environment(levels.find_level("GoToLocalS8N7"))
     env.reset(seed=0)
     with pytest.raises(UserError, match="8 by 8 cells, larger than the grid of 7"):

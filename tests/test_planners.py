@@ -40,10 +40,10 @@ JOINT = joint_probabilities(TABLE)
 CHAINS = 5000
 assert_equal = np.testing.assert_array_equal
 assert_close = functools.partial(np.testing.assert_allclose, rtol=1e-4)
-REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: a sampler that is wrong, one that may be right
+REJECTED, ACCEPTED = 1e-9, 1e-3  # p-values: maximum of a wrong sampler, minimum of a right sampler
 
 
-def plans_of(energy, config, params=TABLE, context=NO_TILT, chains=CHAINS, seed=0):
+def plan_all(energy, config, params=TABLE, context=NO_TILT, chains=CHAINS, seed=0):
     keys = jax.random.split(jax.random.key(seed), chains)
     return jax.tree.map(np.asarray, many_plans(energy, config)(params, keys, context))
 
@@ -59,11 +59,11 @@ UNIFORM = np.full(len(PLANS), 1 / len(PLANS))
 BLANK = np.full(HORIZON, ACTIONS)
 MARGINALS = [conditional_by_counting(JOINT, BLANK, t) for t in range(HORIZON)]
 INDEPENDENT = np.einsum("a,b,c->abc", *MARGINALS)
-FORBIDDEN, ONLY = NO_TILT.copy(), NO_TILT.copy()  # what no plan can begin with, as the end action
+FORBIDDEN, ONLY = NO_TILT.copy(), NO_TILT.copy()  # first action: not 2 (as the end action); only 0
 FORBIDDEN[0, 2] = ONLY[0, 1:] = -np.inf
 POSSIBLE = (PLANS[:, 0] != 2) / 18
 OTHER_TABLE, WEIGHTS = random_table(1, HORIZON, ACTIONS), (0.7, 1.5)
-STEEP = 6 * TABLE  # the likeliest plan has 0.6, so it matters what was drawn before
+STEEP = 6 * TABLE  # the likeliest plan has probability 0.6, so replacement matters
 
 
 def _guarded_total(params, memory, actions):
@@ -79,8 +79,8 @@ def _least_certain(energies, key):
     return jnp.nanmin(jnp.where(jnp.isinf(energies), jnp.nan, energies), axis=-1)
 
 
-def likelier(pairs, joint=JOINT):
-    """The distribution of the likelier plan of two that are drawn as such a pair `[A^T, A^T]`."""
+def likelier_of_pair(pairs, joint=JOINT):
+    """The distribution of the likelier plan of a pair, for a distribution of pairs `[A^T, A^T]`."""
     p, rows = joint.reshape(-1), np.arange(len(PLANS))
     found = np.where(p[:, None] >= p, rows[:, None], rows)
     return np.bincount(found.reshape(-1), pairs.reshape(-1), len(rows))
@@ -90,26 +90,26 @@ def best_of(probabilities, count):
     """The distribution of the plan of least energy among independent draws."""
     if count == 1:
         return np.ravel(probabilities)
-    return likelier(np.outer(best_of(probabilities, count - 1), probabilities))
+    return likelier_of_pair(np.outer(best_of(probabilities, count - 1), probabilities))
 
 
 def best_child(parents, beginnings):
-    """The better of a plan and its child, which has one other action at a random position.
+    """The distribution of the better of a plan and its child, with a random action changed.
 
     Args:
         parents: `[A^T]` probabilities.
-        beginnings: how many actions a plan can begin with; with one alone, it is kept.
+        beginnings: number of possible first actions; a single one never changes.
     """
     differ, pairs = PLANS[:, None] != PLANS, 0
     for t in range(HORIZON):
         others = differ[..., t] & (differ.sum(-1) == 1) & (PLANS[:, 0] < beginnings)
         others |= ~others.any(1, keepdims=True) & np.eye(len(PLANS), dtype=bool)
         pairs += parents[:, None] * others / others.sum(1, keepdims=True) / HORIZON
-    return likelier(pairs)
+    return likelier_of_pair(pairs)
 
 
 def greedy_once(joint):
-    """The distribution of plans of a joint after one random position took its likeliest action."""
+    """The distribution of plans of a joint after a random position took its likeliest action."""
     exact = np.zeros(len(PLANS))
     for plan in PLANS:
         for t in range(HORIZON):
@@ -119,7 +119,7 @@ def greedy_once(joint):
     return exact
 
 
-def action_by_action(temperature):
+def left_to_right(temperature):
     """The distribution of plans whose actions are drawn from left to right."""
     exact = np.ones(len(PLANS))
     for row, plan in enumerate(PLANS):
@@ -130,15 +130,15 @@ def action_by_action(temperature):
     return exact
 
 
-def two_beams(joint, replaced):
-    """The better of two plans, of which the second may be the first again if it is replaced."""
+def two_beams(joint, replacement):
+    """The distribution of the better of two plans, drawn with or without replacement."""
     p = joint.reshape(-1)
-    pairs = np.outer(p, p) if replaced else np.outer(p / (1 - p), p) * (1 - np.eye(len(p)))
-    return likelier(pairs, joint)
+    pairs = np.outer(p, p) if replacement else np.outer(p / (1 - p), p) * (1 - np.eye(len(p)))
+    return likelier_of_pair(pairs, joint)
 
 
 class Sampler(NamedTuple):
-    """A planner, the exact distribution of its plans, and one that they must not fit."""
+    """A planner, the exact distribution of its plans, and a wrong distribution."""
 
     config: PlannerConfig
     exact: np.ndarray
@@ -156,7 +156,7 @@ GUARDED = from_total(ENUMERABLE.encode, _guarded_total, ACTIONS)
 PRODUCT = WEIGHTS[0] * TABLE.astype(np.float64) + WEIGHTS[1] * OTHER_TABLE
 COLD_JOINT = joint_probabilities(2 * TABLE.astype(np.float64))
 COMPOSED = compose([ENUMERABLE, ENUMERABLE], WEIGHTS)
-STEEP_BEAMS = [two_beams(joint_probabilities(STEEP), replaced) for replaced in (False, True)]
+STEEP_BEAMS = [two_beams(joint_probabilities(STEEP), replacement) for replacement in (False, True)]
 BRED = CrossEntropyConfig(HORIZON, 2, candidates=2, elites=1)
 BEGIN_ALIKE = best_of((PLANS[:, 0] == 0) / 9, 2)
 SAMPLERS = {
@@ -170,7 +170,7 @@ SAMPLERS = {
     "first pass": Sampler(_gibbs(1), INDEPENDENT, JOINT),
     "all positions in each pass": Sampler(_gibbs(3, resampled=HORIZON), INDEPENDENT, JOINT),
     "first plan of totals": Sampler(_gibbs(1), UNIFORM, JOINT, FROM_TOTAL),
-    # With an end action in the first place every plan is as bad, so none would be left.
+    # After a forbidden first action, all later actions would have infinite energy.
     "first plan that is possible": Sampler(_gibbs(1), POSSIBLE, UNIFORM, GUARDED),
     "best restart": Sampler(_gibbs(1, restarts=3), best_of(INDEPENDENT, 3), INDEPENDENT),
     "best filled restart": Sampler(
@@ -189,7 +189,7 @@ SAMPLERS = {
     ),
     "bred with one beginning": Sampler(BRED, best_child(BEGIN_ALIKE, 1), BEGIN_ALIKE, context=ONLY),
     "beam": Sampler(BeamConfig(HORIZON, 1, 1.0), JOINT, INDEPENDENT),
-    "warm beam": Sampler(BeamConfig(HORIZON, 1, 2.0), action_by_action(2.0), JOINT),
+    "warm beam": Sampler(BeamConfig(HORIZON, 1, 2.0), left_to_right(2.0), JOINT),
     "two beams": Sampler(BeamConfig(HORIZON, 2, 1.0), *STEEP_BEAMS, params=STEEP),
     "beam by certainty": Sampler(BeamConfig(HORIZON, 1, 1.0, fill="confident"), JOINT, INDEPENDENT),
     "two beams by certainty": Sampler(
@@ -205,7 +205,7 @@ SAMPLERS = {
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_plans_are_drawn_from_the_exact_distribution(name):
     config, exact, wrong, energy, params, context = SAMPLERS[name]
-    counts = plan_counts(plans_of(energy, config, params, context).actions, ACTIONS)
+    counts = plan_counts(plan_all(energy, config, params, context).actions, ACTIONS)
     assert fit_p_value(counts, exact) > ACCEPTED
     assert fit_p_value(counts, wrong) < REJECTED
 
@@ -219,13 +219,13 @@ def test_plans_are_drawn_from_the_exact_distribution(name):
     ],
     ids=["warm", "blind", "two at once"],
 )
-def test_a_broken_sampler_does_not_pass_for_the_joint(energy, config):
-    counts = plan_counts(plans_of(energy, config).actions, ACTIONS)
+def test_broken_samplers_do_not_fit_the_joint(energy, config):
+    counts = plan_counts(plan_all(energy, config).actions, ACTIONS)
     assert fit_p_value(counts, JOINT) < REJECTED
 
 
 def greedy_traces(config):
-    """Traces `[100, N, T]` at temperature 0, each on a joint of its own, and the joints."""
+    """Returns traces `[100, N, T]` at temperature 0 on 100 joints, and the joints."""
     tables = np.stack([random_table(seed, HORIZON, ACTIONS) for seed in range(100)])
     plan = quick_jit(jax.vmap(bind(ENUMERABLE, config), (0, None, None)))
     trace = plan(tables, jax.random.key(1), NO_TILT).trace
@@ -241,7 +241,7 @@ def test_greedy_gibbs_never_raises_the_joint_energy(order, fill):
         traces = traces[:, HORIZON - 1 :]
     changes = np.array([np.diff(joint_energies(t, j)) for t, j in zip(traces, joints, strict=True)])
     assert (changes <= 1e-5).all() and (changes < -0.1).any()
-    for trace, joint in zip(traces, joints, strict=True):  # no single change would help
+    for trace, joint in zip(traces, joints, strict=True):  # no single change lowers the energy
         for t in range(HORIZON):
             conditional = conditional_by_counting(joint, trace[-1], t)
             assert conditional[trace[-1, t]] == pytest.approx(conditional.max(), rel=1e-5)
@@ -251,8 +251,8 @@ def test_greedy_gibbs_never_raises_the_joint_energy(order, fill):
 
 
 @pytest.mark.parametrize("fill", [fill for fill in FILLS if fill != "together"])
-def test_each_pass_fills_so_many_and_keeps_them(fill):
-    trace = plans_of(ENUMERABLE, _gibbs(2, fill=fill, resampled=2), chains=200).trace
+def test_each_pass_fills_p_positions_and_keeps_earlier_ones(fill):
+    trace = plan_all(ENUMERABLE, _gibbs(2, fill=fill, resampled=2), chains=200).trace
     known = trace < ACTIONS  # [chains, N, T]
     assert (known.sum(-1) == [2, 3]).all()
     assert ((trace[:, 0] == trace[:, 1]) | ~known[:, 0]).all()
@@ -285,18 +285,18 @@ CERTAINTY = np.array([2.0, 0.5, 3.0, 1.0], np.float32)  # of the four positions
 
 
 def _next_action(params, memory, actions, positions):
-    wanted = (actions[positions] + 1) % 5
-    energies = jnp.where(jnp.arange(5) == wanted[:, None], 0.0, 1.0)
+    successors = (actions[positions] + 1) % 5
+    energies = jnp.where(jnp.arange(5) == successors[:, None], 0.0, 1.0)
     return energies * jnp.array(CERTAINTY)[positions][:, None]
 
 
-# Every resampled action goes up by one, so the trace tells which positions were resampled.
+# Resampling increments an action, so the trace shows which positions were resampled.
 COUNTER = Energy(lambda params, context: None, _next_action, lambda *_: jnp.zeros(()), 5)
 
 
 def resampled_positions(config, chains):
-    """Which positions each iteration after the first changed: `[chains, N - 1, T]`."""
-    steps = np.diff(plans_of(COUNTER, config, None, None, chains).trace, axis=1) % 5
+    """Whether each iteration after the first resampled each position: `[chains, N - 1, T]`."""
+    steps = np.diff(plan_all(COUNTER, config, None, None, chains).trace, axis=1) % 5
     assert np.isin(steps, (0, 1)).all()
     return steps.astype(bool)
 
@@ -321,14 +321,14 @@ def test_random_order_is_uniform_over_sets_of_distinct_positions(resampled):
         ("uncertain", 2, [{1, 3}, {0, 2}, {1, 3}]),
     ],
 )
-def test_every_position_is_resampled_before_any_is_again(order, resampled, expected):
-    """From left to right and around, or those that are least certain first."""
+def test_all_positions_are_resampled_before_any_repeats(order, resampled, expected):
+    """Sequential order is cyclic; "uncertain" takes the least certain positions first."""
     config = GibbsConfig(4, 1 + len(expected), resampled, order=order)
     (row,) = resampled_positions(config, chains=1)
     assert [set(np.flatnonzero(step)) for step in row] == expected
 
 
-# What a plan holds.
+# The fields of a plan.
 
 CONFIGS = {
     "gibbs": GibbsConfig(HORIZON, iterations=5, temperature=0.7, score=True),
@@ -341,8 +341,8 @@ SCORED = _gibbs(HORIZON, fill="confident", score=True, score_trace=True)
 
 
 @pytest.mark.parametrize("config", [*CONFIGS.values(), SCORED], ids=[*CONFIGS, "scored trace"])
-def test_a_plan_is_the_end_of_its_trace_with_its_exact_energy_and_a_function_of_its_key(config):
-    plan = plans_of(ENUMERABLE, config, chains=50)
+def test_plan_fields_agree_and_depend_only_on_the_key(config):
+    plan = plan_all(ENUMERABLE, config, chains=50)
     assert plan.trace.shape == (50, getattr(config, "iterations", 1), HORIZON)
     assert plan.actions.dtype == plan.trace.dtype == np.int32
     assert_equal(plan.trace[:, -1], plan.actions)
@@ -351,9 +351,9 @@ def test_a_plan_is_the_end_of_its_trace_with_its_exact_energy_and_a_function_of_
     assert (plan.trace_energies is None) == (config is not SCORED)
     if config is SCORED:
         assert_equal(plan.trace_energies[:, -1], plan.energy)
-        assert np.isposinf(plan.trace_energies[:, :-1]).all()  # what is not complete has none yet
-    jax.tree.map(assert_equal, plan, plans_of(ENUMERABLE, config, chains=50))
-    other = plans_of(ENUMERABLE, config, chains=50, seed=1)
+        assert np.isposinf(plan.trace_energies[:, :-1]).all()  # incomplete plans
+    jax.tree.map(assert_equal, plan, plan_all(ENUMERABLE, config, chains=50))
+    other = plan_all(ENUMERABLE, config, chains=50, seed=1)
     assert (plan.actions != other.actions).any(-1).mean() > 0.2
     unscored = jax.eval_shape(
         bind(ENUMERABLE, type(config)(HORIZON)), TABLE, jax.random.key(0), NO_TILT
@@ -364,10 +364,10 @@ def test_a_plan_is_the_end_of_its_trace_with_its_exact_energy_and_a_function_of_
 # The cross-entropy method.
 
 
-def test_cross_entropy_keeps_the_elites_and_breeds_from_each():
+def test_cross_entropy_keeps_elites_and_mutates_each():
     scored = []
 
-    def total(params, memory, actions):  # plans are far apart: it is clear which child is whose
+    def total(params, memory, actions):  # plans are far apart, so a child shows its parent
         jax.debug.callback(lambda a: scored.append(a.copy()), actions)
         return jnp.sum(actions * 2.5 ** jnp.arange(12))
 
@@ -392,45 +392,45 @@ def test_cross_entropy_keeps_the_elites_and_breeds_from_each():
 
 
 def slow_beam_search(joint, width):
-    """The best beam after every position, with conditionals by counting."""
+    """Returns the best beam after every position; counts plans to find conditionals."""
     beams, trace = [(0.0, ())], []
     for t in range(HORIZON):
-        longer = []
+        extended = []
         for energy, plan in beams:
             tokens = np.array([*plan, *[ACTIONS] * (HORIZON - t)])
             for action, p in enumerate(conditional_by_counting(joint, tokens, t)):
-                longer.append((energy - np.log(p), (*plan, action)))
-        beams = sorted(longer)[:width]
+                extended.append((energy - np.log(p), (*plan, action)))
+        beams = sorted(extended)[:width]
         trace.append([*beams[0][1], *[ACTIONS] * (HORIZON - 1 - t)])
     return np.array(trace)
 
 
 @pytest.mark.parametrize(("width", "temperature"), [(1, 0), (1, 1e-30), (2, 0), (40, 0)])
-def test_beam_search_against_a_slow_one(width, temperature):
-    """As wide as there are ways to begin, it finds the likeliest plan; narrower, it may not."""
+def test_beam_search_equals_a_slow_implementation(width, temperature):
+    """From 2 beams on it finds the likeliest plan of all six joints; with 1 it does not."""
     found = []
     for seed in range(6):
         table = random_table(seed, HORIZON, ACTIONS)
         joint = joint_probabilities(table)
         config = BeamConfig(HORIZON, width, temperature)
-        [trace] = plans_of(ENUMERABLE, config, table, chains=1).trace
+        [trace] = plan_all(ENUMERABLE, config, table, chains=1).trace
         assert_equal(trace, slow_beam_search(joint, width))
         found.append((trace[-1] == PLANS[joint.argmax()]).all())
     assert all(found) == (width > 1)
 
 
 @pytest.mark.parametrize(("partial", "temperature"), [(False, 0.0), (True, 1.0)])
-def test_beam_search_keeps_no_plan_that_is_forbidden_while_another_is_allowed(partial, temperature):
-    """A beam that leads into a dead end pays nothing there, and is the best by its sum."""
+def test_beam_search_returns_an_allowed_plan_if_one_exists(partial, temperature):
+    """A beam in a dead end pays no energy there, so its sum is the least."""
 
-    def forbids_first(context, actions):  # known only once there is a second action
+    def forbids_first(context, actions):  # applies once a second action is chosen
         return jnp.where((actions[0] != 2) & (actions[1] < ACTIONS), jnp.inf, 0.0)
 
     tilt = NO_TILT.copy()
-    tilt[0, 2] = -5.0  # the only allowed beginning is the unlikeliest
+    tilt[0, 2] = -5.0  # the only allowed first action is the least likely
     safe = constrain(ENUMERABLE, forbids_first, partial=partial)
     config = BeamConfig(HORIZON, 40, temperature, score=True)
-    plan = plans_of(safe, config, np.zeros_like(TABLE), tilt, chains=100)
+    plan = plan_all(safe, config, np.zeros_like(TABLE), tilt, chains=100)
     assert (plan.actions[:, 0] == 2).all() and plan.satisfied.all() and plan.valid.all()
     assert_equal(plan.actions, plan.trace[:, -1])
     assert np.isfinite(plan.energy).all()
@@ -439,11 +439,11 @@ def test_beam_search_keeps_no_plan_that_is_forbidden_while_another_is_allowed(pa
 # Planning under constraints. Context: a tilt and a price for each action at each position.
 
 
-def priced(context, actions):
+def compute_price(context, actions):
     return context["price"][jnp.arange(HORIZON), actions].sum()
 
 
-CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), priced)
+CONSTRAINED = constrain(view(ENUMERABLE, lambda context: context["tilt"]), compute_price)
 
 
 def prices(*forbidden, price=np.inf):
@@ -452,7 +452,7 @@ def prices(*forbidden, price=np.inf):
     return result
 
 
-def price_of(plans, price):
+def price_plans(plans, price):
     return price[np.arange(HORIZON), plans].sum(-1)
 
 
@@ -465,24 +465,24 @@ def price_of(plans, price):
         CrossEntropyConfig(HORIZON, 2, candidates=3, elites=1, score=True),
     ],
 )
-def test_a_plan_that_breaks_a_constraint_is_never_called_satisfied(config):
-    some = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 0), (2, 2)]
-    for price in (prices(*some, price=0.5), prices(*some), np.full_like(NO_TILT, np.inf)):
-        plan = plans_of(CONSTRAINED, config, context={"tilt": NO_TILT, "price": price}, chains=300)
-        penalties = price_of(plan.actions, price)
+def test_satisfied_marks_exactly_the_plans_without_penalty(config):
+    cells = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 0), (2, 2)]
+    for price in (prices(*cells, price=0.5), prices(*cells), np.full_like(NO_TILT, np.inf)):
+        plan = plan_all(CONSTRAINED, config, context={"tilt": NO_TILT, "price": price}, chains=300)
+        penalties = price_plans(plan.actions, price)
         assert_equal(plan.satisfied, penalties == 0)
         assert penalties.any() and (penalties > 0).all() == (price > 0).all()
-        # No NaN either, and an infinite price makes an infinite energy.
+        # Energies are never NaN, and an infinite price makes them infinite.
         assert_close(plan.energy, joint_energies(plan.actions) + penalties)
         if plan.trace_energies is not None:
-            expected = joint_energies(plan.trace) + price_of(plan.trace, price)
+            expected = joint_energies(plan.trace) + price_plans(plan.trace, price)
             assert_close(plan.trace_energies, expected)
 
 
 def test_constrained_gibbs_samples_the_joint_given_the_constraint():
     price = prices((0, 0), (2, 1))
-    plan = plans_of(CONSTRAINED, _gibbs(), context={"tilt": NO_TILT, "price": price})
-    # Two violations at once cannot be left by single steps: those chains found nothing.
+    plan = plan_all(CONSTRAINED, _gibbs(), context={"tilt": NO_TILT, "price": price})
+    # Single steps cannot remove two violations at once: chains stay in such plans.
     found = plan.actions[plan.satisfied]
     assert len(found) > CHAINS / 2
     allowed = JOINT.copy()
@@ -490,15 +490,15 @@ def test_constrained_gibbs_samples_the_joint_given_the_constraint():
     assert fit_p_value(plan_counts(found, ACTIONS), allowed / allowed.sum()) > ACCEPTED
 
 
-def test_infinite_totals_do_not_overwrite_actions_that_cannot_help():
-    """Position 1 has to change; resampling position 0 first must not lose its action."""
+def test_gibbs_keeps_actions_while_all_totals_are_infinite():
+    """If only position 1 must change, resampling position 0 first keeps its action."""
 
     def total(params, memory, actions):
         return jnp.where(jnp.any(actions == 0), jnp.inf, 0.0)
 
     energy = from_total(lambda params, context: None, total, ACTIONS)
     config = GibbsConfig(2, iterations=9, order="sequential")
-    plan = plans_of(energy, config, None, None, chains=100)
+    plan = plan_all(energy, config, None, None, chains=100)
     reachable = (plan.trace[:, 0] == 0).sum(-1) <= 1
     assert reachable.any() and not (plan.actions[reachable] == 0).any()
 
@@ -506,8 +506,8 @@ def test_infinite_totals_do_not_overwrite_actions_that_cannot_help():
 # Batches.
 
 
-def batch_of(batch, seed=0):
-    """Keys and contexts, all different, as NumPy arrays."""
+def make_batch(batch, seed=0):
+    """Makes distinct keys and contexts, as NumPy arrays."""
     tilts = np.random.default_rng(seed).normal(size=(batch, HORIZON, ACTIONS)).astype(np.float32)
     return plan_keys(seed, np.arange(batch), np.zeros(batch, int)), {"tilt": tilts}
 
@@ -517,27 +517,27 @@ GIBBS = CONFIGS["gibbs"]
 
 
 @functools.cache
-def batched(config, devices=None):
+def compile_batched(config, devices=None):
     sizes = (8, 2) if isinstance(config, GibbsConfig) else (7,)
     return compile_planner(TILTED, config, sizes, jax.devices()[:devices])
 
 
 @functools.cache
-def one_by_one(config):
-    """The plans of 20 contexts, each from its own unbatched call."""
-    keys, contexts = batch_of(20)
+def plan_singly(config):
+    """Plans for 20 contexts, each in its own unbatched call."""
+    keys, contexts = make_batch(20)
     single = quick_jit(bind(TILTED, config))
     plans = [single(TABLE, keys[i], {"tilt": contexts["tilt"][i]}) for i in range(20)]
     return jax.tree.map(lambda *rows: np.stack(rows), *plans)
 
 
 @EACH_PLANNER
-def test_a_batch_is_a_loop_over_its_contexts_on_any_number_of_devices(config):
-    keys, contexts = batch_of(20)
+def test_batched_plans_equal_single_plans_on_any_devices(config):
+    keys, contexts = make_batch(20)
     for batch, devices in [(1, None), (2, None), (7, None), (9, None), (20, 2)]:
-        planner = batched(config, devices if config is GIBBS else None)
+        planner = compile_batched(config, devices if config is GIBBS else None)
         plan = planner(TABLE, keys[:batch], {"tilt": contexts["tilt"][:batch]})
-        expected = jax.tree.map(lambda x, n=batch: x[:n], one_by_one(config))
+        expected = jax.tree.map(lambda x, n=batch: x[:n], plan_singly(config))
         for name in ("actions", "trace", "satisfied"):
             assert_equal(getattr(plan, name), getattr(expected, name))
         assert_close(plan.energy, expected.energy)
@@ -553,7 +553,7 @@ def test_a_batch_is_a_loop_over_its_contexts_on_any_number_of_devices(config):
         (110, [32, 128], [128]),
     ],
 )
-def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunks):
+def test_chunks_have_little_padding(batch, sizes, chunks):
     found = split_batch(batch, sizes)
     assert [size for _, size, _ in found] == chunks
     rows = [row for start, _, used in found for row in range(start, start + used)]
@@ -570,11 +570,11 @@ def test_a_chunk_is_not_padded_to_several_times_what_is_left(batch, sizes, chunk
         (ShootingConfig(2), (1, 16, 128)),
     ],
 )
-def test_chunks_are_small_where_some_plans_take_fewer_passes(config, sizes):
+def test_default_chunks_are_small_if_passes_vary(config, sizes):
     assert compile_planner(TILTED, config).chunk_sizes == sizes
 
 
-def test_after_compiling_ahead_nothing_is_traced_or_compiled(caplog):
+def test_compiling_ahead_prevents_later_tracing_and_compilation(caplog):
     traced = []
 
     def encode(params, context):
@@ -598,7 +598,7 @@ def test_after_compiling_ahead_nothing_is_traced_or_compiled(caplog):
     assert len(traced) > before and "program" in caplog.text
 
 
-def test_plans_with_a_cache_are_compiled_ahead_too(caplog):
+def test_planning_with_a_cache_is_compiled_ahead(caplog):
     def encode_next(params, context, cache):
         seen = jnp.zeros((), int) if cache is None else cache
         return ENUMERABLE.encode(params, context), seen + 1
@@ -614,7 +614,7 @@ def test_plans_with_a_cache_are_compiled_ahead_too(caplog):
     assert "program" not in caplog.text
 
 
-def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
+def test_keys_depend_only_on_seed_episode_and_replan():
     episodes, replans = np.array([3, 0, 3, 1]), np.array([0, 2, 1, 2])
     data = np.asarray(jax.random.key_data(plan_keys(7, episodes, replans)))
     shuffled = jax.random.key_data(plan_keys(7, episodes[::-1], replans[::-1]))
@@ -627,8 +627,8 @@ def test_keys_depend_on_seed_episode_and_replan_and_not_on_the_row():
         assert_equal(plan_keys(7, episodes, replans), data)
 
 
-def test_parameters_are_placed_again_where_they_or_their_place_in_the_tree_change():
-    keys, contexts = batch_of(8)
+def test_changed_parameters_or_trees_are_placed_again():
+    keys, contexts = make_batch(8)
     first, second = jnp.asarray(TABLE), jnp.asarray(OTHER_TABLE)
     planner = compile_planner(
         TILTED._replace(encode=lambda p, c: TILTED.encode(p[0] if p[1] is None else -p[1], c)),
@@ -637,20 +637,20 @@ def test_parameters_are_placed_again_where_they_or_their_place_in_the_tree_chang
     )
 
     def check(params, table):
-        expected = batched(GIBBS)(table, keys, contexts)
+        expected = compile_batched(GIBBS)(table, keys, contexts)
         assert_equal(planner(params, keys, contexts).actions, expected.actions)
 
     for table in (first, first, second, first):
         check((table, None), table)
     check((None, first), -first)
-    # An array of NumPy that its owner writes to is not remembered.
+    # A NumPy array is placed in every call, because its owner may write to it.
     written = np.array(first)
     check((written, None), first)
     written[...] = second
     check((written, None), second)
 
 
-# Energies that are no numbers. Parameters: a table, and what stands where an energy should be.
+# Energies that are NaN or -inf. Parameters: a table, and the value of undefined energies.
 
 UNDEFINED = ENUMERABLE._replace(
     encode=lambda params, context: (ENUMERABLE.encode(params[0], context), params[1]),
@@ -676,36 +676,36 @@ def _undefined_at_first(params, memory, actions, positions):
         BeamConfig(HORIZON, score=True),
     ],
 )
-def test_a_plan_whose_energy_is_no_number_is_not_valid(config):
+def test_plans_with_undefined_energies_are_invalid(config):
     energy = UNDEFINED
-    if config == GibbsConfig(HORIZON, 3):  # which asks for no total
+    if config == GibbsConfig(HORIZON, 3):  # which computes no total
         energy = UNDEFINED._replace(conditional=_undefined_at_first)
     for value, valid in ((np.nan, False), (-np.inf, False), (1.0, True)):
-        plan = plans_of(energy, config, (TABLE, np.float32(value)), chains=2)
+        plan = plan_all(energy, config, (TABLE, np.float32(value)), chains=2)
         assert (plan.valid == valid).all()
 
 
-def test_an_energy_that_is_nan_is_an_error_and_not_a_plan():
-    keys, contexts = batch_of(20)
+def test_nan_energies_raise_an_error_that_holds_the_plans():
+    keys, contexts = make_batch(20)
     contexts["tilt"][3, 1] = np.nan
     with pytest.raises(NotANumber, match=r"1 of 20 contexts \(the first is context 3\)") as error:
-        batched(GIBBS)(TABLE, keys, contexts)
+        compile_batched(GIBBS)(TABLE, keys, contexts)
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
     plan = error.value.plan
     assert plan.valid.sum() == 19
-    assert_equal(plan.actions[4:], one_by_one(GIBBS).actions[4:])
+    assert_equal(plan.actions[4:], plan_singly(GIBBS).actions[4:])
 
 
-# What a planner takes, and mistakes.
+# Valid and invalid arguments.
 
-KEYS, CONTEXTS = batch_of(2)
+KEYS, CONTEXTS = make_batch(2)
 
 
-def test_keys_and_contexts_of_every_type_are_taken():
-    expected = batched(GIBBS)(TABLE, KEYS, CONTEXTS)
+def test_keys_and_contexts_of_many_types_are_accepted():
+    expected = compile_batched(GIBBS)(TABLE, KEYS, CONTEXTS)
     types = {str(kind): np.zeros(2, kind) for kind in (jnp.bfloat16, np.uint64, bool)}
     for keys in (jax.random.wrap_key_data(KEYS), [*KEYS], KEYS):
-        plan = batched(GIBBS)(TABLE, keys, CONTEXTS | (types if keys is KEYS else {}))
+        plan = compile_batched(GIBBS)(TABLE, keys, CONTEXTS | (types if keys is KEYS else {}))
         jax.tree.map(assert_equal, plan, expected)
     for fits in ([2**31 - 1, -(2**31)], [np.nan, -np.inf, 3e38, 1 / 3], [], ["words"]):
         check_fit("context", {"x": np.array(fits)})
@@ -713,11 +713,11 @@ def test_keys_and_contexts_of_every_type_are_taken():
 
 
 def _plan(keys=KEYS, params=TABLE, **context):
-    return batched(GIBBS)(params, keys, CONTEXTS | context)
+    return compile_batched(GIBBS)(params, keys, CONTEXTS | context)
 
 
-def _of_another_shape(name, config):
-    wrong = ENUMERABLE._replace(**{name: lambda *given: jnp.zeros((2, 7))})
+def _plan_in_wrong_shape(name, config):
+    wrong = ENUMERABLE._replace(**{name: lambda *arguments: jnp.zeros((2, 7))})
     jax.eval_shape(bind(wrong, config), TABLE, jax.random.key(0), NO_TILT)
 
 
@@ -736,7 +736,7 @@ WRONG = [
     (lambda: _plan(params={"more": WIDE[0]}), r"params\['more'\] holds .*does not fit"),
     (lambda: jax.jit(_plan)(KEYS), r"inside of jit, vmap or grad.* use leap.gibbs"),
     *(
-        (lambda n=name, c=config: _of_another_shape(n, c), rf"^{name} of .*, got shape \(2, 7\)")
+        (lambda n=name, c=config: _plan_in_wrong_shape(n, c), rf"^{name} of .*, got shape \(2, 7\)")
         for config in CONFIGS.values()
         for name in ("conditional", "total", "violation")
     ),
@@ -746,9 +746,9 @@ WRONG = [
     (lambda: plan_keys(0, np.arange(2), np.arange(1)), "2 episodes, but 1 replans"),
     (lambda: compile_planner(TILTED, GIBBS, (8, -1)), "chunk sizes"),
     (lambda: compile_planner(TILTED, GIBBS, (1,), ["cpu"]), "devices must be a sequence"),
-    (lambda: batched(GIBBS).compile(TABLE, CONTEXTS, 0), "batch must be at least 1"),
-    (lambda: plans_of(FROM_TOTAL, _gibbs(fill="margin")), "fill 'margin' .* use fill 'together'"),
-    (lambda: plans_of(FROM_TOTAL, BeamConfig(HORIZON)), "accepts_mask is False"),
+    (lambda: compile_batched(GIBBS).compile(TABLE, CONTEXTS, 0), "batch must be at least 1"),
+    (lambda: plan_all(FROM_TOTAL, _gibbs(fill="margin")), "fill 'margin' .* use fill 'together'"),
+    (lambda: plan_all(FROM_TOTAL, BeamConfig(HORIZON)), "accepts_mask is False"),
     (lambda: bind(ENUMERABLE, {"horizon": 3}), "no planner takes a dict"),
     (lambda: GibbsConfig(0), "horizon must be at least 1, got 0"),
     (lambda: GibbsConfig(3, resampled=4), "resampled is 4, .* the horizon 3"),
@@ -761,6 +761,6 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("call", "message"), WRONG)
-def test_mistakes_are_refused(call, message):
+def test_invalid_arguments_raise_an_error(call, message):
     with pytest.raises((ValueError, TypeError), match=message):
         call()

@@ -19,13 +19,13 @@ from tests.programs import only_long
 from tests.quick import quick_jit
 
 HORIZON = 4
-EVERYWHERE = np.arange(HORIZON)
+POSITIONS = np.arange(HORIZON)
 EACH_ARCHITECTURE = pytest.mark.parametrize(
     ("architecture", "past"), [("leapjax", 0), ("leapjax", 1), ("paper", 2)]
 )
 
 
-def setup_of(architecture, past, steps=1, **options):
+def make_setup(architecture, past, steps=1, **options):
     model = ModelConfig(architecture, layers=1, heads=2, width=32, dropout=0.0, **options)
     learn = TrainingConfig(
         steps, batch=64, warmup=20, learning_rate=3e-3, weight_decay=0.0, windows="step"
@@ -33,18 +33,18 @@ def setup_of(architecture, past, steps=1, **options):
     return Setup(mixed.DOMAIN, past, HORIZON, model, learn, plate.Settings())
 
 
-def data():
+def make_data():
     return jax.tree.map(jnp.asarray, windows.concatenate(toy.demonstrations()))
 
 
 class Untrained:
-    """A network whose parameters are all random, windows, and the energies of plans."""
+    """A network with random parameters, some contexts, and the energies of plans."""
 
     def __init__(self, architecture, past):
-        setup = setup_of(architecture, past)
+        setup = make_setup(architecture, past)
         self.agent = plate.make_agent(setup)
         self.params = random_parameters(self.agent)
-        self.contexts = quick_jit(self.agent.batch)(jax.random.key(2), data()).context
+        self.contexts = quick_jit(self.agent.batch)(jax.random.key(2), make_data()).context
         first = jax.tree.map(lambda x: x[0], self.contexts)
         self.context = windows.context_at(first, 0, past)
         module = plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
@@ -58,8 +58,8 @@ untrained = functools.cache(Untrained)
 
 
 @EACH_ARCHITECTURE
-def test_the_future_is_encoded_as_the_present_is(architecture, past):
-    """State by state: what is predicted is what would be seen."""
+def test_later_states_of_a_window_are_encoded_like_current_states(architecture, past):
+    """The targets of predicted states equal the encodings of those states as observed."""
     network = untrained(architecture, past)
     unrolled = jax.tree.map(lambda x: x[1], network.contexts)
     second = jax.tree.map(lambda x: x[1:2], network.contexts)
@@ -75,30 +75,30 @@ def test_the_future_is_encoded_as_the_present_is(architecture, past):
 
 
 @EACH_ARCHITECTURE
-def test_one_token_at_a_time_says_what_all_together_say(architecture, past):
-    """Plans with predicted states, against passes over all tokens with those states."""
+def test_incremental_decoding_equals_passes_over_all_tokens(architecture, past):
+    """Compares cached energies with passes over all tokens, predicted states included."""
     network, plan = untrained(architecture, past), jnp.array([0, 1, 2, 0])
     states, before = network.apply(network.context, method="encode")
     between = jnp.concatenate([before, plan[:-1]])
     read = quick_jit(functools.partial(network.apply, method="read"))
     states = jnp.concatenate([states, jnp.zeros((HORIZON - 1, states.shape[1]))])
     for place in range(HORIZON - 1):
-        _, led = read(states, between)
-        states = states.at[place - HORIZON + 1].set(led[place])
+        _, predicted = read(states, between)
+        states = states.at[place - HORIZON + 1].set(predicted[place])
     expected = -jax.nn.log_softmax(read(states, between)[0])
-    found = network.energies(plan, EVERYWHERE)
+    found = network.energies(plan, POSITIONS)
     np.testing.assert_allclose(found[1:], expected[1:], rtol=1e-3, atol=1e-3)
     assert np.isposinf(found[0, toy.END])
-    # No action depends on later ones, nor on what else is asked for.
+    # No energy depends on later actions, nor on the other positions to score.
     for place in range(HORIZON):
-        (alone,) = network.energies(np.where(place < EVERYWHERE, 1, plan), np.array([place]))
+        (alone,) = network.energies(np.where(place < POSITIONS, 1, plan), np.array([place]))
         np.testing.assert_allclose(alone, found[place], rtol=1e-4, atol=1e-4)
 
 
-def test_nothing_follows_an_end():
-    """Past it nothing is learned, so nothing is asked: a plan that ended costs no more."""
+def test_only_the_end_follows_an_end():
+    """Training skips positions after an end, so the rest of an ended plan costs 0."""
     network = untrained("leapjax", 0)
-    found = np.asarray(network.energies(np.array([0, toy.END, 1, toy.END]), EVERYWHERE))
+    found = np.asarray(network.energies(np.array([0, toy.END, 1, toy.END]), POSITIONS))
     assert np.isfinite(found[0, : toy.END]).all() and np.isfinite(found[1]).all()
     expected = np.where(np.arange(toy.END + 1) == toy.END, 0.0, np.inf)
     np.testing.assert_array_equal(found[2:], np.stack([expected, expected]))
@@ -107,21 +107,21 @@ def test_nothing_follows_an_end():
     assert total == pytest.approx(found[0, 0] + found[1, toy.END], rel=1e-5)
 
 
-def test_it_plans_in_bfloat16():
-    """What is kept of earlier tokens has the precision of the tokens."""
+def test_energies_in_bfloat16_are_close_to_float32():
+    """The cache of earlier tokens has the precision of the tokens."""
     network, plan = untrained("leapjax", 0), jnp.array([0, 1, 2, 0])
-    energy = plate.make_agent(setup_of("leapjax", 0, dtype="bfloat16")).energy
+    energy = plate.make_agent(make_setup("leapjax", 0, dtype="bfloat16")).energy
     memory = quick_jit(energy.encode)(network.params, network.context)
-    low = quick_jit(energy.conditional)(network.params, memory, plan, EVERYWHERE)[:, :-1]
-    high = network.energies(plan, EVERYWHERE)[:, :-1]
+    low = quick_jit(energy.conditional)(network.params, memory, plan, POSITIONS)[:, :-1]
+    high = network.energies(plan, POSITIONS)[:, :-1]
     assert 0 < np.abs(low - high).max() < 0.05 * np.abs(high).max()
 
 
 @only_long
-def test_plans_are_the_demonstrators_ways():
-    setup = setup_of("leapjax", 0, steps=300)
+def test_plans_follow_the_demonstrator():
+    setup = make_setup("leapjax", 0, steps=300)
     agent = plate.make_agent(setup)
-    state, metrics = toy.learn(agent, data(), setup.training.steps)
+    state, metrics = toy.learn(agent, make_data(), setup.training.steps)
     assert metrics[-1]["accuracy"] == 1 and metrics[-1]["state_error"] < 0.02
     keys = jax.random.split(jax.random.key(0), len(mixed.PLACES))
     planner = compile_planner(agent.energy, BeamConfig(HORIZON, beams=3, score=True))

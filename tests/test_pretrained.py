@@ -1,4 +1,4 @@
-"""Planners that were trained before, asked for something else."""
+"""Loaded planners: other targets, searches and levels, plans, and compilation."""
 
 import dataclasses
 import itertools
@@ -15,49 +15,49 @@ from leapjax.errors import UserError
 from tests.programs import untrained_run
 
 
-def test_a_planner_can_be_asked_for_another_return(tmp_path):
+def test_target_return_of_a_loaded_planner_changes_its_energies(tmp_path):
     folder = untrained_run(tmp_path, "--method", "dt")
 
-    def energies(target):
+    def load_energies(target):
         planner = pretrained.load(folder, target_return=target)
         domain = pretrained.make_domain(planner.specification)
         context = blank_context(domain, planner.specification.context)
         first = np.zeros(1, np.int32)
 
         @jax.jit
-        def judge(params, context):
+        def score_actions(params, context):
             memory = planner.energy.encode(params, context)
             return planner.energy.conditional(params, memory, first, first)
 
-        asked = planner.specification.method_settings.target_return
-        return asked, np.asarray(judge(planner.params, context))
+        chosen = planner.specification.method_settings.target_return
+        return chosen, np.asarray(score_actions(planner.params, context))
 
-    (usual, as_trained), (_, same), (asked, other) = map(energies, (None, 1.0, -3.0))
-    assert (usual, asked) == (1.0, -3.0)
+    (default, as_trained), (_, same), (chosen, other) = map(load_energies, (None, 1.0, -3.0))
+    assert (default, chosen) == (1.0, -3.0)
     np.testing.assert_array_equal(as_trained, same)
-    finite = np.isfinite(other)  # the end action is not chosen
+    finite = np.isfinite(other)  # the energy of the end action is infinite
     assert np.abs(as_trained[finite] - other[finite]).max() > 1e-3
     with pytest.raises(UserError, match="target_return must be finite"):
         pretrained.load(folder, target_return=float("nan"))
 
 
-def test_a_planner_says_how_it_searches_and_what_it_plays(tmp_path):
+def test_specification_of_a_loaded_planner_holds_its_search_and_level(tmp_path):
     folder = untrained_run(tmp_path, "--level", "GoToLocalS7N1", "--architecture", "paper")
     trained = pretrained.load(folder).specification
     search = dataclasses.replace(trained.planner, iterations=77, fill="confident")
     planner = pretrained.load(folder, search, level="GoToObjMazeS4R2")
-    asked = planner.specification
-    assert (asked.planner, asked.level) == (search, "GoToObjMazeS4R2")
-    assert dataclasses.replace(asked, planner=trained.planner, level=trained.level) == trained
-    # Its network counts as many steps of an episode as it has learned to.
+    chosen = planner.specification
+    assert (chosen.planner, chosen.level) == (search, "GoToObjMazeS4R2")
+    assert dataclasses.replace(chosen, planner=trained.planner, level=trained.level) == trained
+    # The network keeps the number of episode steps of its training level.
     blank = blank_context(planner.domain, 0)
     assert jax.eval_shape(planner.energy.encode, planner.params, blank)
     with pytest.raises(UserError, match="this leap has not learned"):
         pretrained.load(folder, target_return=0.5)
 
 
-def test_the_plan_for_an_environment_is_the_first_that_is_played():
-    """And what is said of a planner is short."""
+def test_plan_for_returns_the_first_plan_of_an_episode():
+    """The planner's `repr` begins with its method, level and data."""
     planner = leap.load("GoToLocalS7N5")
     adapter = planner.domain.make_adapter()
     plan = planner.plan_for(adapter, seed=3)
@@ -75,12 +75,12 @@ def test_the_plan_for_an_environment_is_the_first_that_is_played():
     assert "leap on GoToLocalS7N5, trained on 500 demonstrations" in level
 
 
-@pytest.mark.parametrize(("executed", "again"), [(None, False), (1, True)])
-def test_plans_after_the_first_are_compiled_where_a_cache_is_used(
-    executed, again, tmp_path, monkeypatch
+@pytest.mark.parametrize(("executed", "later_plans"), [(None, False), (1, True)])
+def test_plans_after_the_first_are_compiled_if_they_use_a_cache(
+    executed, later_plans, tmp_path, monkeypatch
 ):
     compiled = []
     monkeypatch.setattr(CompiledPlanner, "compile", lambda *given: compiled.append(given[3:]))
     planner = pretrained.load(untrained_run(tmp_path, "--architecture", "paper", "--context", "2"))
     planner.compile(40, executed)
-    assert compiled == [(40, again)]
+    assert compiled == [(40, later_plans)]

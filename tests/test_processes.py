@@ -1,4 +1,4 @@
-"""Two processes are one: the same training, the same episodes, one writer, one end."""
+"""Two processes train, evaluate, write results and stop as one process does."""
 
 import signal
 import socket
@@ -17,21 +17,21 @@ from tests.programs import ROOT, only_long, place_with_a_run
 place = pytest.fixture(place_with_a_run, scope="module")
 
 
-def free_address():
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        return f"localhost:{free.getsockname()[1]}"
+def find_free_address():
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return f"localhost:{listener.getsockname()[1]}"
 
 
 def start_two(place, runs, *options):
-    together = ("--coordinator", free_address(), "--num-processes", "2", *options)
+    cluster = ("--coordinator", find_free_address(), "--num-processes", "2", *options)
     return [
-        place.start(runs, *together, "--process-id", str(index), devices=1) for index in range(2)
+        place.start(runs, *cluster, "--process-id", str(index), devices=1) for index in range(2)
     ]
 
 
-# A sum of two is the same in any order, so not even the last bit differs. Split parameters
-# are another program.
+# A sum of two numbers does not depend on their order, so results are bit-identical. Split
+# parameters need a different program.
 @pytest.mark.parametrize(("fsdp", "tolerance"), [(1, 0.0), pytest.param(2, 1e-6, marks=only_long)])
 def test_two_processes_train_and_evaluate_as_one(place, fsdp, tolerance):
     for run in start_two(place, f"two{fsdp}", "--fsdp", str(fsdp)):
@@ -39,14 +39,14 @@ def test_two_processes_train_and_evaluate_as_one(place, fsdp, tolerance):
     place.check_same_end(f"two{fsdp}", tolerance)
 
 
-def test_a_process_that_has_joined_others_can_still_be_stopped():
-    """JAX would have the signal for itself."""
+def test_signals_stop_a_process_that_has_joined_a_cluster():
+    """JAX takes SIGTERM for itself, so leapjax restores its own handler."""
     program = f"""
 import os, signal, time
 from leapjax.running import jax_setup
 from leapjax.running.interruption import Interrupted, catch_signals
 with catch_signals():
-    jax_setup.connect(jax_setup.Cluster({free_address()!r}, 1, 0))
+    jax_setup.connect(jax_setup.Cluster({find_free_address()!r}, 1, 0))
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(1)
@@ -60,14 +60,14 @@ with catch_signals():
 
 
 @only_long
-def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
+def test_a_signal_to_one_process_stops_both_resumably(place):
     runs = start_two(place, "one stopped")
     place.wait_for_checkpoint(runs[0], "one stopped")
     runs[1].send_signal(signal.SIGTERM)
     errors = [run.communicate(timeout=100)[1] for run in runs]
     assert [run.returncode for run in runs] == [0, 0], errors
     assert all("stopped by SIGTERM; continue with" in error for error in errors)
-    # A checkpoint does not know how many processes wrote it.
+    # One process can resume a checkpoint of two.
     place.finish(place.start("one stopped"))
     place.check_same_end("one stopped")
 
@@ -80,22 +80,22 @@ def test_a_signal_to_one_process_stops_both_where_they_can_go_on(place):
         ({"coordinator": "a", "process_id": 0, "num_processes": 2}, "expected host:port"),
     ],
 )
-def test_processes_that_cannot_be_are_refused(options, message):
+def test_invalid_clusters_raise_an_error(options, message):
     with pytest.raises(ValueError, match=message):
         Cluster(**options)
 
 
-def test_alone_a_process_agrees_with_itself():
-    def refuse():
+def test_a_single_process_returns_results_and_raises_errors():
+    def fail():
         raise UserError("no")
 
-    for ask in (processes.run_on_first, processes.run_together):
-        assert ask(lambda: 3) == 3
+    for call in (processes.run_on_first, processes.run_together):
+        assert call(lambda: 3) == 3
         with pytest.raises(UserError, match="no"):
-            ask(refuse)
+            call(fail)
 
 
-def test_episodes_that_were_played_side_by_side_are_joined_in_order():
+def test_episodes_of_processes_are_joined_in_order():
     seeds = np.arange(5)
     whole = Episodes(seeds, seeds % 2 == 0, seeds + 1, seeds / 2, 9, 90, 2.0, 3.0)
     parts = [

@@ -1,4 +1,4 @@
-"""Planners that come with the library, and the files that they are."""
+"""Planners that come with the library, and their files."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ from tests.programs import ROOT, only_long, untrained_run
 PARAMS = {"a": {"kernel": jnp.linspace(-3, 3, 12).reshape(3, 4)}, "b": jnp.ones(2)}
 
 
-def test_parameters_come_back_in_half_precision(tmp_path):
+def test_parameters_round_trip_in_half_precision(tmp_path):
     path = tmp_path / "new" / "weights.npz"
     weights.write(path, PARAMS, "mine")
     found = weights.read(path, PARAMS, "mine")
@@ -32,7 +32,7 @@ def test_parameters_come_back_in_half_precision(tmp_path):
         weights.write(path, {"b": jnp.full(2, 1e6)}, "mine")
 
 
-def test_parameters_of_something_else_are_refused(tmp_path):
+def test_parameters_of_another_configuration_raise_an_error(tmp_path):
     path = tmp_path / "weights.npz"
     weights.write(path, PARAMS, "mine")
     reshaped = {**PARAMS, "b": jnp.ones(3)}
@@ -44,8 +44,8 @@ def test_parameters_of_something_else_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("name", "size"), [("c", 5_000_000), ("b", 10**15), ("identity", 10**15)])
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_what_is_too_large_is_not_unpacked(tmp_path, name, size):
-    """Another array than those that are wanted, one of another shape, the seal itself."""
+def test_unexpected_arrays_are_not_unpacked(tmp_path, name, size):
+    """The archive has an extra array, an array of another shape, or a large identity."""
     path = tmp_path / "weights.npz"
     weights.write(path, PARAMS, "mine")
     with (
@@ -63,7 +63,7 @@ def test_what_is_too_large_is_not_unpacked(tmp_path, name, size):
     assert peak < 10**6
 
 
-def test_a_damaged_file_is_one_line(tmp_path):
+def test_damaged_files_are_reported_in_one_line(tmp_path):
     path = tmp_path / "weights.npz"
     weights.write(path, PARAMS, "mine")
     whole = path.read_bytes()
@@ -72,7 +72,7 @@ def test_a_damaged_file_is_one_line(tmp_path):
         damaged = bytearray(whole)
         damaged[rng.integers(len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(bytes(damaged))
-        try:  # a bit that nobody reads may change
+        try:  # the reader ignores some bits
             found = weights.read(path, PARAMS, "mine")
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), found, PARAMS)
         except UserError as error:
@@ -88,7 +88,7 @@ def test_a_damaged_file_is_one_line(tmp_path):
 
 @pytest.fixture
 def published(tmp_path, monkeypatch):
-    """A planner that has learned nothing, published for its level."""
+    """Publishes an untrained planner for its level; returns the folder of its run."""
     run = untrained_run(tmp_path / "run", "--seeds", "3")
     monkeypatch.setattr(pretrained, "PUBLISHED", tmp_path / "published")
     assert publish.main([str(run)]) == 0
@@ -96,7 +96,7 @@ def published(tmp_path, monkeypatch):
     return run
 
 
-def test_a_published_planner_is_the_run_that_it_was_made_of(published, tmp_path):
+def test_a_published_planner_equals_its_run(published, tmp_path):
     run, copy = leap.load(published), leap.load("GoToLocalS7N5")
     assert run.specification == copy.specification
     jax.tree.map(
@@ -119,16 +119,16 @@ def test_the_command_line_plays_published_planners(published, tmp_path, capsys):
     (row,) = results.read(tmp_path / "runs" / "babyai.jsonl")
     assert (row["seed"], row["train_steps"], row["episodes"]) == (3, 0, 2)
     capsys.readouterr()
-    for more, said in (
+    for more, message in (
         (["--level", "PickUpLoc"], "no planner is published for 'PickUpLoc': only for GoToLocal"),
         (["--checkpoint", str(published)], "give one of them"),
         (["--seeds", "0"], "seed is 3, not 0"),
     ):
         assert babyai.main([*options, *more]) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
-def test_the_planner_of_a_family_plays_each_of_its_levels(published, tmp_path):
+def test_a_family_planner_plays_each_level_of_its_family(published, tmp_path):
     (tmp_path / "published" / "GoToLocalS7N5").rename(tmp_path / "published" / "BabyAI")
     level = "BabyAI-GoToObj-v0"
     assert leap.load(level).domain.level == level
@@ -137,7 +137,7 @@ def test_the_planner_of_a_family_plays_each_of_its_levels(published, tmp_path):
     assert babyai.main(["--level", level, *options]) == 0
     (row,) = results.read(tmp_path / "runs" / "babyai.jsonl")
     assert (row["level"], row["played"]) == ("GoToLocalS7N5", level)
-    assert row["paper_success"] is None  # it is of another level
+    assert row["paper_success"] is None  # the paper's number belongs to the trained level
     for name in ("BabyAI-GoToObjj-v0", "Other-GoToObj-v0"):
         with pytest.raises(UserError):
             leap.load(name)
@@ -150,7 +150,7 @@ LEVELS = {
 PROGRAMS = {"babyai": babyai, "sudoku": sudoku}
 
 
-def test_what_is_published_is_of_todays_presets():
+def test_published_planners_have_the_current_presets():
     assert len(LEVELS) > 4
     for level, domain in LEVELS.items():
         (config,) = parse(domain, ["--level", level, "--pretrained"])
@@ -161,8 +161,8 @@ def test_what_is_published_is_of_todays_presets():
 
 @only_long
 @pytest.mark.parametrize("level", LEVELS)
-def test_a_published_planner_has_the_successes_of_its_row(level, tmp_path, monkeypatch):
-    """On the machine that the rows are from; on another one bits may differ."""
+def test_published_planners_reproduce_the_successes_of_their_rows(level, tmp_path, monkeypatch):
+    """Holds on the machine that measured the rows; on another machine, bits may differ."""
     domain = LEVELS[level]
     rows = results.read(ROOT / "results" / f"{domain}.jsonl")
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Episodes inside `jit` are the episodes of the lockstep rollout."""
+"""Rollouts inside `jit` play the same episodes as the lockstep rollout."""
 
 from typing import NamedTuple
 
@@ -35,16 +35,14 @@ def step(state, action):
     reward = jnp.where(reached, 1.0, -0.1)
     observation = {"at": state.at, "to": state.to}
     over = state.steps >= LONGEST
-    # The score is not the reward, which planners see.
+    # The score differs from the reward, which planners see.
     return state, Transition(observation, reward, reached, over, reached, score=3 * reward + 1)
 
 
 WALK = PureEnvironment(reset, step, END + 1)
 
 
-class Adapter:
-    """The same world, step by step."""
-
+class WalkAdapter:
     num_actions = END + 1
 
     def reset(self, seed):
@@ -56,28 +54,27 @@ class Adapter:
         return jax.device_get(found)
 
 
-def total(params, context, actions):
-    """Go there; rather not where one has been; all of the context matters."""
+def compute_energy(params, context, actions):  # reads every field of the context
     moves = jnp.array([-1, 1, 0, 0])[actions]
-    miss = jnp.abs(context.observation["at"] + moves.sum() - context.observation["to"])
-    been = (context.past["at"] == context.observation["at"] + moves[0]).sum()
+    distance = jnp.abs(context.observation["at"] + moves.sum() - context.observation["to"])
+    visited = (context.past["at"] == context.observation["at"] + moves[0]).sum()
     habit = (context.actions == actions[0]).sum() + context.rewards.sum() + context.return_so_far
-    return params * miss + 0.3 * been + 0.1 * habit * actions[0] + 0.01 * (context.step % 3)
+    return params * distance + 0.3 * visited + 0.1 * habit * actions[0] + 0.01 * (context.step % 3)
 
 
-ENERGY = leap.from_total(lambda params, context: context, total, END + 1)
+ENERGY = leap.from_total(lambda params, context: context, compute_energy, END + 1)
 CONFIG = leap.GibbsConfig(horizon=4, iterations=6, temperature=0.7)
 
 
 @pytest.mark.parametrize(
-    ("context", "executed", "most"), [(3, 2, 50), pytest.param(0, None, 5, marks=only_long)]
+    ("context", "executed", "limit"), [(3, 2, 50), pytest.param(0, None, 5, marks=only_long)]
 )
-def test_the_episodes_are_those_of_the_lockstep_rollout(context, executed, most):
+def test_episodes_equal_the_lockstep_rollout(context, executed, limit):
     seeds = range(100, 140)
-    options = {"context": context, "executed": executed, "max_steps": most}
+    options = {"context": context, "executed": executed, "max_steps": limit}
     found = compile_rollout(WALK, ENERGY, CONFIG, **options)(1.0, seeds, 5)
     planner = leap.compile_planner(ENERGY, CONFIG, (8,))
-    expected = leap.evaluate(Adapter, seeds, planner, jnp.float32(1.0), seed=5, **options)
+    expected = leap.evaluate(WalkAdapter, seeds, planner, jnp.float32(1.0), seed=5, **options)
     for name in ("seeds", "successes", "lengths"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
     np.testing.assert_allclose(found.returns, expected.returns, atol=1e-5)
@@ -86,13 +83,13 @@ def test_the_episodes_are_those_of_the_lockstep_rollout(context, executed, most)
     assert len(set(found.lengths)) > 2
 
 
-def roll(params=1.0, seeds=(0, 1, 2), seed=0, world=WALK, energy=ENERGY, config=CONFIG, **options):
+def play(params=1.0, seeds=(0, 1, 2), seed=0, world=WALK, energy=ENERGY, config=CONFIG, **options):
     options = {"context": 1, "max_steps": 9, **options}
     return compile_rollout(world, energy, config, **options)(params, seeds, seed)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         ({"world": WALK._replace(num_actions=3)}, "energy has 4 actions and the environment 3"),
         ({"executed": 0}, "executed must be"),
@@ -104,19 +101,19 @@ def roll(params=1.0, seeds=(0, 1, 2), seed=0, world=WALK, energy=ENERGY, config=
         ({"seed": -1}, "^seed must be"),
     ],
 )
-def test_what_cannot_be_is_refused(wrong, says):
-    with pytest.raises(ValueError, match=says):
-        roll(**wrong)
+def test_invalid_arguments_raise_an_error(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        play(**wrong)
 
 
-def test_a_plan_that_ends_at_once_gives_up():
+def test_empty_plans_give_up_the_episode():
     lazy = leap.from_total(lambda *_: (), lambda p, c, a: (a != END).sum(), END + 1)
-    found = roll((), range(5), energy=lazy, config=leap.GibbsConfig(2, 20))
+    found = play((), range(5), energy=lazy, config=leap.GibbsConfig(2, 20))
     assert not found.lengths.any() and not found.successes.any() and found.plans == 5
 
 
-def led(state=lambda state: state, **changes):
-    """The step of the world, but for what it returns."""
+def alter(state=lambda state: state, **changes):
+    """Returns the world with altered results of `step`."""
 
     def changed(before, action):
         after, found = step(before, action)
@@ -126,34 +123,37 @@ def led(state=lambda state: state, **changes):
     return WALK._replace(step=changed)
 
 
-def tripled(tree):
+def triple(tree):
     return jax.tree.map(lambda x: jnp.stack([x] * 3), tree)
 
 
 @pytest.mark.parametrize(
-    ("world", "says"),
+    ("world", "message"),
     [
-        (led(observation=tripled), r"observation\['at'\] as int32\[3\], but reset as int32\[\]"),
-        (led(state=lambda s: s._replace(at=tripled(s.at))), "state.at"),
+        (alter(observation=triple), r"observation\['at'\] as int32\[3\], but reset as int32\[\]"),
+        (alter(state=lambda s: s._replace(at=triple(s.at))), "state.at"),
         (WALK._replace(step=lambda s, a: step(s, a)[1]), r"must return \(state, Transition\)"),
         (WALK._replace(reset=lambda key: reset(key)[1]["at"]), r"return \(state, observation\)"),
-        (led(reward=lambda x: x[None]), r"a real number of shape \(\) as reward, got float32\[1\]"),
-        (led(taken=lambda x: 1.0), "an integer .* as taken"),
+        (
+            alter(reward=lambda x: x[None]),
+            r"a real number of shape \(\) as reward, got float32\[1\]",
+        ),
+        (alter(taken=lambda x: 1.0), "an integer .* as taken"),
     ],
 )
-def test_a_step_hands_on_what_the_reset_began(world, says):
-    with pytest.raises(UserError, match=says):
-        roll(world=world)
+def test_step_and_reset_must_return_matching_structures(world, message):
+    with pytest.raises(UserError, match=message):
+        play(world=world)
 
 
-def test_numbers_that_are_not_finite_are_refused():
-    def late(state, action):
+def test_non_finite_rewards_raise_an_error():
+    def step_to_nan(state, action):
         state, found = step(state, action)
         return state, found._replace(reward=jnp.where(state.steps == 3, jnp.nan, 0.0))
 
     still = leap.from_total(lambda *_: (), lambda p, m, a: (a != STAY).sum() * 1.0, END + 1)
-    world = WALK._replace(step=late)
+    world = WALK._replace(step=step_to_nan)
     rollout = compile_rollout(world, still, leap.GibbsConfig(2, 2), context=1, max_steps=5)
-    assert rollout((), [8, 13]).lengths.tolist() == [2, 2]  # over before
+    assert rollout((), [8, 13]).lengths.tolist() == [2, 2]  # over before step 3
     with pytest.raises(UserError, match="not finite in 2 of 4 .* at step 3 of level seed 11"):
         rollout((), [8, 11, 13, 12])

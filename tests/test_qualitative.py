@@ -1,4 +1,4 @@
-"""Drawings of plans: episodes that are watched, and the program at toy size."""
+"""Drawings of plans: watched episodes, and the program at toy size."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def planner(tmp_path_factory):
 
 
 @pytest.mark.parametrize("executed", [None, 2])
-def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
+def test_watched_episodes_equal_evaluated_episodes(planner, executed):
     seeds = range(5)
     played = rollouts.evaluate(
         lambda: BabyAIAdapter(LEVEL), seeds, planner.plan, planner.params, context=0,
@@ -42,14 +42,14 @@ def test_what_is_watched_is_what_an_evaluation_plays(planner, executed):
     assert plans == played.plans
 
 
-def test_a_way_is_what_a_plan_would_do_and_is_drawn():
+def test_the_way_of_a_plan_is_predicted_and_drawn():
     adapter = BabyAIAdapter(LEVEL)
     adapter.reset(0)
     turns = next(n for n in range(4) if len(set(find_way(adapter, [RIGHT] * n + [FORWARD]))) == 2)
     plan = [RIGHT] * turns + [FORWARD, END, FORWARD]
     before = agent_cell(adapter.env)
     cells = find_way(adapter, plan)
-    assert agent_cell(adapter.env) == before == cells[0]  # nothing was done
+    assert agent_cell(adapter.env) == before == cells[0]  # `find_way` takes no action
     for action in plan[: turns + 1]:
         adapter.step(action)
     assert agent_cell(adapter.env) == cells[-1] and len(cells) == turns + 2
@@ -63,14 +63,14 @@ def test_a_way_is_what_a_plan_would_do_and_is_drawn():
 def test_both_figures_are_drawn(tmp_path, monkeypatch):
     untrained = pretrained.load(untrained_run(tmp_path, "--level", "GoToBehindObstacles"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(qualitative, "STEPS", 0)  # any episode will do
+    monkeypatch.setattr(qualitative, "STEPS", 0)  # any episode is long enough
     monkeypatch.setattr(qualitative, "ITERATIONS", (2,))
     monkeypatch.setattr(qualitative, "PLANNED", ("GoToLocalS7N5",))
     monkeypatch.setattr(qualitative, "ASKED", (("composition-easy", "sum"),))
     monkeypatch.setattr(qualitative.cases, "load_models", lambda *_: [untrained, untrained])
     assert qualitative.main(["--test-seed", "0"]) == 0
-    refined, asked = (Image.open(tmp_path / "runs" / f"{name}.png") for name in qualitative.FIGURES)
-    assert refined.size == (2 * 336, 370) and asked.size == (336, 370)
-    frames = np.asarray(asked).reshape(-1, 3)
-    for colour in qualitative.HALVES:  # who sees what
+    first, second = (Image.open(tmp_path / "runs" / f"{name}.png") for name in qualitative.FIGURES)
+    assert first.size == (2 * 336, 370) and second.size == (336, 370)
+    frames = np.asarray(second).reshape(-1, 3)
+    for colour in qualitative.HALVES:  # frames of each model's obstacles
         assert (frames == colour).all(axis=1).any()

@@ -1,4 +1,4 @@
-"""What a careless or hostile user does: refused in one line, before any work, and nothing lost."""
+"""Careless or hostile use raises a one-line error before any work, and loses no files."""
 
 import dataclasses
 import gc
@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from minigrid.utils.baby_ai_bot import Subgoal
 
-import experiments.__main__ as everything
+import experiments.__main__ as all_experiments
 import leapjax as leap
 from experiments import accuracy, babyai, gymnasium
 from leapjax import checkpoints, files, pretrained
@@ -47,8 +47,8 @@ def workplace(tmp_path, monkeypatch):
     return tmp_path
 
 
-def one_line(capsys, *arguments) -> str:
-    """The line with which a command is refused."""
+def get_error_line(capsys, *arguments) -> str:
+    """Runs a command that must fail; returns its line of error."""
     assert babyai.main([*TOY_RUN, *map(str, arguments)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1
@@ -64,78 +64,77 @@ def one_line(capsys, *arguments) -> str:
         (babyai.main, [""], "an argument"),
         (gymnasium.main, ["--dataset="], "--dataset"),
         (accuracy.main, ["runs/a", ""], "an argument"),
-        (everything.main, ["babyai", "--level="], "--level"),
+        (all_experiments.main, ["babyai", "--level="], "--level"),
     ],
 )
-def test_an_empty_value_as_an_unset_variable_leaves_it(workplace, capsys, main, arguments, option):
+def test_empty_values_from_unset_variables_are_errors(workplace, capsys, main, arguments, option):
     with pytest.raises(SystemExit, match="2"):
         main(arguments)
-    said = capsys.readouterr().err
-    assert said == f"error: {option} is empty: give it a value, or leave it out\n"
+    printed = capsys.readouterr().err
+    assert printed == f"error: {option} is empty: give it a value, or leave it out\n"
     assert not list(workplace.iterdir())
 
 
 # Checkpoints.
 
 
-def small(value: float, step=1) -> TrainState:
+def make_state(value: float, step=1) -> TrainState:
     return TrainState({"w": jnp.full(3, value)}, (), jnp.int32(step))
 
 
 def save(folder, *values, **options):
     saved = Checkpoints(folder, **options)
     for step, value in enumerate(values, 1):
-        saved.save(small(value, step))
+        saved.save(make_state(value, step))
     saved.close()
 
 
 def check_params(folder, value, *identity):
-    found = checkpoints.restore_params(folder, small(0.0).params, *identity)
+    found = checkpoints.restore_params(folder, make_state(0.0).params, *identity)
     np.testing.assert_array_equal(found["w"], value)
 
 
 @pytest.mark.parametrize("name", ["a\\b", "run[1]", "gs:/c", "\udc80"])
-def test_a_folder_in_which_checkpoints_would_be_lost(name, workplace):
+def test_unsafe_folders_cannot_hold_checkpoints(name, workplace):
     for use in (Checkpoints, lambda folder: checkpoints.restore_params(folder, {})):
         with pytest.raises(UserError, match="cannot hold checkpoints"):
             use(workplace / name)
 
 
 @pytest.mark.parametrize("name", ["a #%41ü\n:.{7}'$HOME", "1.orbax-checkpoint-tmp", "x" * 255])
-def test_an_odd_name_holds_checkpoints(name, workplace):
+def test_odd_folder_names_can_hold_checkpoints(name, workplace):
     save(workplace / name, 3.0)
     again = Checkpoints(workplace / name)
-    restored = again.restore(small(0.0), skipped=pytest.fail)
+    restored = again.restore(make_state(0.0), skipped=pytest.fail)
     again.close()
     np.testing.assert_array_equal(restored.params["w"], 3.0)
     check_params(workplace / name, 3.0)
 
 
-def test_a_checkpoint_that_is_written_somewhere_else(workplace, monkeypatch):
-    """Whatever the reason: it is found out after the first, not by the next start."""
+def test_checkpoint_written_elsewhere_raises_an_error(workplace, monkeypatch):
+    """The next save notices it, whatever the cause; otherwise the next start would."""
     monkeypatch.setattr(states, "check_path", lambda folder: None)
     saved = Checkpoints(workplace / "a\\b")
-    saved.save(small(1.0))
+    saved.save(make_state(1.0))
     with pytest.raises(UserError, match="was written, but is not found in"):
-        saved.save(small(2.0, 2))
+        saved.save(make_state(2.0, 2))
     saved.close()
 
 
-def test_a_checkpoint_belongs_to_its_configuration(workplace):
+def test_checkpoint_of_another_configuration_raises_an_error(workplace):
     save(workplace / "a", 1.0, identity="mine")
     for identity in ("yours", ""):
         with pytest.raises(UserError, match=OTHER):
-            checkpoints.restore_params(workplace / "a", small(0.0).params, identity)
+            checkpoints.restore_params(workplace / "a", make_state(0.0).params, identity)
         other = Checkpoints(workplace / "a", identity)
         with pytest.raises(UserError, match=OTHER):
-            other.restore(small(0.0))
+            other.restore(make_state(0.0))
         other.close()
-    assert (workplace / "a" / "1").is_dir()  # whole, so it is not set aside as damaged
+    assert (workplace / "a" / "1").is_dir()  # intact, so not set aside as damaged
     check_params(workplace / "a", 1.0, "mine")
 
 
-def edit(folder, change):
-    """Changes the values of a specification."""
+def edit_specification(folder, change):
     values = json.loads((folder / "specification.json").read_text())
     change(values)
     (folder / "specification.json").write_text(json.dumps(values))
@@ -151,9 +150,9 @@ def edit(folder, change):
         (lambda values: values["model"].update(width=2**30), OTHER),
     ],
 )
-def test_a_specification_that_was_edited_builds_nothing(workplace, monkeypatch, change, message):
+def test_edited_specification_fails_before_building(workplace, monkeypatch, change, message):
     folder = untrained_run(workplace / "run")
-    edit(folder, change)
+    edit_specification(folder, change)
     monkeypatch.setattr(pretrained, "make_domain", lambda *given: pytest.fail("built"))
     with pytest.raises(UserError, match=message):
         leap.load(folder)
@@ -166,23 +165,23 @@ def test_a_specification_that_was_edited_builds_nothing(workplace, monkeypatch, 
         (lambda values: values.update(context=2**31 - 1), "cannot be built"),
     ],
 )
-def test_a_sealed_network_that_nothing_can_build(workplace, change, message):
+def test_sealed_network_of_impossible_size_raises_an_error(workplace, change, message):
     folder = untrained_run(workplace / "run")
-    edit(folder, change)
+    edit_specification(folder, change)
     seal(folder)
     with pytest.raises(UserError, match=message):
         leap.load(folder)
 
 
-def test_a_specification_may_leave_defaults_out(workplace):
+def test_specification_may_omit_defaults(workplace):
     folder = untrained_run(workplace / "run")
     before = leap.load(folder).specification
-    edit(folder, lambda values: values["domain_settings"].pop("radius"))
+    edit_specification(folder, lambda values: values["domain_settings"].pop("radius"))
     assert leap.load(folder).specification == before
 
 
-def sealed(folder, **changes) -> Path:
-    """A run of nothing, whoever made it: its specification and parameters agree."""
+def make_sealed_run(folder, **changes) -> Path:
+    """Makes an untrained run with matching specification and parameters, as anyone can."""
     (chosen,) = parse("gymnasium", ["--level", "CartPole-v1", "--method", "random"])
     made = specify(chosen, 0, make_domain(chosen))
     pretrained.save_specification(folder, dataclasses.replace(made, **changes))
@@ -192,7 +191,7 @@ def sealed(folder, **changes) -> Path:
 
 @pytest.fixture
 def trap(workplace, monkeypatch):
-    """A module whose import leaves a file behind."""
+    """The file that a hostile module creates when it is imported."""
     (workplace / "evilmod.py").write_text(
         "import pathlib\nimport gymnasium as gym\npathlib.Path('trap').touch()\n"
         "gym.register('Evil-v0', 'gymnasium.envs.classic_control:CartPoleEnv',"
@@ -203,12 +202,12 @@ def trap(workplace, monkeypatch):
     sys.modules.pop("evilmod", None)
 
 
-def test_code_that_a_checkpoint_names_runs_only_if_the_caller_names_it(workplace, trap):
-    edited = sealed(workplace / "edited")
-    edit(edited, lambda values: values.update(level="evilmod:Evil-v0"))
+def test_module_of_a_checkpoint_runs_only_if_the_caller_names_it(workplace, trap):
+    edited = make_sealed_run(workplace / "edited")
+    edit_specification(edited, lambda values: values.update(level="evilmod:Evil-v0"))
     with pytest.raises(UserError, match=OTHER):
         leap.load(edited)
-    whole = sealed(workplace / "whole", level="evilmod:Evil-v0")
+    whole = make_sealed_run(workplace / "whole", level="evilmod:Evil-v0")
     read = pretrained.read_specification(whole)
     for load in (
         lambda: leap.load(whole),
@@ -221,11 +220,11 @@ def test_code_that_a_checkpoint_names_runs_only_if_the_caller_names_it(workplace
     assert not trap.exists()
     loaded = leap.load(whole, level="evilmod:Evil-v0")
     assert loaded.specification.level == "evilmod:Evil-v0" and trap.exists()
-    (asked,) = parse("gymnasium", ["--checkpoint", str(whole), "--level", "evilmod:Evil-v0"])
-    assert asked.level == "evilmod:Evil-v0"
+    (parsed,) = parse("gymnasium", ["--checkpoint", str(whole), "--level", "evilmod:Evil-v0"])
+    assert parsed.level == "evilmod:Evil-v0"
 
 
-def test_code_that_data_name(trap, monkeypatch):
+def test_module_of_a_data_set_does_not_run(trap, monkeypatch):
     described = storage.Described("evilmod:Evil-v0", 3)
     monkeypatch.setattr(storage, "describe_dataset", lambda name: described)
     with pytest.raises(UserError, match="mine/data-v0 names the level evilmod:Evil-v0"):
@@ -237,7 +236,7 @@ def test_code_that_data_name(trap, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "folder/" + "x" * 300, 7])
-def test_a_path_that_the_system_cannot_look_for(name, workplace):
+def test_impossible_path_raises_a_short_error(name, workplace):
     (workplace / "folder").mkdir()
     for use in (leap.load, checkpoints.find_newest, Checkpoints, files.check_path):
         with pytest.raises(UserError, match="cannot look for|expected a path") as raised:
@@ -245,14 +244,14 @@ def test_a_path_that_the_system_cannot_look_for(name, workplace):
         assert len(str(raised.value)) < 200
 
 
-def test_a_checkpoint_that_is_not_there(workplace):
+def test_missing_checkpoint_raises_an_error(workplace):
     (workplace / "loop").symlink_to("loop")
     for nowhere in ("nothing", "loop", ""):
         with pytest.raises(UserError, match="not a checkpoint|symbolic links"):
             leap.load(nowhere)
 
 
-def test_files_of_text_that_have_no_end(workplace):
+def test_endless_and_huge_text_files_raise_an_error(workplace):
     os.mkfifo(workplace / "pipe")
     for path in (workplace / "pipe", Path("/dev/zero"), workplace):
         with pytest.raises(UserError, match="not a file"):
@@ -263,7 +262,7 @@ def test_files_of_text_that_have_no_end(workplace):
         leap.load(workplace)
 
 
-def test_links_that_were_planted_in_a_shared_folder(workplace):
+def test_planted_links_do_not_redirect_writes(workplace):
     mine, shared = workplace / "mine", workplace / "shared"
     shared.mkdir()
     mine.write_text("precious")
@@ -271,13 +270,13 @@ def test_links_that_were_planted_in_a_shared_folder(workplace):
     (shared / ".lock").symlink_to(mine)
     files.write_text(shared / "row.json", "new")
     assert files.read_text(shared / "row.json") == "new"
-    refused = pytest.raises(UserError, match="cannot write to .*shared.*symbolic links")
-    with refused, files.lock_folder(shared):
+    expect_error = pytest.raises(UserError, match="cannot write to .*shared.*symbolic links")
+    with expect_error, files.lock_folder(shared):
         pass
     assert mine.read_text() == "precious"
 
 
-def test_a_folder_that_nobody_else_can_write_to(workplace):
+def test_folder_that_others_can_write_to_raises_an_error(workplace):
     made = workplace / "a" / "b"
     files.make_private(made)
     assert made.stat().st_mode & 0o777 == made.parent.stat().st_mode & 0o777 == 0o700
@@ -288,13 +287,13 @@ def test_a_folder_that_nobody_else_can_write_to(workplace):
         with pytest.raises(UserError, match="others can write to"):
             files.make_private(workplace / "link")
         folder.chmod(0o755)
-    made.parent.chmod(0o1777)  # as /tmp is
+    made.parent.chmod(0o1777)  # like /tmp
     files.make_private(made)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
-def test_a_folder_to_which_the_group_of_its_user_can_write(workplace, monkeypatch):
-    """As umask 002 makes them: the group has the user's name, not always the number."""
+def test_private_folder_may_be_writable_for_the_users_own_group(workplace, monkeypatch):
+    """Umask 002 makes such folders: the group has the user's name, not always the number."""
     made, mine = workplace / "made", pwd.getpwuid(0).pw_name
     made.mkdir()
     os.chown(made, 0, 4321)
@@ -310,7 +309,7 @@ def test_a_folder_to_which_the_group_of_its_user_can_write(workplace, monkeypatc
         files.make_private(made)
 
 
-# Before any work.
+# Errors before any work.
 
 
 @pytest.mark.parametrize(
@@ -327,7 +326,7 @@ def test_a_folder_to_which_the_group_of_its_user_can_write(workplace, monkeypatc
         (["--width", "200000"], "GiB of memory would be needed"),
     ],
 )
-def test_where_a_run_is_impossible_nothing_is_done(
+def test_impossible_runs_stop_before_any_work(
     toy_run, workplace, capsys, monkeypatch, arguments, message
 ):
     (workplace / "file").write_text("")
@@ -336,10 +335,10 @@ def test_where_a_run_is_impossible_nothing_is_done(
     for name in ("load_demonstrations", "load_trained", "evaluate"):
         monkeypatch.setattr(running, name, lambda *given: pytest.fail("work was done"))
     given = [toy_run if each == "RUN" else each for each in arguments]
-    assert message in one_line(capsys, *given)
+    assert message in get_error_line(capsys, *given)
 
 
-def test_a_level_that_fails_does_not_end_the_others(capsys, monkeypatch):
+def test_failing_level_does_not_stop_the_others(capsys, monkeypatch):
     played = []
 
     def run_one(which, config, seed, *rest):
@@ -351,19 +350,19 @@ def test_a_level_that_fails_does_not_end_the_others(capsys, monkeypatch):
     monkeypatch.setattr(running, "finish", run_one)
     assert babyai.main(["--level", "all", "--seeds", "0", "1", "--no-pictures"]) == 2
     assert played == [(level, seed) for level in levels.LEVELS for seed in (0, 1)]
-    said = capsys.readouterr()
-    assert said.err == "error: something is wrong with it\n"
-    assert "GoToLocalS8N7, seed 1, failed" in said.out and "GoToSeqS5R2" in said.out
+    printed = capsys.readouterr()
+    assert printed.err == "error: something is wrong with it\n"
+    assert "GoToLocalS8N7, seed 1, failed" in printed.out and "GoToSeqS5R2" in printed.out
 
 
-def test_a_run_that_has_not_come_to_its_end(toy_run, workplace, capsys):
+def test_unfinished_run_is_neither_recorded_nor_published(toy_run, workplace, capsys):
     stopped = workplace / "stopped"
     shutil.copytree(toy_run, stopped)
     (stopped / "checkpoints" / "4").rename(stopped / "checkpoints" / "3")
-    said = "ends at step 3 of 4: start the run's command again"
-    assert said in one_line(capsys, "--checkpoint", stopped, "--record")
+    printed = "ends at step 3 of 4: start the run's command again"
+    assert printed in get_error_line(capsys, "--checkpoint", stopped, "--record")
     assert not list(workplace.rglob("*.jsonl"))
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=printed):
         pretrained.publish(stopped, workplace / "published")
     with pytest.warns(UserWarning, match="ends at step 3 of 4"):
         leap.load(stopped)
@@ -376,16 +375,16 @@ def test_a_run_that_has_not_come_to_its_end(toy_run, workplace, capsys):
     ("setting", "value"), [("enable_x64", True), ("default_prng_impl", "rbg"),
                            ("numpy_dtype_promotion", "strict")],
 )  # fmt: skip
-def test_a_setting_of_jax_that_breaks_a_promise(setting, value, monkeypatch):
+def test_unsupported_jax_settings_raise_an_error(setting, value, monkeypatch):
     monkeypatch.setattr(jax_setup, "connect", lambda cluster: pytest.fail("went on"))
     name = f"jax_{setting}"
     with getattr(jax, setting)(value), pytest.raises(UserError, match=f"{name} is .*unset"):
         jax_setup.start()
 
 
-def test_no_device_is_one_line(monkeypatch):
+def test_missing_device_raises_a_one_line_error(monkeypatch):
     def fail():
-        raise AssertionError  # as JAX does where JAX_PLATFORMS is cuda and no plugin is installed
+        raise AssertionError  # as JAX does if JAX_PLATFORMS is cuda without a plugin
 
     monkeypatch.setattr(jax_setup.jax, "devices", fail)
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
@@ -395,24 +394,24 @@ def test_no_device_is_one_line(monkeypatch):
 
 @only_long
 @pytest.mark.parametrize(
-    ("variable", "value", "says"),
+    ("variable", "value", "pattern"),
     [
         ("JAX_NUM_CPU_DEVICES", "abc", "error: cannot import JAX with .*JAX_NUM_CPU_DEVICES=abc"),
         ("PYTHONIOENCODING", "ascii", r"error: unknown level 'St\?r \?': expected"),
     ],
 )
-def test_an_environment_that_cannot_be_served_is_one_line(variable, value, says):
+def test_odd_environment_variables_print_a_one_line_error(variable, value, pattern):
     done = subprocess.run(
         [sys.executable, "-m", "experiments.stars", "--level", "St\u00e4r \u00b1"],
         capture_output=True, text=True, cwd=ROOT, env={**os.environ, variable: value}, check=False,
     )  # fmt: skip
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2
-    assert re.match(says, line)
+    assert re.match(pattern, line)
 
 
-def test_what_is_written_is_on_the_disk(workplace, monkeypatch):
-    """The file before it has its name, the folder after."""
+def test_writing_flushes_the_file_and_then_its_folder(workplace, monkeypatch):
+    """The file is flushed before it gets its name, the folder after."""
     flushed = []
     monkeypatch.setattr(
         os, "fsync", lambda number: flushed.append(Path(f"/proc/self/fd/{number}").readlink())
@@ -422,17 +421,17 @@ def test_what_is_written_is_on_the_disk(workplace, monkeypatch):
     assert flushed[0].name != "row.json"
 
 
-def test_a_disk_without_room_is_refused_before_anything_is_written(workplace, monkeypatch):
+def test_full_disk_raises_an_error_before_writing(workplace, monkeypatch):
     saved = Checkpoints(workplace / "a")
     monkeypatch.setattr(files, "SPARE", 2**60)
     with pytest.raises(UserError, match="MiB are free in .* may be needed"):
-        saved.save(small(1.0))
+        saved.save(make_state(1.0))
     saved.close()
     assert list((workplace / "a").iterdir()) == []
 
 
-def test_a_disk_that_fills_is_one_line_and_older_files_stay(workplace, capfd, caplog, monkeypatch):
-    """The threads of Orbax, asyncio and TensorStore say nothing."""
+def test_filling_disk_raises_an_error_and_keeps_older_files(workplace, capfd, caplog, monkeypatch):
+    """The threads of Orbax, asyncio and TensorStore print no text."""
     monkeypatch.setattr(sys, "unraisablehook", startup.print_unraisable)
     row = workplace / "row.json"
     files.write_text(row, "old")
@@ -441,7 +440,7 @@ def test_a_disk_that_fills_is_one_line_and_older_files_stay(workplace, capfd, ca
     saved = Checkpoints(workplace / "a")
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
     with pytest.raises(UserError, match=r"cannot write a checkpoint to .*/a \(File too large\)"):
-        # No file may grow beyond this: what a full disk does, to this process alone.
+        # This limit on file sizes acts like a full disk, for this process alone.
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, most))
         try:
             with pytest.raises(UserError, match="cannot write .*row.json"):
@@ -451,15 +450,15 @@ def test_a_disk_that_fills_is_one_line_and_older_files_stay(workplace, capfd, ca
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
     gc.collect()
-    said = capfd.readouterr()
-    assert (said.out, said.err, caplog.text) == ("", "", "")
+    printed = capfd.readouterr()
+    assert (printed.out, printed.err, caplog.text) == ("", "", "")
     assert {path.name for path in workplace.iterdir()} == {"a", "row.json"}
     assert row.read_text() == "old"
     check_params(workplace / "a", 1.0)
 
 
-def test_a_bot_that_never_decides_is_a_failed_demonstration(monkeypatch):
-    """MiniGrid's bot goes from subgoal to subgoal for ever on one in six of UnlockToUnlock."""
+def test_bot_that_never_decides_is_a_failed_demonstration(monkeypatch):
+    """MiniGrid's bot cycles through subgoals forever in one in six levels of UnlockToUnlock."""
 
     class Undecided(Subgoal):
         def replan_before_action(self):

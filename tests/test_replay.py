@@ -28,8 +28,8 @@ LEFT, DONE = 0, 6
 PARTIAL = "minigrid/BabyAI-GoToLocal/optimal-v0"
 
 
-def recorded(name, wrap=None, episodes=5, level=LEVEL, spoil=None, first=1000):
-    """A data set of MiniGrid's bot, whose episode 1 is spoiled."""
+def record(name, wrap=None, episodes=5, level=LEVEL, spoil=None, first=1000):
+    """Records a data set of MiniGrid's bot; the action `spoil`, if given, spoils episode 1."""
     with levels.silenced():
         env = gym.make(level) if wrap is None else wrap(gym.make(level))
     words = spaces.Text(200, charset=string.printable)
@@ -41,7 +41,7 @@ def recorded(name, wrap=None, episodes=5, level=LEVEL, spoil=None, first=1000):
         bot, action, over = BabyAIBot(env.unwrapped), None, False
         if episode == 1 and spoil is not None:
             collector.step(spoil)
-            for _ in range(2):  # and then it was cut off
+            for _ in range(2):  # then the episode is cut off
                 collector.step(LEFT)
             continue
         while not over:
@@ -55,11 +55,11 @@ def recorded(name, wrap=None, episodes=5, level=LEVEL, spoil=None, first=1000):
 
 @pytest.mark.parametrize(
     ("wrap", "level"),
-    [(None, LEVEL), (FullyObsWrapper, LEVEL), (None, "BabyAI-GoToLocalS7N5-v0")],  # 7: the view
+    [(None, LEVEL), (FullyObsWrapper, LEVEL), (None, "BabyAI-GoToLocalS7N5-v0")],  # view is 7x7
 )
-def test_what_was_recorded_is_played_again_and_seen_as_a_whole(wrap, level):
+def test_recordings_are_replayed_with_full_observations(wrap, level):
     name, domain = "minigrid/some/optimal-v0", BABYAI.make(level, Settings())
-    collection = storage.load(recorded(name, wrap, level=level), domain)
+    collection = storage.load(record(name, wrap, level=level), domain)
     assert not collection.dropped and len(collection.demonstrations) == 5
     adapter = demonstrations.BabyAIAdapter(levels.find_level(level))
     for number, found in enumerate(collection.demonstrations):
@@ -77,21 +77,21 @@ def test_what_was_recorded_is_played_again_and_seen_as_a_whole(wrap, level):
     [
         ({"spoil": DONE}, replay.DONE, [1000, 1002, 1003, 1004]),
         ({"spoil": LEFT}, replay.FAILED, [1000, 1002, 1003, 1004]),
-        # It ends at another match: what is observed of the goal would teach to go elsewhere.
+        # It ends at another match, so the observed goal would teach the wrong target.
         ({"episodes": 2, "first": 1008}, replay.OTHER_GOAL, [1008]),
     ],
 )
-def test_episodes_that_are_no_demonstrations_are_dropped_and_counted(options, reason, seeds):
-    collection = storage.load(recorded(PARTIAL, **options), DOMAIN)
+def test_unusable_episodes_are_dropped_and_counted(options, reason, seeds):
+    collection = storage.load(record(PARTIAL, **options), DOMAIN)
     assert collection.dropped == {reason: 1}
     assert [d.seed for d in collection.demonstrations] == seeds
 
 
-def test_episodes_that_go_otherwise_are_dropped_and_counted():
-    name = recorded(PARTIAL, episodes=6)
+def test_inconsistent_episodes_are_dropped_and_counted():
+    name = record(PARTIAL, episodes=6)
     with h5py.File(file_of(storage.find_datasets_folder(), name), "a") as file:
-        file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never was
-        file["episode_2"].attrs["seed"] = 5  # of another level
+        file["episode_1/observations/image"][1, 3, 3, 0] += 1  # a state that never occurred
+        file["episode_2"].attrs["seed"] = 5  # the seed of another level
         file["episode_3/rewards"][-1] = 0.123
         del file["episode_4"].attrs["seed"]
         shorter = file["episode_5/observations/image"][:-1]
@@ -106,8 +106,8 @@ def test_episodes_that_go_otherwise_are_dropped_and_counted():
         storage.load(name, DOMAIN)
 
 
-def test_the_level_follows_from_the_data_and_must_be_theirs():
-    name = recorded(PARTIAL, episodes=1)
+def test_level_is_read_from_the_data_and_must_match():
+    name = record(PARTIAL, episodes=1)
     (chosen,) = command_line.parse("babyai", ["--demonstrations", name])
     assert chosen.level == LEVEL and chosen.demonstrations == name
     with pytest.raises(
@@ -116,9 +116,9 @@ def test_the_level_follows_from_the_data_and_must_be_theirs():
         command_line.parse("babyai", ["--demonstrations", name, "--level", "GoToLocalS7N5"])
 
 
-def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
+def test_program_runs_on_recorded_data(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    name = recorded(PARTIAL, spoil=DONE)
+    name = record(PARTIAL, spoil=DONE)
     assert babyai.main([*TOY, "--demonstrations", name]) == 2
     assert f"4 episodes that can be used (1 {replay.DONE}), fewer than 6" in (
         " ".join(capsys.readouterr().err.split())
@@ -129,8 +129,8 @@ def test_the_program_trains_on_them(tmp_path, monkeypatch, capsys):
 
 
 @only_long
-def test_many_levels_replay():
+def test_many_levels_can_be_replayed():
     for level in ("BabyAI-GoToSeqS5R2-v0", "BabyAI-PickupLoc-v0", "BabyAI-UnlockLocal-v0"):
-        name = recorded(f"minigrid/{level}/optimal-v0", episodes=20, level=level)
+        name = record(f"minigrid/{level}/optimal-v0", episodes=20, level=level)
         found = storage.load(name, BABYAI.make(level, Settings()))
         assert len(found.demonstrations) + found.dropped.get(replay.OTHER_GOAL, 0) == 20

@@ -1,4 +1,4 @@
-"""Tables and plots say what the rows say."""
+"""Tables and figures show the rows of results."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ def row(
     level="GoToLocalS8N7", method="leap", name="leapjax", seed=0, rate=0.9, played=False,
     mean_length=6.0, **options,
 ):  # fmt: skip
-    """The row of a run, or of its checkpoint played again, with the parts that tables read."""
+    """Makes the row of a run, or of its checkpoint played again, with the fields of tables."""
     config = with_options(find_preset("babyai", level, method, name), options)
     config = dataclasses.replace(config, checkpoint=Path("runs/name") if played else None)
     return {
@@ -32,36 +32,36 @@ def row(
 
 ROWS = [
     row(), row(seed=1, rate=1.0), row("PickUpLoc", rate=0.3),
-    # Of other settings, on other levels than all others, and a checkpoint played again.
+    # These do not count: other settings, other evaluation levels, a checkpoint played again.
     row(demos=50, rate=0), row(steps=1, rate=0), row(validation=True, rate=0),
     row(test_seed=5, rate=0), row(episodes=600, rate=0), row(played=True, rate=0),
 ]  # fmt: skip
 
 
-def cells(table, level):
+def read_cells(table, level):
     (line,) = (line for line in table.splitlines() if level in line)
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_only_rows_of_the_setting_count_and_trained_ones_before_those_played_again():
-    found = cells(babyai.compare_settings(ROWS, babyai.SETTINGS), "S8N7")
+def test_only_rows_of_a_setting_count_and_training_rows_are_preferred():
+    found = read_cells(babyai.compare_settings(ROWS, babyai.SETTINGS), "S8N7")
     assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
     assert found[4] == "95.0% (90.0, 100.0), 2 seeds"
     assert found[5] == "-"
 
 
-def test_settings_are_kept_apart():
+def test_each_setting_has_its_own_column():
     others = [
         row(name="paper", rate=0.8), row(name="paper", rate=0, masking="one"),
         row(method="random", rate=0.1), row(method="classifier", rate=0),
         row(played=True, executed=3, rate=1.0, mean_length=4.0),
         row(played=True, executed=1, rate=0), row(played=True, iterations=1, rate=0),
     ]  # fmt: skip
-    found = cells(babyai.compare_settings([*ROWS, *others], babyai.SETTINGS), "S8N7")
+    found = read_cells(babyai.compare_settings([*ROWS, *others], babyai.SETTINGS), "S8N7")
     assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
 
 
-def test_an_interval_beside_the_published_number_is_marked():
+def test_intervals_above_or_below_the_published_number_are_marked():
     rows = [row(rate=0.9), row(seed=1, rate=0.9), row(seed=2, rate=0.9)]
     plain = format_rate(rows)
     assert plain.startswith("90.0% [") and plain.endswith("], 3 seeds")
@@ -70,38 +70,38 @@ def test_an_interval_beside_the_published_number_is_marked():
     assert format_rate([]) == format_beside([], 50) == "-"
 
 
-def test_methods_stand_beside_the_papers_and_the_best_in_bold(tmp_path):
+def test_methods_are_compared_with_the_paper_and_the_best_is_bold(tmp_path):
     rows = [
         row(rate=0.9), row(method="bc", rate=1.0), row(method="bc", seed=1, rate=0.9),
         row(method="bc", name="paper", rate=0.2), row("PickUpLoc"),
-        row(method="dt", steps=1, rate=1.0),  # not the preset's
+        row(method="dt", steps=1, rate=1.0),  # other steps than the preset's
     ]  # fmt: skip
     lines = babyai.compare_methods(rows).splitlines()[2:]
     found = {line[2]: line[3:-1] for line in ([c.strip() for c in x.split("|")] for x in lines)}
-    assert len(lines) == len(found) and tuple(found) == babyai.COMPARED  # of one level
-    published = [of[0] for of in found.values()]
+    assert len(lines) == len(found) and tuple(found) == babyai.COMPARED  # rows of a single level
+    published = [entries[0] for entries in found.values()]
     assert published == ["-", "61.5%", "63.0%", "71.5%", "63.5%", "45.0%", "81.5%", "95.0%"]
     assert found["bc"][1].startswith("**20.0% [") and found["bc"][1].endswith("1 seed ↓**")
-    told = [of[3].split("%")[0] for of in found.values()]
-    assert told == ["-", "**95.0", *"-----", "**90.0"]  # of bc with two seeds, and of leap
+    ours = [entries[3].split("%")[0] for entries in found.values()]
+    assert ours == ["-", "**95.0", *"-----", "**90.0"]  # bc with two seeds, and leap
     assert all(report.is_used(r) for r in rows[:-1]) and not report.is_used(rows[-1])
     names, found = babyai.COMPARED, babyai.compute_success_by_method(rows)
     figures.draw_methods(found, names, tmp_path / "methods.png")
     assert (tmp_path / "methods.png").stat().st_size > 5_000
     everywhere = [row(level, method="bc", rate=0.5) for level in LEVELS]
     aggregated = babyai.compute_aggregates([*everywhere, row("PickUpLoc")])
-    assert list(aggregated) == ["LEAP, published", "bc, preset `leapjax`"]  # not of one level
+    assert list(aggregated) == ["LEAP, published", "bc, preset `leapjax`"]  # others lack levels
     figures.draw_intervals(aggregated, tmp_path / "aggregate.png")
     assert (tmp_path / "aggregate.png").stat().st_size > 5_000
 
 
 def level_row(play, rate):
-    """The row of a level that the planner of all levels played."""
+    """Makes the row of a level that the planner of all levels played."""
     found = row("BabyAI", rate=rate, played=True, play=play)
     return found | {"played": play, "mean_success_length": 7.5 if rate else None}
 
 
-def test_levels_that_were_not_learned_come_first_then_those_that_fail():
+def test_levels_are_sorted_by_whether_they_were_learned_then_by_success():
     unknown, hard, easy = "BabyAI-PickupDist-v0", "BabyAI-Unlock-v0", "BabyAI-GoTo-v0"
     rows = [level_row(easy, 1.0), level_row(hard, 0.0), level_row(unknown, 0.5)]
     bot = {"episodes": 200, "successes": 190, "mean_success_length": 5.0}
@@ -117,7 +117,7 @@ def test_levels_that_were_not_learned_come_first_then_those_that_fail():
 
 
 def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
-    """A row of a level whose plans are executed whole."""
+    """Makes the row of a level whose plans are executed whole."""
     domain = "stars" if level.startswith("Star") else "sudoku"
     config = with_options(find_preset(domain, level, method, "leapjax"), options)
     return {
@@ -128,12 +128,12 @@ def puzzle_row(level="Star3x5", method="leap", seed=0, rate=0.5, **options):
     }  # fmt: skip
 
 
-# Of a single plan, where a preset restarts.
+# Options for a single plan, because the preset restarts.
 MOST_CERTAIN = {"certainty": 1.0, "restarts": 1, "judge": "energy", "enough": None}
 
 
 def board_row(rate, passes=81, boards=None, **options):
-    """A row of the planner that plays boards of a file."""
+    """Makes the row of a planner that plays boards of a file."""
     config = with_options(find_preset("sudoku", puzzles.HARD, "leap", "leapjax"), options)
     settings = json.loads(json.dumps(list_settings(config, 0)))
     settings["domain_settings"]["boards"] = boards
@@ -141,7 +141,7 @@ def board_row(rate, passes=81, boards=None, **options):
     return row | {"configuration": settings, "passes": passes, "hash": f"{rate}{passes}"}
 
 
-def test_hard_boards_stand_beside_those_of_training():
+def test_searches_are_compared_on_training_and_hard_boards():
     rows = [
         board_row(0.9, **MOST_CERTAIN), board_row(0.6, boards="hard.txt 1234", **MOST_CERTAIN),
         board_row(0.7, boards="hard.txt 1234", rules=1.0, **MOST_CERTAIN),
@@ -150,7 +150,7 @@ def test_hard_boards_stand_beside_those_of_training():
         board_row(0.8, boards="hard.txt 1234", layers=2),  # another network
     ]  # fmt: skip
     older = rows[1]["configuration"]["planner"]
-    del older["judge"], older["enough"]  # rows from before these settings
+    del older["judge"], older["enough"]  # older rows lack these settings
     assert [report.is_used(row) for row in rows] == [True] * 5 + [False]
     lines = [[cell.strip().split(" ")[0] for cell in line.split("|")[1:-1]]
              for line in puzzles.compare_boards(rows).splitlines()[2:]]  # fmt: skip
@@ -161,14 +161,14 @@ def test_hard_boards_stand_beside_those_of_training():
     ]
 
 
-def test_ways_to_search_stand_beside_each_other(tmp_path):
+def test_searches_are_compared_by_level_and_energy(tmp_path):
     rows = [
-        puzzle_row(rate=1.0), puzzle_row(seed=1, rate=0.9),  # as trained
+        puzzle_row(rate=1.0), puzzle_row(seed=1, rate=0.9),  # the search of the preset
         puzzle_row(rate=0.3, fill="together", iterations=10),
         puzzle_row(method="bc", rate=0.4),
         puzzle_row("Sudoku4x6", "rules", rate=0.6, fill="together", iterations=1),
         puzzle_row("Sudoku4x6", rate=0.7, rules=1.0, **MOST_CERTAIN),
-        puzzle_row(rate=0.8, fill="margin", iterations=9),  # of no table
+        puzzle_row(rate=0.8, fill="margin", iterations=9),  # in no table
     ]  # fmt: skip
     assert [report.is_used(row) for row in rows] == [True] * 6 + [False]
     columns = ["Star3x5, learned", "Sudoku4x6, rules", "Sudoku4x6, learned and rules"]

@@ -1,4 +1,4 @@
-"""Rows say what they were made with."""
+"""Result rows and measurements are checked, and recorded with the version of the code."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from tests.programs import ROOT, toy_row
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A repository with one commit of code."""
+    """Makes a repository with one commit of code."""
     (tmp_path / "leapjax").mkdir()
     (tmp_path / "leapjax" / "code.py").write_text("1")
     git(tmp_path, "init", "--quiet")
@@ -26,10 +26,10 @@ def checkout(tmp_path):
 
 def git(folder, *arguments):
     identity = ("-c", "user.name=a", "-c", "user.email=a@example.org")
-    done = subprocess.run(
+    process = subprocess.run(
         ("git", "-C", folder, *identity, *arguments), capture_output=True, text=True, check=True
     )
-    return done.stdout.strip()
+    return process.stdout.strip()
 
 
 def commit(folder):
@@ -38,7 +38,7 @@ def commit(folder):
     return git(folder, "log", "-1", "--format=%h")
 
 
-def test_a_checkout_is_known_by_the_last_commit_of_its_code(checkout):
+def test_code_version_is_the_last_commit_of_the_code(checkout):
     version = results.find_code_version(checkout)
     (checkout / "rows").write_text("new")
     commit(checkout)
@@ -57,12 +57,12 @@ def write_rows(path, *rows):
     return path
 
 
-def test_a_row_twice_is_refused_in_files_that_were_merged(tmp_path):
+def test_duplicate_rows_of_merged_files_raise_an_error(tmp_path):
     other = {**ROW, "hash": "y", "seed": 2}
     path = write_rows(tmp_path / "rows.jsonl", ROW, other)
     assert results.read(path) == [ROW, other]
-    for twice in (ROW, {**ROW, "seed": 3, "successes": 0, "success": 0.0}):
-        write_rows(path, ROW, other, twice)
+    for duplicate in (ROW, {**ROW, "seed": 3, "successes": 0, "success": 0.0}):
+        write_rows(path, ROW, other, duplicate)
         with pytest.raises(UserError, match="line 3: the same hash, x, as line 1.* delete one"):
             results.read(path)
     with pytest.raises(UserError, match="line 3"):
@@ -70,7 +70,7 @@ def test_a_row_twice_is_refused_in_files_that_were_merged(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"seed": True}, "seed is a bool, expected int"),
         ({"seed": 2**32}, "seed is 4294967296, expected at least 0 and at most 4294"),
@@ -82,13 +82,13 @@ def test_a_row_twice_is_refused_in_files_that_were_merged(tmp_path):
         ({"mean_return": None}, "mean_return is a NoneType, expected float"),
     ],
 )
-def test_a_field_that_no_table_can_show(tmp_path, change, says):
+def test_invalid_field_raises_an_error_that_names_its_line(tmp_path, change, message):
     path = write_rows(tmp_path / "rows.jsonl", ROW, {**ROW, "hash": "y", **change})
-    with pytest.raises(UserError, match=f"line 2: {says}"):
+    with pytest.raises(UserError, match=f"line 2: {message}"):
         results.read(path)
 
 
-def test_an_object_that_names_a_field_twice(tmp_path):
+def test_duplicate_field_raises_an_error(tmp_path):
     text = json.dumps(ROW)
     (tmp_path / "rows.jsonl").write_text(f'{text[:-1]}, "seed": 5}}\n')
     with pytest.raises(UserError, match=r"line 1: not JSON \(an object names 'seed' twice\)"):
@@ -96,7 +96,7 @@ def test_an_object_that_names_a_field_twice(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "says"),
+    ("name", "change", "message"),
     [
         ("planning", lambda v: v[3].update(batch="1"), r"\[3\].batch is a str, expected int"),
         ("training", lambda v: v[0]["parts"][1].pop("ms"), r"\[0\].parts\[1\] without ms"),
@@ -105,46 +105,46 @@ def test_an_object_that_names_a_field_twice(tmp_path):
         ("atari-energy", lambda v: v["Pong"]["returns"].pop(), "Pong.*other numbers"),
     ],
 )
-def test_measurements_that_no_table_can_show(tmp_path, name, change, says):
+def test_invalid_measurements_raise_an_error(tmp_path, name, change, message):
     path = tmp_path / f"{name}.json"
     values = measured.read_measured(ROOT / "results" / path.name)
     change(values)
     path.write_text(json.dumps(values))
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError, match=message):
         measured.read_measured(path)
 
 
-def test_a_row_is_json_or_refused(tmp_path):
+def test_infinite_values_are_not_recorded(tmp_path):
     path = tmp_path / "rows.jsonl"
     with pytest.raises(UserError, match="planner of a new row is not finite"):
         results.record(path, {"hash": "a", "planner": {"temperature": math.inf}})
     assert not path.exists()
 
 
-def test_episodes_are_kept_with_their_rows(tmp_path):
-    def played(*lengths):
+def test_episodes_are_stored_with_their_rows(tmp_path):
+    def make_episodes(*lengths):
         seeds = np.arange(len(lengths))
         return Episodes(seeds, seeds > 0, np.array(lengths), seeds / 3, 1, 10, 1.0, 1.0)
 
-    def kept():
+    def read_lengths():
         return {name: each["length"].tolist() for name, each in results.read_episodes(path).items()}
 
     path = tmp_path / "babyai.jsonl"
-    assert kept() == {}
-    results.record(path, {**ROW, "hash": "a"}, played(3, 4))
-    results.record(path, {**ROW, "hash": "b"}, played(5))
-    assert kept() == {"a": [3, 4], "b": [5]}
+    assert read_lengths() == {}
+    results.record(path, {**ROW, "hash": "a"}, make_episodes(3, 4))
+    results.record(path, {**ROW, "hash": "b"}, make_episodes(5))
+    assert read_lengths() == {"a": [3, 4], "b": [5]}
     table = results.read_episodes(path)["a"]
     assert table["seed"].tolist() == [0, 1] and table["success"].tolist() == [False, True]
     assert table["return"].tolist() == [0, 1 / 3]
-    results.record(path, {**ROW, "hash": "a"}, played(7))
-    results.record(path, {**ROW, "hash": "b"})  # another outcome, of which no episodes are known
-    assert kept() == {"a": [7]}
+    results.record(path, {**ROW, "hash": "a"}, make_episodes(7))
+    results.record(path, {**ROW, "hash": "b"})  # another outcome, without episodes
+    assert read_lengths() == {"a": [7]}
     results.record(path, {**ROW, "hash": "a"})
-    assert kept() == {}
+    assert read_lengths() == {}
     archive = tmp_path / "episodes" / "babyai.npz"
     for damage in (lambda: archive.write_bytes(archive.read_bytes()[:10]),
                    lambda: np.savez(archive, a=np.zeros(3))):  # fmt: skip
         damage()
         with pytest.raises(UserError, match=r"babyai\.npz"):
-            results.record(path, {**ROW, "hash": "c"}, played(1))
+            results.record(path, {**ROW, "hash": "c"}, make_episodes(1))

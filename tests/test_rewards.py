@@ -1,4 +1,4 @@
-"""Methods that learn from rewards find what is best in data of which most is not."""
+"""Methods that learn from rewards find the best policy in data of mostly wrong actions."""
 
 import dataclasses
 import functools
@@ -23,8 +23,8 @@ from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
 
 QUICKLY = {"discount": 0.9, "target_rate": 0.1}
-# Without waiting, which nobody does in the data: what is not there has any value at all, and
-# only CQL and BCQ know what to do about that.
+# Without waiting, which the data lack: the value of a missing action is arbitrary, and only CQL and
+# BCQ correct such values.
 COVERED = mixed.DOMAIN._replace(actions=("left", "right", "end"))
 CASES = {
     "bc": (bc, bc.Settings(), mixed.DOMAIN),
@@ -32,7 +32,7 @@ CASES = {
     "bcq": (bcq, bcq.Settings(**QUICKLY), mixed.DOMAIN),
     # Advantages are small here: far from the middle a wrong step costs a tenth.
     "iql": (iql, iql.Settings(**QUICKLY, inverse_temperature=20.0), mixed.DOMAIN),
-    # What is imagined is wrong at first: with more of it, some runs end up going one way.
+    # Imagined steps are wrong at first: with more of them, some runs end up going one way.
     "mopo": (
         mopo, mopo.Settings(**QUICKLY, inverse_temperature=10.0, real_share=0.8), mixed.DOMAIN
     ),
@@ -46,10 +46,10 @@ CASES = {
 
 @functools.cache
 def trained(case):
-    """An agent after a moment of training on walks that go wrong more often than right."""
+    """Trains an agent briefly on mostly wrong walks; returns it, its state and its metrics."""
     module, settings, domain = CASES[case]
     model = ModelConfig("leapjax", layers=1, heads=1, width=32, dropout=0.0)
-    # What MOPO imagines is less sure to settle: at the others' rate one run in eight does not.
+    # MOPO converges less surely: at the others' learning rate, one run in eight does not.
     learn = TrainingConfig(
         300 if case == "cql" else 600, batch=128, warmup=10, final_fraction=0.0, weight_decay=0.0,
         learning_rate=2e-3 if case == "mopo" else 3e-3, windows="step",
@@ -60,44 +60,44 @@ def trained(case):
 
 @functools.cache
 def scores(case):
-    """What a method says of each action and the end, at each place."""
+    """Returns the negative energies of the actions and the end, at each place."""
     agent, state, _ = trained(case)
 
     @quick_jit
     @jax.vmap
-    def of_place(context):
+    def score_place(context):
         memory, first = agent.energy.encode(state.params, context), jnp.zeros(1, jnp.int32)
         return -agent.energy.conditional(state.params, memory, first, first)[0]
 
-    return np.asarray(of_place(mixed.contexts(0)))
+    return np.asarray(score_place(mixed.contexts(0)))
 
 
 @pytest.mark.parametrize(
     "case",
     ["cql", *(pytest.param(x, marks=only_long) for x in ("bcq", "iql", "mopo", "qr_dqn", "rem"))],
 )
-def test_the_best_policy_is_found(case):
+def test_methods_find_the_best_policy(case):
     found = scores(case)
     np.testing.assert_array_equal(found.argmax(axis=1), mixed.best_actions())
     assert np.isneginf(found[:, -1]).all()  # the end is never chosen
-    if case == "cql":  # it keeps low what the data do not hold
+    if case == "cql":  # it keeps values of missing actions low
         assert (found[:, WAIT] < found[:, [LEFT, RIGHT]].min(axis=1) - 1).all()
     assert all(np.isfinite(list(entry.values())).all() for entry in trained(case)[2])
 
 
 @only_long
-def test_cloning_does_what_was_done_most_often():
+def test_cloning_imitates_the_most_frequent_action():
     inner = np.abs(mixed.PLACES) < toy.FARTHEST
     assert (scores("bc").argmax(axis=1) != mixed.best_actions())[inner].all()
 
 
 @only_long
 @pytest.mark.parametrize("case", ["bcq", "cql without", "qr_dqn", "rem"])
-def test_values_are_those_of_value_iteration(case):
+def test_values_match_value_iteration(case):
     best, rows = mixed.best_actions(), np.arange(len(mixed.PLACES))
     agent, state, _ = trained(case)
     q = scores(case)
-    if case == "bcq":  # which scores likely actions alone
+    if case == "bcq":  # whose energy scores only likely actions
         encode = quick_jit(jax.vmap(agent.energy.encode, (None, 0)))
         q = encode(state.params, mixed.contexts(0))["q"][:, -1]
         assert np.isneginf(scores(case)[:, WAIT]).all()
@@ -105,21 +105,20 @@ def test_values_are_those_of_value_iteration(case):
     np.testing.assert_allclose(found, mixed.best_values(0.9), atol=0.1)
 
 
-def test_bcq_never_does_what_the_data_do_not_hold():
-    """However good its value may look."""
-    said = {
+def test_bcq_masks_unlikely_actions_of_high_value():
+    outputs = {
         "behaviour": jnp.log(jnp.array([[0.6, 0.3, 0.1], [0.5, 0.5, 0.0]])),
         "q": jnp.array([[1.0, 2.0, 9.0], [3.0, 4.0, 9.0]]),
     }
     for threshold, expected in {
-        0.0: said["q"],
+        0.0: outputs["q"],
         0.3: [[1, 2, -np.inf], [3, 4, -np.inf]],
         1.0: [[1, -np.inf, -np.inf], [3, 4, -np.inf]],
     }.items():
-        np.testing.assert_array_equal(bcq.mask_unlikely_values(said, threshold), expected)
+        np.testing.assert_array_equal(bcq.mask_unlikely_values(outputs, threshold), expected)
 
 
-def test_mixtures_are_random_and_convex():
+def test_rem_mixtures_are_random_and_convex():
     weights = jax.vmap(rem.draw_mixture, (0, None))(jax.random.split(jax.random.key(0), 500), 8)
     assert (weights >= 0).all() and weights.shape == (500, 8)
     np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-5)
@@ -135,8 +134,8 @@ def test_mixtures_are_random_and_convex():
     ],
     ids=["dt", "leap"],
 )
-def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings, steps):
-    """Of walks that end well and walks that never do, it follows those that gave as much."""
+def test_actions_lead_to_the_target_return(module, settings, steps):
+    """The data hold walks that reach the middle and walks that never do."""
     model = ModelConfig("leapjax", layers=1, heads=2, width=32, dropout=0.0)
     learn = TrainingConfig(
         steps, batch=64, warmup=30, learning_rate=3e-3, weight_decay=0.0, windows="step"
@@ -155,8 +154,8 @@ def test_it_does_what_leads_to_the_return_that_is_asked_for(module, settings, st
         np.testing.assert_array_equal(found, expected)
 
 
-def test_a_missing_target_is_a_high_return_of_the_data():
-    """Not the highest of many; what is given stays, and what asks for no return needs none."""
+def test_target_return_defaults_to_a_high_return_of_the_data():
+    """A quantile, not the maximum; given targets and methods without a target stay unchanged."""
     rng, given = np.random.default_rng(0), dt.Settings(target_return=3.0)
     good = mixed.walk(rng, 1, 1.0)._replace(rewards=np.array([5.0], np.float32))
     data = [good._replace(rewards=np.float32([i])) for i in range(1000)]
@@ -172,15 +171,15 @@ def test_a_missing_target_is_a_high_return_of_the_data():
         agent.energy.encode(random_parameters(agent), context)
 
 
-def test_a_missing_scale_is_the_largest_discounted_return_from_any_step():
-    """Also of negative returns; rewards of one goal are left as they are."""
+def test_reward_scale_defaults_to_the_largest_discounted_return():
+    """The largest in magnitude, from any step; rewards of a single goal keep the scale 1."""
     step = mixed.walk(np.random.default_rng(0), 1, 1.0)
-    costs, goal, none = (
+    costs, goal, zero = (
         step._replace(rewards=np.array(rewards, np.float32))
         for rewards in ([1.0, -4.0, -2.0], [0.0, 0.0, 1.0], [0.0])
     )
     missing = iql.Settings(discount=0.5, reward_scale=None)
-    for data, scale in (([costs, goal], 5.0), ([goal], 1.0), ([none], 1.0)):
+    for data, scale in (([costs, goal], 5.0), ([goal], 1.0), ([zero], 1.0)):
         assert measure_settings(missing, data) == dataclasses.replace(missing, reward_scale=scale)
     assert measure_settings(iql.Settings(), [costs]) == iql.Settings()
     with pytest.raises(ValueError, match="reward_scale must be positive, got 0"):
@@ -188,8 +187,8 @@ def test_a_missing_scale_is_the_largest_discounted_return_from_any_step():
 
 
 @pytest.mark.parametrize("module", [bcq, cql, iql, mopo, qr_dqn, rem])
-def test_a_scale_of_rewards_is_as_smaller_rewards(module):
-    """Rewards of 7 with a scale of 7 are learned from as rewards of 1."""
+def test_reward_scale_divides_rewards(module):
+    """Rewards of 7 with a scale of 7 train like rewards of 1."""
     model, steps, found = ModelConfig(layers=1), mixed.steps(), []
     for times in (1.0, 7.0):
         settings = dataclasses.replace(module.Settings(), reward_scale=times)
@@ -202,8 +201,8 @@ def test_a_scale_of_rewards_is_as_smaller_rewards(module):
     np.testing.assert_allclose(*found, rtol=1e-6)
 
 
-def test_the_return_that_is_wanted_is_less_by_what_was_given():
-    """In units that do not saturate; where a demonstration tells the rest, that is taken."""
+def test_rewards_lower_the_target_return():
+    """Scaled returns do not saturate the network; a known return to go replaces the target."""
     domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
     settings = dt.Settings(target_return=10.0)
     compute = returns.condition_on_target(
@@ -215,7 +214,7 @@ def test_the_return_that_is_wanted_is_less_by_what_was_given():
 
 
 @pytest.mark.parametrize("name", ["bc", "dt", "bcq", "iql", "mopo", "cql", "qr_dqn", "rem"])
-def test_longer_plans_are_refused(name):
+def test_longer_plans_raise_an_error(name):
     module, settings, domain = CASES[name]
     setup = Setup(domain, 0, 5, ModelConfig(), TrainingConfig(), settings)
     with pytest.raises(UserError, match="a horizon of 5: .* one action at a time"):
@@ -236,6 +235,6 @@ def test_longer_plans_are_refused(name):
         (rem.Settings, "target_rate", float("nan")),
     ],
 )
-def test_settings_that_cannot_be_are_refused(settings, name, value):
+def test_invalid_settings_raise_an_error(settings, name, value):
     with pytest.raises(ValueError, match=f"^{name} must be"):
         settings(**{name: value})

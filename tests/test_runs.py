@@ -1,4 +1,4 @@
-"""Runs: windows in a row that make one example, so that each of their states is encoded once."""
+"""Runs: consecutive windows that form one example, so that each state is encoded once."""
 
 import dataclasses
 
@@ -61,7 +61,7 @@ def runs(data):
     )
 
 
-def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs):
+def test_windows_of_a_run_are_consecutive_and_stop_at_the_last(runs):
     steps, stopped = np.asarray(runs.context.step), 0
     assert steps.shape == (TRAINING.batch // RUN, RUN)
     for run, place in np.ndindex(len(steps), RUN - 1):
@@ -79,13 +79,13 @@ def test_the_windows_of_a_run_follow_each_other_and_stop_at_the_last(runs):
 
 
 @pytest.mark.parametrize("returns", [True, pytest.param(False, marks=only_long)])
-def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
+def test_training_step_on_runs_equals_step_on_their_windows(returns, runs):
     agent = leap.make_agent(setup(returns=returns))
-    alone = leap.make_agent(setup(run=1, returns=returns))
+    separate = leap.make_agent(setup(run=1, returns=returns))
     state = random_state(agent)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), runs)
     together, metrics = quick_jit(agent.update)(state, runs, jax.random.key(1))
-    one_by_one, expected = quick_jit(alone.update)(state, flat, jax.random.key(1))
+    one_by_one, expected = quick_jit(separate.update)(state, flat, jax.random.key(1))
     for name in ("loss", "accuracy", "gradient_norm"):
         assert float(metrics[name]) == pytest.approx(float(expected[name]), rel=1e-5)
     changed = 0.0
@@ -97,17 +97,17 @@ def test_a_step_on_runs_is_the_step_on_their_windows(returns, runs):
     assert changed > 1e-3
 
 
-def test_a_run_is_augmented_as_a_whole(data):
-    def turn(key, window):
+def test_run_is_augmented_as_a_whole(data):
+    def mark_window(key, window):
         return window._replace(return_to_go=jax.random.uniform(key))
 
-    domain = DOMAIN._replace(augmentations=Augmentations([turn]))
+    domain = DOMAIN._replace(augmentations=Augmentations([mark_window]))
     drawn = quick_jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
     marks = np.asarray(drawn.return_to_go)
     assert (marks == marks[:, :1]).all() and len(np.unique(marks)) == len(marks)
 
 
-def test_where_runs_win_nothing_they_are_refused():
+def test_runs_without_benefit_raise_an_error():
     with pytest.raises(ValueError, match="batch of 12 windows is not a multiple of 5"):
         dataclasses.replace(TRAINING, consecutive=5)
     single = setup()._replace(horizon=1)

@@ -34,24 +34,23 @@ MASK, END = 3, 2
 
 
 def is_violated(clause, values, differ):
-    """Whether a clause is violated for certain."""
+    """Returns whether a clause is violated, whatever its open variables become."""
     truths = [None if values[v // 2] > 1 else values[v // 2] == v % 2 for v in clause.tolist()]
     return truths == [False] * 3 or (differ and truths == [True] * 3)
 
 
-def count(literals, values, size):
-    """The number of violated clauses."""
+def count_violated(literals, values, size):
     return sum(is_violated(clause, values, size.differ) for clause in literals)
 
 
 def enumerate_solutions(literals, size):
-    """All assignments without violated clauses."""
+    """Returns all assignments without violated clauses."""
     every = itertools.product((0, 1), repeat=size.variables)
-    return {values for values in every if not count(literals, values, size)}
+    return {values for values in every if not count_violated(literals, values, size)}
 
 
 @SIZES
-def test_a_formula_has_different_clauses_and_the_solution_that_it_was_drawn_for(size):
+def test_formulas_have_distinct_clauses_and_their_drawn_solution(size):
     assert formulas.find_level(NAMES[size]) == size
     for seed in range(20):
         literals, solution = formulas.draw(size, seed)
@@ -63,8 +62,8 @@ def test_a_formula_has_different_clauses_and_the_solution_that_it_was_drawn_for(
 
 
 @SIZES
-def test_every_clause_that_a_solution_satisfies_can_be_drawn(size):
-    every = Size(4, 4 * size.patterns, size.differ)  # all that one assignment satisfies
+def test_every_clause_that_the_solution_satisfies_can_be_drawn(size):
+    every = Size(4, 4 * size.patterns, size.differ)  # all clauses that an assignment satisfies
     literals, solution = formulas.draw(every, 0)
     assert len({frozenset(clause) for clause in literals.tolist()}) == every.clauses
     found = enumerate_solutions(literals, every)
@@ -73,8 +72,8 @@ def test_every_clause_that_a_solution_satisfies_can_be_drawn(size):
 
 
 @SIZES
-def test_the_demonstrated_solution_is_a_uniform_one_of_all(size):
-    """So a network that imitates it learns the share of solutions that hold a value."""
+def test_demonstrated_solution_is_uniform_among_all_solutions(size):
+    """A network that imitates it thus learns the share of solutions with each value."""
     ranks = []
     for seed in range(1500):
         literals, solution = formulas.draw(size, seed)
@@ -87,7 +86,7 @@ def test_the_demonstrated_solution_is_a_uniform_one_of_all(size):
 
 
 def enumerate_solutions_fast(literals, size):
-    """The same as `enumerate_solutions`, for many formulas."""
+    """Vectorises `enumerate_solutions`."""
     every = np.array(list(itertools.product((0, 1), repeat=size.variables)))
     true = (every[:, literals // 2] == literals % 2).sum(axis=2)
     good = ((true > 0) & ((true < 3) | (not size.differ))).all(axis=1)
@@ -95,7 +94,7 @@ def enumerate_solutions_fast(literals, size):
 
 
 @SIZES
-def test_exactly_the_solutions_succeed(size):
+def test_episodes_succeed_exactly_for_solutions(size):
     adapter = FormulaAdapter(size)
     for seed in range(3):
         start = adapter.reset(seed)
@@ -115,16 +114,16 @@ def test_exactly_the_solutions_succeed(size):
             if step.success:
                 assert steps == size.variables
                 succeeded.add(values)
-            else:  # it ends as soon as a clause is violated
-                assert count(start.literals, known, size) > 0
+            else:  # the episode ends at the first violated clause
+                assert count_violated(start.literals, known, size) > 0
                 known[steps - 1] = OPEN
-                assert count(start.literals, known, size) == 0
+                assert count_violated(start.literals, known, size) == 0
         assert succeeded == solutions
 
 
 @functools.cache
 def renamed(size):
-    """Cuts the window at a step of a demonstration and renames it: compiled once."""
+    """Compiles a function that cuts a window at a step of the demonstrations, and renames it."""
     domain = make(NAMES[size], Settings())
     data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
@@ -138,13 +137,13 @@ def renamed(size):
 
 @SIZES
 @pytest.mark.parametrize("step", [0, 1, 4])
-def test_a_renamed_window_is_that_of_a_formula_with_the_solutions_renamed(size, step):
+def test_renamed_windows_have_the_renamed_solutions(size, step):
     seen, rest = set(), size.variables - step
     for seed, episode in itertools.product(range(5), range(2)):
         pair = renamed(size)(jax.random.key(seed), episode * size.variables + step)
         before, window = jax.tree.map(np.asarray, pair)
         old, new = before.context.observation, window.context.observation
-        # Which variable became which, and how: read from the clauses, whose order stays.
+        # The new literal of each old literal, read from the clauses, whose order stays.
         pairs = np.unique(np.stack([old.literals, new.literals], -1).reshape(-1, 2), axis=0)
         to = dict(pairs.tolist())
         assert len(to) == len(set(to.values())) == len(pairs)
@@ -174,13 +173,12 @@ def test_a_renamed_window_is_that_of_a_formula_with_the_solutions_renamed(size, 
     assert len(seen) == 10
 
 
-def at(size, formula):
-    """The context of a formula."""
+def observe(size, formula):
     return blank_context(make(NAMES[size], Settings()), 0)._replace(observation=formula)
 
 
 def start(size, seed, known=0):
-    """A formula whose first variables have the values of its solution."""
+    """Draws a formula; its first `known` variables have the values of the solution."""
     literals, solution = formulas.draw(size, seed)
     values = np.where(np.arange(size.variables) < known, solution, OPEN).astype(np.int32)
     return Formula(literals, values, np.int32(known)), solution
@@ -188,16 +186,16 @@ def start(size, seed, known=0):
 
 @SIZES
 @pytest.mark.parametrize(("known", "horizon"), [(0, 6), (2, 6), (2, 3)])
-def test_the_energy_of_the_rules_weighs_violated_clauses(size, known, horizon):
+def test_energy_of_the_rules_weighs_violated_clauses(size, known, horizon):
     energy, rng = rules(size.differ, weight=3.0), np.random.default_rng(0)
     total, conditional = jax.jit(energy.total), jax.jit(energy.conditional)
     formula, solution = start(size, 0, known)
-    memory, inside = energy.encode((), at(size, formula)), min(horizon, size.variables - known)
+    memory, inside = energy.encode((), observe(size, formula)), min(horizon, size.variables - known)
 
     def weigh(plan):
         values = formula.values.copy()
         values[known : known + inside] = plan[:inside]
-        return 3.0 * count(formula.literals, values, size)
+        return 3.0 * count_violated(formula.literals, values, size)
 
     planned = np.append(solution[known:], np.zeros(known, int))[:horizon]
     assert total((), memory, planned) == weigh(planned) == 0
@@ -214,21 +212,21 @@ def test_the_energy_of_the_rules_weighs_violated_clauses(size, known, horizon):
     apart = np.array([conditional((), memory, masked, each[None])[0] for each in both])
     np.testing.assert_array_equal(conditional((), memory, planned, both), apart)
     for row in conditional((), memory, planned, np.arange(inside, horizon)):
-        assert row[0] == row[1] < row[2] == np.inf  # after the last variable any value will do
+        assert row[0] == row[1] < row[2] == np.inf  # positions after the last variable are free
 
 
 @functools.cache
 def turn(size, horizon):
-    """The turn of a level: compiled once."""
+    """Compiles the turn of a level."""
     return jax.jit(functools.partial(make(NAMES[size], Settings()).turn, horizon=horizon))
 
 
 @SIZES
-def test_a_turned_formula_has_the_solutions_renamed(size):
+def test_turned_formulas_have_the_renamed_solutions(size):
     (formula, _), seen = start(size, 0), set()
     solutions = enumerate_solutions_fast(formula.literals, size)
     for seed in range(5):
-        context, places, names = turn(size, 6)(jax.random.key(seed), at(size, formula))
+        context, places, names = turn(size, 6)(jax.random.key(seed), observe(size, formula))
         new, places, names = jax.tree.map(np.asarray, (context.observation, places, names))
         assert new.variable == 0 and (new.values == OPEN).all()
         assert sorted(places) == [*range(6)] and (np.sort(names) == [0, 1, END]).all()
@@ -240,11 +238,11 @@ def test_a_turned_formula_has_the_solutions_renamed(size):
 
 
 @SIZES
-def test_the_rules_weigh_a_plan_alike_for_each_turned_formula(size):
+def test_turning_does_not_change_the_energy_of_the_rules(size):
     horizon, rng = 8, np.random.default_rng(0)  # two positions are after the last variable
     plain = rules(size.differ)
     energy = symmetric(plain, turn(size, horizon))
-    context, positions = at(size, start(size, 0)[0]), np.arange(horizon)
+    context, positions = observe(size, start(size, 0)[0]), np.arange(horizon)
 
     @jax.jit
     def weigh(key, plan):
@@ -261,13 +259,13 @@ def test_the_rules_weigh_a_plan_alike_for_each_turned_formula(size):
         found, expected = weigh(jax.random.key(seed), plan)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
         totals.add(float(expected[0]))
-    assert len(totals) > 2  # so that an order the wrong way round is seen
+    assert len(totals) > 2  # so that an inverted permutation fails
 
 
 @SIZES
 @pytest.mark.parametrize(("known", "horizon"), [(1, 6), (0, 5)])
-def test_a_formula_is_turned_only_for_plans_of_all_variables(size, known, horizon):
-    context = at(size, start(size, 0, known)[0])
+def test_formulas_are_turned_only_for_plans_of_all_variables(size, known, horizon):
+    context = observe(size, start(size, 0, known)[0])
     turned = turn(size, horizon)(jax.random.key(0), context)
     jax.tree.map(np.testing.assert_array_equal, turned.context, context)
     np.testing.assert_array_equal(turned.places, np.arange(horizon))
@@ -282,39 +280,39 @@ def make_agent(**model):
     return find_method("leap").make_agent(setup, None)
 
 
-def test_the_network_sees_a_formula_and_no_order_of_clauses_literals_or_variables():
+def test_network_ignores_the_order_of_clauses_literals_and_variables():
     agent, (formula, _) = make_agent(), start(SAT, 0)
     params, plan = random_parameters(agent), np.array([0, MASK, 1, MASK, 1, 0])
 
     @jax.jit
     def energies(literals, plan):
-        memory = agent.energy.encode(params, at(SAT, formula._replace(literals=literals)))
-        # One position at a time: those asked for together are masked together.
-        ask = functools.partial(agent.energy.conditional, params, memory, plan)
-        return jax.vmap(lambda position: ask(position[None])[0, :2])(np.arange(6))
+        memory = agent.energy.encode(params, observe(SAT, formula._replace(literals=literals)))
+        # One position at a time, because positions of a query are masked together.
+        query = functools.partial(agent.energy.conditional, params, memory, plan)
+        return jax.vmap(lambda position: query(position[None])[0, :2])(np.arange(6))
 
-    def ask(literals, plan=plan):
+    def query(literals, plan=plan):
         return np.asarray(energies(literals, plan))
 
     literals = formula.literals
-    found = ask(literals)
+    found = query(literals)
     same = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
-    same(ask(literals[::-1]), found)
-    same(ask(literals[:, [1, 2, 0]]), found)
-    places = np.array([0, 3, 1, 5, 2, 4])  # the first is marked: methods of one action assign it
+    same(query(literals[::-1]), found)
+    same(query(literals[:, [1, 2, 0]]), found)
+    places = np.array([0, 3, 1, 5, 2, 4])  # 0 stays: it is marked for methods of one action
     moved = np.empty_like(plan)
     moved[places] = plan
-    same(ask(2 * places[literals // 2] + literals % 2, moved)[places], found)
+    same(query(2 * places[literals // 2] + literals % 2, moved)[places], found)
     flipped = literals ^ (np.arange(3) == 0)
-    for other in (ask(flipped), ask(literals, np.where(plan < 2, 1 - plan, plan))):
+    for other in (query(flipped), query(literals, np.where(plan < 2, 1 - plan, plan))):
         assert np.abs(other - found).max() > 1e-3
 
 
-def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
-    """Its memory equals the one for variables counted from the next one on."""
+def test_plans_later_in_an_episode_assign_the_remaining_variables():
+    """Rolling the formula to begin with the next variable gives the same memory."""
     agent = make_agent()
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0, known=2)
-    encode = jax.jit(lambda formula: agent.energy.encode(params, at(SAT, formula)).memory)
+    encode = jax.jit(lambda formula: agent.energy.encode(params, observe(SAT, formula)).memory)
     rolled = formula._replace(
         literals=(formula.literals - 4) % 12, values=np.roll(formula.values, -2), variable=0
     )
@@ -326,10 +324,10 @@ def test_a_plan_later_in_an_episode_assigns_the_variables_from_there_on():
     assert np.abs(encode(other).positions.tokens - encode(formula).positions.tokens).max() > 0.01
 
 
-def test_no_action_sees_a_later_one_where_attention_is_causal():
+def test_causal_attention_hides_later_actions():
     agent = make_agent(attention="causal")
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0)
-    memory = agent.energy.encode(params, at(SAT, formula))
+    memory = agent.energy.encode(params, observe(SAT, formula))
     conditional = jax.jit(agent.energy.conditional)
     plans = [np.array([0, MASK, 1, value, 1, 0]) for value in (0, 1)]
     found = [conditional(params, memory, plan, np.array([1])) for plan in plans]
@@ -337,7 +335,7 @@ def test_no_action_sees_a_later_one_where_attention_is_causal():
 
 
 @SIZES
-def test_solvers_find_solutions_and_no_others(size):
+def test_solvers_find_a_solution_if_one_exists(size):
     rng = np.random.default_rng(0)
     for seed in range(30):
         literals, _ = formulas.draw(size, seed)
@@ -352,7 +350,7 @@ def test_solvers_find_solutions_and_no_others(size):
         assert every or walked.steps == satisfiability_solvers.FLIPS
 
 
-def test_a_walk_does_not_start_at_the_solution_that_a_formula_was_drawn_for():
+def test_walk_does_not_start_at_the_drawn_solution():
     size = formulas.find_level("Sat20x91")
     steps = [
         satisfiability_solvers.walk(formulas.draw(size, seed)[0], size, seed).steps
@@ -370,12 +368,12 @@ def test_a_walk_does_not_start_at_the_solution_that_a_formula_was_drawn_for():
         ("Nae4x25", "level Nae4x25: at most 24 clauses exist, got 25"),
     ],
 )
-def test_unknown_levels_are_refused(name, message):
+def test_unknown_levels_raise_an_error(name, message):
     with pytest.raises(UserError, match=message):
         formulas.find_level(name)
 
 
-def test_data_that_satisfy_no_formula_are_refused():
+def test_invalid_demonstrations_raise_an_error():
     source = make("Sat6x20", Settings()).demonstrations
     states = source.collect(1, 0, lambda done: None).demonstrations[0].observations
     source.check(states, "here")
@@ -390,7 +388,7 @@ def test_data_that_satisfy_no_formula_are_refused():
 
 
 @only_long
-def test_the_program_prints_searches_and_solvers(tmp_path, monkeypatch, capsys, quick_begin):
+def test_program_prints_searches_and_solvers(tmp_path, monkeypatch, capsys, quick_begin):
     monkeypatch.chdir(tmp_path)
     (only,) = (search for search in searches.SEARCHES if search.name == "all at once")
     monkeypatch.setattr(searches, "SEARCHES", (only,))

@@ -28,44 +28,44 @@ counts = st.integers(1, 100_000).flatmap(lambda n: st.tuples(st.integers(0, n), 
     ("successes", "episodes", "low", "high"),
     [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (1, 1, 0.2065, 1.0)],
 )
-def test_known_intervals(successes, episodes, low, high):
+def test_wilson_interval_matches_known_values(successes, episodes, low, high):
     assert wilson_interval(successes, episodes) == pytest.approx((low, high), abs=1e-4)
 
 
 @given(counts, st.floats(0.1, 4.0))
-def test_bounds_are_the_rates_that_the_score_test_just_accepts(case, z):
+def test_wilson_bounds_satisfy_their_definition(case, z):
     successes, episodes = case
     rate = successes / episodes
     low, high = wilson_interval(successes, episodes, z)
     assert 0 <= low <= rate <= high <= 1 and low < high
     for bound in wilson_interval(successes, episodes, z):
-        # The definition: the observed rate is z standard deviations from the bound.
+        # The score test just accepts a bound: the rate is z standard deviations from it.
         distance = abs(rate - bound)
         assert distance == pytest.approx(z * math.sqrt(bound * (1 - bound) / episodes), abs=1e-7)
 
 
-def test_seeds_that_differ_widen_the_interval():
-    def width(*successes, **correlation):
+def test_differing_seeds_widen_the_interval():
+    def measure_width(*successes, **correlation):
         low, high = interval_over_seeds(successes, [500] * len(successes), **correlation)
         return high - low
 
     for correlation in (0, 0.6, 1):
-        alike = width(450, 450, 450, correlation=correlation)
-        # Three seeds on the same levels tell less than three times as many levels would.
+        equal = measure_width(450, 450, 450, correlation=correlation)
+        # Three seeds on the same levels are worth fewer episodes than on separate levels.
         count = 3 * 500 / (1 + 2 * correlation)
         low, high = wilson_interval(round(0.9 * count), round(count))
-        assert alike == pytest.approx(high - low, rel=0.05)
-        assert width(400, 450, 500, correlation=correlation) > 3 * alike
+        assert equal == pytest.approx(high - low, rel=0.05)
+        assert measure_width(400, 450, 500, correlation=correlation) > 3 * equal
 
 
-def test_a_planner_without_failures_may_fail():
+def test_intervals_at_the_extremes_follow_jeffreys_prior():
     for seeds in (1, 3):
         low, high = interval_of_episodes(np.ones((seeds, 200), bool))
         assert low == pytest.approx(stats.beta.ppf(0.025, 200.5, 0.5), abs=1e-3) and high == 1
     assert interval_of_episodes(np.zeros((3, 200), bool))[0] == 0
 
 
-def test_variance_components_are_those_of_the_outcomes_drawn():
+def test_variance_components_match_the_simulated_outcomes():
     rng = np.random.default_rng(0)
     seeds, levels, _ = variance_components(draw_outcomes(rng, 400, 2000, 0.7, 0, deviation=0.1))
     assert seeds == pytest.approx(0.01, rel=0.2) and levels == pytest.approx(0, abs=1e-4)
@@ -75,7 +75,7 @@ def test_variance_components_are_those_of_the_outcomes_drawn():
 
 
 def draw_outcomes(rng, seeds, levels, rate, correlation, deviation=0.0):
-    """Outcomes [S, L] of seeds whose rates deviate, correlated on the same level."""
+    """Draws outcomes [S, L]: rates of seeds deviate, and outcomes of a level correlate."""
     common, own = rng.random(levels), rng.random((seeds, levels))
     shared = rng.random((seeds, levels)) < math.sqrt(correlation)
     return np.where(shared, common, own) < rng.normal(rate, deviation, (seeds, 1))
@@ -84,26 +84,26 @@ def draw_outcomes(rng, seeds, levels, rate, correlation, deviation=0.0):
 @pytest.mark.parametrize("correlation", [0, 0.6])
 @pytest.mark.parametrize("rate", [0.5, 0.95])
 @pytest.mark.parametrize("seeds", [1, 3, 5])
-def test_intervals_contain_the_truth_as_often_as_they_say(seeds, rate, correlation, monkeypatch):
+def test_intervals_have_their_nominal_coverage(seeds, rate, correlation, monkeypatch):
     monkeypatch.setattr(scores, "BOOTSTRAPS", 4000)
     rng = np.random.default_rng(0)
-    held, count = np.zeros(2), 4000 if LONG else 400
+    covered, count = np.zeros(2), 4000 if LONG else 400
     for _ in range(count):
         solved = draw_outcomes(rng, seeds, 200, rate, correlation)
         counts = solved.sum(axis=1), [200] * seeds
         found = interval_of_episodes(solved), interval_over_seeds(*counts, 0.95, correlation)
-        held += [low <= rate <= high for low, high in found]
-    assert (0.92 * count <= held).all() and (held <= 0.98 * count).all()
+        covered += [low <= rate <= high for low, high in found]
+    assert (0.92 * count <= covered).all() and (covered <= 0.98 * count).all()
 
 
-def test_the_default_correlation_is_that_of_the_recorded_episodes():
-    """Pooled over the settings of BabyAI that have several seeds."""
+def test_default_correlation_matches_the_recorded_episodes():
+    """Pools the settings of BabyAI that have several seeds."""
     rows = report.read_rows(ROOT, "babyai")
     by_setting = {}
     for row in rows:
         setting = {**row["configuration"], "seed": None}
         by_setting.setdefault(json.dumps(setting, sort_keys=True), []).append(row)
-    found = [collect_outcomes(of) for of in by_setting.values() if len(of) > 1]
+    found = [collect_outcomes(group) for group in by_setting.values() if len(group) > 1]
     matrices = [each for each in found if isinstance(each, np.ndarray)]
     assert len(matrices) > 50
     _, levels, rest = np.sum([variance_components(each) for each in matrices], axis=0)
@@ -128,21 +128,21 @@ SEEDS = [([], []), ([5], [10, 20]), (5, [10]), ("5", "9"), *(([s], [e]) for s, e
         (aggregate, [[]], "no tasks"),
     ],
 )
-def test_impossible_counts_and_levels_are_refused(call, wrong, message):
+def test_invalid_counts_and_levels_raise_an_error(call, wrong, message):
     for each in wrong:
         with pytest.raises(ValueError, match=message):
             call(each)
 
 
-def test_the_interquartile_mean_is_scipys_and_rliables():
+def test_interquartile_mean_equals_scipys_trimmed_mean():
     rng = np.random.default_rng(0)
     for count in (1, 3, 4, 7, 20):
         values = rng.normal(size=(5, count))
-        expected = stats.trim_mean(values, 0.25, axis=1)
+        expected = stats.trim_mean(values, 0.25, axis=1)  # as in rliable
         np.testing.assert_allclose(interquartile_mean(values), expected)
 
 
-def test_an_aggregate_is_stratified_by_level():
+def test_aggregates_are_stratified_by_level():
     levels = [([50, 60], [100, 100]), ([90], [100]), ([0], [100]), ([80], [100])]
     middle, (low, high) = aggregate(levels)
     assert middle == pytest.approx((0.55 + 0.8) / 2)  # the best and the worst do not count

@@ -63,15 +63,15 @@ def plan_for(config, energy=ENUMERABLE, params=None, context=NO_TILT, chains=Non
 
 
 def count_by_hand(probabilities, least, certainty, entropy):
-    """The number of positions of a ranked list that a pass fills, by the definitions."""
+    """Counts how many ranked positions a pass fills, by the definitions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         entropies = -np.nansum(probabilities * np.log(probabilities), axis=1)
     count = least
     while count < len(probabilities):
         following = probabilities[: count + 1]
-        surely = certainty < 1 and (following.max(1) >= certainty).all()
+        certain = certainty < 1 and (following.max(1) >= certainty).all()
         spread = entropies[: count + 1].sum() - entropies[: count + 1].max()
-        if not (surely or (entropy > 0 and spread <= entropy)):
+        if not (certain or (entropy > 0 and spread <= entropy)):
             break
         count += 1
     return count
@@ -102,7 +102,7 @@ def test_a_pass_fills_the_certain_positions(least, certainty, entropy):
 @pytest.mark.parametrize("bound", [{"certainty": 0.8}, {"entropy_bound": 0.3}])
 @pytest.mark.parametrize("kind", [GibbsConfig, BeamConfig])
 def test_certain_positions_save_passes(kind, bound):
-    """Trace and `passes` tell how many; without a bound each pass fills one position."""
+    """`passes` agrees with the trace; without a bound, each pass fills one position."""
     counts = set()
     for seed in range(12):
         table = 2 * random_table(seed, HORIZON, ACTIONS)
@@ -121,8 +121,8 @@ def test_certain_positions_save_passes(kind, bound):
     assert len(counts) > 1
 
 
-def test_independent_positions_are_drawn_together_from_their_joint():
-    """The entropy bound allows for the dependence between actions; here there is none."""
+def test_independent_positions_are_drawn_from_their_joint_in_one_pass():
+    """The entropy bound limits dependence between actions; these actions are independent."""
     rows = np.random.default_rng(0).normal(size=(HORIZON, ACTIONS))
     table = (rows[0][:, None, None] + rows[1][:, None] + rows[2]).astype(np.float32)
     config = GibbsConfig(HORIZON, HORIZON, fill="confident", temperature=1.0, entropy_bound=9.0)
@@ -132,7 +132,7 @@ def test_independent_positions_are_drawn_together_from_their_joint():
     assert fit_p_value(counts, joint_probabilities(table).reshape(-1)) > 1e-3
 
 
-def test_a_strategy_that_ranks_nothing_still_fills_the_plan():
+def test_nan_and_infinite_ranks_still_fill_the_plan():
     for rank in (np.nan, -np.inf, np.inf):
         plan = plan_for(
             GibbsConfig(
@@ -143,10 +143,10 @@ def test_a_strategy_that_ranks_nothing_still_fills_the_plan():
         assert (plan.actions < ACTIONS).all() and plan.passes == HORIZON
 
 
-# What is kept.
+# Kept plans, cooling, and the number of passes.
 
 
-def test_the_best_plan_of_all_traces_is_kept():
+def test_keep_best_returns_the_best_plan_of_all_traces():
     table = random_table(3, HORIZON, ACTIONS)
     options = {"temperature": 1.5, "restarts": 2, "score": True, "score_trace": True}
     last = plan_for(GibbsConfig(HORIZON, 8, **options), params=table, chains=200)
@@ -157,7 +157,7 @@ def test_the_best_plan_of_all_traces_is_kept():
     assert_close(best.energy, energies, rtol=1e-4)
 
 
-def test_cooling_to_the_same_temperature_changes_nothing_and_to_zero_takes_the_best():
+def test_cooling_lowers_the_energy_unless_the_temperature_stays():
     table = random_table(0, HORIZON, ACTIONS)
     plain = plan_for(GibbsConfig(HORIZON, 9, temperature=0.7), params=table, chains=50)
     same = plan_for(GibbsConfig(HORIZON, 9, temperature=0.7, cool_to=0.7), params=table, chains=50)
@@ -188,7 +188,7 @@ def test_passes_count_every_conditional_and_every_total():
 # Judges and restarts.
 
 
-def test_halves_sum_the_conditionals_of_each_action_given_the_other_half():
+def test_judge_halves_sums_conditionals_given_the_other_half():
     horizon, actions = 4, 2
     energy = enumerable_energy(horizon, actions)
     table, tilt = random_table(2, horizon, actions), np.zeros((horizon, actions), np.float32)
@@ -209,7 +209,7 @@ def test_halves_sum_the_conditionals_of_each_action_given_the_other_half():
     assert len(found) > 3  # keys draw different halves
 
 
-def test_halves_forbid_what_the_energy_forbids():
+def test_judge_halves_forbids_actions_that_the_energy_forbids():
     forbidden = from_total(lambda params, context: None, None, 3)._replace(
         conditional=lambda params, memory, actions, positions: (
             jnp.full((positions.shape[0], 3), 1.0).at[:, 2].set(jnp.inf)
@@ -222,10 +222,10 @@ def test_halves_forbid_what_the_energy_forbids():
 
 
 def mislead():
-    """An energy that begins with a wrong action, unless the context is turned.
+    """Makes an energy that begins plans with a wrong action, unless the context is turned.
 
-    The context is the right plan: three different actions. The energy is sure that an empty plan
-    begins with 0. With another action in view it knows the right one.
+    The context is the right plan: three different actions. At position 0, the energy prefers
+    action 0 if all other positions are masked, else the right action.
     """
 
     def conditional(params, memory, actions, positions):
@@ -243,70 +243,70 @@ def mislead():
 
 
 def permute(key, context):
-    """Turns a context of three different numbers: other places, other names."""
+    """Turns a context of three different numbers: permutes its places and its names."""
     place_key, name_key = jax.random.split(key)
     places = jax.random.permutation(place_key, 3)
     names = jax.random.permutation(name_key, 3)
     return Turned(names[context[places]], places, jnp.tile(names, (3, 1)))
 
 
-TURNING = symmetric(mislead(), permute)
+TURNED = symmetric(mislead(), permute)
 
 
-def test_a_turned_energy_is_that_of_the_renamed_plan():
+def test_a_turned_energy_equals_the_energy_of_the_renamed_plan():
     context, inner = jnp.array([2, 0, 1]), mislead()
     rng = np.random.default_rng(0)
     for seed in range(5):
         key = jax.random.key(seed)
-        turned, memory = permute(key, context), TURNING.turn((), key, TURNING.encode((), context))
+        turned, memory = permute(key, context), TURNED.turn((), key, TURNED.encode((), context))
         places, names = np.asarray(turned.places), np.asarray(turned.names[0])
         plan = rng.integers(0, 4, 3)  # 3 is MASK
-        there = np.append(names, 3)[plan[places]]
-        expected = inner.conditional((), turned.context, jnp.asarray(there), jnp.arange(3))
-        found = TURNING.conditional((), memory, jnp.asarray(plan), jnp.arange(3))
-        for here, (position, action) in enumerate(itertools.product(range(3), repeat=2)):
+        renamed = np.append(names, 3)[plan[places]]
+        expected = inner.conditional((), turned.context, jnp.asarray(renamed), jnp.arange(3))
+        found = TURNED.conditional((), memory, jnp.asarray(plan), jnp.arange(3))
+        for index, (position, action) in enumerate(itertools.product(range(3), repeat=2)):
             other = expected[np.flatnonzero(places == position)[0], names[action]]
-            assert found[here // 3, action] == other
+            assert found[index // 3, action] == other
         complete = jnp.asarray(rng.integers(0, 3, 3))
         expected = inner.total((), turned.context, jnp.asarray(names)[complete[places]])
-        assert_close(TURNING.total((), memory, complete), expected, rtol=1e-6)
+        assert_close(TURNED.total((), memory, complete), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("enough", [None, 0.5])
 @pytest.mark.parametrize("judge", ["energy", "halves"])
-def test_restarts_see_the_context_turned(judge, enough):
-    context = jnp.array([2, 0, 1])  # untouched, the energy writes 0 at position 0
+def test_restarts_turn_the_context(judge, enough):
+    context = jnp.array([2, 0, 1])  # without turns, the energy chooses 0 at position 0
     options = {"fill": "confident", "judge": judge, "score": True}
     alone = GibbsConfig(3, 3, **options)
-    assert plan_for(alone, TURNING, context=context).actions[0] == 0
+    assert plan_for(alone, TURNED, context=context).actions[0] == 0
     many = GibbsConfig(3, 3, restarts=24, enough=enough, **options)
     unturned = plan_for(many, mislead(), context=context)
     assert unturned.actions[0] == 0
-    plan = plan_for(many, TURNING, context=context)
+    plan = plan_for(many, TURNED, context=context)
     assert_equal(plan.actions, context)
-    # The energy is that of the plan where nothing is turned.
+    # The reported energy is the energy in the original context.
     assert_close(plan.energy, mislead().total((), context, jnp.asarray(plan.actions)), rtol=1e-6)
 
 
-def test_a_symmetry_of_other_plans_is_refused():
-    longer = TURNING.turn((), jax.random.key(0), TURNING.encode((), jnp.array([2, 0, 1])))
+def test_a_symmetry_that_does_not_fit_the_plan_raises_an_error():
+    form = TURNED.turn((), jax.random.key(0), TURNED.encode((), jnp.array([2, 0, 1])))
     with pytest.raises(UserError, match="a plan of 4 actions, and a symmetry of plans of 3"):
-        TURNING.conditional((), longer, jnp.zeros(4, int), jnp.arange(4))
+        TURNED.conditional((), form, jnp.zeros(4, int), jnp.arange(4))
     wrong = symmetric(mislead(), lambda key, context: context)
     with pytest.raises(UserError, match="Turned"):
         wrong.turn((), jax.random.key(0), wrong.encode((), jnp.array([2, 0, 1])))
 
 
-def test_the_parts_of_an_energy_are_turned_together():
+def test_composed_and_constrained_energies_turn_their_parts():
     context = jnp.array([2, 0, 1])
-    both = compose([TURNING, mislead()], [1.0, 0.5])
+    both = compose([TURNED, mislead()], [1.0, 0.5])
     bound = constrain(both, lambda context, plan: jnp.where(plan[0] == 1, 1.0, 0.0))
     key = jax.random.key(3)
     memory, _ = bound.turn(((), ()), key, bound.encode(((), ()), context))
     assert memory[1] is not None and memory[0].places is not None
-    expected = TURNING.turn((), key, TURNING.encode((), context))
+    expected = TURNED.turn((), key, TURNED.encode((), context))
     assert_equal(memory[0].places, expected.places)
-    assert_equal(memory[1], context)  # the other part knows no symmetry
+    assert_equal(memory[1], context)  # the other part has no symmetry
 
 
 def test_restarts_stop_when_a_plan_is_good_enough():
@@ -345,7 +345,7 @@ def test_wide_beams_find_the_mode_in_any_order(fill, judge):
         assert_close(plan.energy, -np.log(joint.max()), rtol=1e-4)
 
 
-def test_halves_choose_among_beams_of_all_plans():
+def test_judge_halves_chooses_among_beams_of_all_plans():
     table, key = random_table(4, HORIZON, ACTIONS), jax.random.key(0)
     memory = ENUMERABLE.encode(table, NO_TILT)
     judge_key = jax.random.fold_in(key, 2)
@@ -354,15 +354,15 @@ def test_halves_choose_among_beams_of_all_plans():
     assert_equal(plan.actions, PLANS[np.argmin(scores)])
 
 
-def test_the_total_energy_chooses_another_beam_than_the_sum():
-    """Of a pseudo-likelihood whose conditionals are not those of one joint."""
+def test_judges_energy_and_sum_choose_different_beams():
+    """The conditionals of this pseudo-likelihood belong to no joint distribution."""
 
     def conditional(params, memory, actions, positions):
-        first = jnp.array([0.0, 0.1, 5.0])  # the first choice is nearly free,
+        first = jnp.array([0.0, 0.1, 5.0])  # action 0 costs least at first
         second = jnp.where(actions[0] == 0, 2.0, 2.1) + jnp.zeros(3)
         return jnp.where(positions[:, None] == 0, first, second)
 
-    def total(params, memory, actions):  # and the total knows that it was wrong
+    def total(params, memory, actions):  # action 0 has the higher total
         return jnp.where(actions[0] == 0, 9.0, 1.0)
 
     energy = Energy(lambda params, context: None, conditional, total, 3)
@@ -374,8 +374,8 @@ def test_the_total_energy_chooses_another_beam_than_the_sum():
 # Dead ends.
 
 
-def test_a_dead_end_crowds_out_no_plan_that_satisfies():
-    """Only (1, 1) is allowed; from action 0 no way leads there, and it costs less."""
+def test_dead_ends_do_not_crowd_out_allowed_plans():
+    """Only (1, 1) is allowed. Action 0 costs less, but leads to a dead end."""
     energy = Energy(
         lambda params, context: None,
         lambda params, memory, actions, positions: (
@@ -396,29 +396,29 @@ def test_a_dead_end_crowds_out_no_plan_that_satisfies():
     partial=st.booleans(),
     fill=st.sampled_from(["sequential", "confident", "random"]),
 )
-def test_wide_beams_satisfy_where_a_plan_can(seed, allowed, partial, fill):
-    """They return the best of the allowed plans, whatever the others cost."""
+def test_wide_beams_find_the_best_allowed_plan(seed, allowed, partial, fill):
+    """Forbidden plans may cost less."""
     plans = PLANS[sorted(set(allowed))]
     context = np.zeros(len(PLANS), np.float32)
     context[sorted(set(allowed))] = 1
-    plan = DEAD_ENDS[partial, fill](2 * random_table(seed, HORIZON, ACTIONS), context)
+    plan = PLANNERS[partial, fill](2 * random_table(seed, HORIZON, ACTIONS), context)
     joint = joint_probabilities(2 * random_table(seed, HORIZON, ACTIONS))[tuple(plans.T)]
     assert plan.satisfied
     assert_equal(plan.actions, plans[joint.argmax()])
 
 
-def _forbid(context, plan):
-    """Infinite unless a plan can still become an allowed one."""
+def _penalise(context, plan):
+    """Returns 0 if a plan can still become an allowed plan, else +inf."""
     agrees = ((jnp.array(PLANS) == plan) | (plan == ACTIONS)).all(1)
     return jnp.where((agrees & (context > 0)).any(), 0.0, jnp.inf)
 
 
-def _plan_among(partial, fill):
+def _make_planner(partial, fill):
     energy = constrain(
         ENUMERABLE._replace(
             encode=lambda p, c: ENUMERABLE.encode(p, jnp.zeros((HORIZON, ACTIONS)))
         ),
-        _forbid,
+        _penalise,
         partial=partial,
     )
     planner = quick_jit(bind(energy, BeamConfig(HORIZON, ACTIONS ** (HORIZON - 1), fill=fill)))
@@ -427,8 +427,8 @@ def _plan_among(partial, fill):
     )
 
 
-DEAD_ENDS = {
-    (partial, fill): _plan_among(partial, fill)
+PLANNERS = {
+    (partial, fill): _make_planner(partial, fill)
     for partial in (False, True)
     for fill in ("sequential", "confident", "random")
 }
@@ -444,34 +444,34 @@ def _clash(params, weight, actions):
     return params * weight * (actions[0] == actions[1]) + 0.1 * actions[1]
 
 
-COLOURS = from_factors(lambda params, context: Factors(context, WEIGHTS), _clash, 3, degree=3)
+COLOURING = from_factors(lambda params, context: Factors(context, WEIGHTS), _clash, 3, degree=3)
 
 
-def _clash_of_all(params, memory, actions):
+def _sum_clashes(params, memory, actions):
     pairs = actions[memory]
     return (params * WEIGHTS * (pairs[:, 0] == pairs[:, 1]) + 0.1 * pairs[:, 1]).sum()
 
 
-def test_local_terms_have_the_energies_of_their_sum():
+def test_local_terms_have_the_same_energies_as_their_sum():
     def evaluate(energy, plan):
         memory = energy.encode(2.0, EDGES)
         energies = energy.conditional(2.0, memory, plan, jnp.arange(5))
         return energy.total(2.0, memory, plan), energies - energies[:, :1]
 
-    whole = from_total(lambda params, context: context, _clash_of_all, 3)
+    whole = from_total(lambda params, context: context, _sum_clashes, 3)
     plans = np.array(list(itertools.product(range(3), repeat=5)))
     for local, exact in zip(
         *(
             quick_jit(jax.vmap(functools.partial(evaluate, energy)))(plans)
-            for energy in (COLOURS, whole)
+            for energy in (COLOURING, whole)
         ),
         strict=True,
     ):
         assert_close(local, exact, atol=1e-5)
 
 
-def test_local_terms_may_judge_incomplete_plans():
-    """A pair with an open end costs nothing: so the conditional counts the chosen neighbours."""
+def test_local_terms_may_score_incomplete_plans():
+    """A pair with an open end costs 0, so the conditional counts only chosen neighbours."""
 
     def clash(params, weight, actions):
         both = (actions < 3).all()
@@ -482,16 +482,16 @@ def test_local_terms_may_judge_incomplete_plans():
     )
     memory, mask = energy.encode(None, None), mask_token(3)
     plan = jnp.array([mask, 1, 2, mask, mask])
-    ask = quick_jit(functools.partial(energy.conditional, None, memory, plan))
-    assert_close(ask(jnp.array([0]))[0], [0, 1.0, 1.5])
-    assert_close(ask(jnp.array([0, 1]))[0], [0, 0, 1.5])
+    query = quick_jit(functools.partial(energy.conditional, None, memory, plan))
+    assert_close(query(jnp.array([0]))[0], [0, 1.0, 1.5])
+    assert_close(query(jnp.array([0, 1]))[0], [0, 0, 1.5])
     assert np.isposinf(energy.total(None, memory, plan))
     found = plan_for(GibbsConfig(5, 5, fill="confident"), energy)
     pairs = found.actions[EDGES[:5]]
     assert (pairs[:, 0] != pairs[:, 1]).all()
 
 
-def test_more_terms_at_a_position_than_the_degree_are_an_error():
+def test_more_terms_at_a_position_than_the_degree_raise_an_error():
     few = from_factors(lambda params, context: Factors(EDGES, WEIGHTS), _clash, 3, degree=2)
     plan = plan_for(GibbsConfig(5, 10), few, params=1.0)
     assert not plan.valid
@@ -517,6 +517,6 @@ def test_more_terms_at_a_position_than_the_degree_are_an_error():
         (lambda: from_factors(None, None, 3, degree=0), "degree"),
     ],
 )
-def test_mistakes_are_refused(make, message):
+def test_invalid_settings_raise_an_error(make, message):
     with pytest.raises(ValueError, match=message):
         make()

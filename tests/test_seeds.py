@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from leapjax.data import seeds
 from leapjax.errors import UserError
 
-TESTS = seeds.VALIDATION_START  # so many test levels
+TESTS = seeds.VALIDATION_START  # number of test levels
 VALIDATIONS = seeds.TRAINING_START - seeds.VALIDATION_START
 training = st.integers(0, seeds.MAX_TRAINING_SEED - 1)
-few = st.integers(1, 5000)
+counts = st.integers(1, 5000)
 
 
 def training_range(seed: int) -> range:
-    """What `training_seeds` runs over, by its first seed and a check that it counts up."""
+    """Returns the range of `training_seeds` from its first seed; checks that it counts up."""
     first, *more = itertools.islice(seeds.training_seeds(seed), 5)
     assert more == [*range(first + 1, first + 5)]
     return range(first, first + seeds.TRAINING_STRIDE)
@@ -24,8 +24,8 @@ def overlap(a: range, b: range) -> bool:
     return max(a.start, b.start) < min(a.stop, b.stop)
 
 
-@given(st.integers(0, TESTS - 5000), st.integers(0, VALIDATIONS - 5000), few, training, training)
-def test_no_level_seed_serves_two_purposes(test_first, validation_first, count, one, other):
+@given(st.integers(0, TESTS - 5000), st.integers(0, VALIDATIONS - 5000), counts, training, training)
+def test_seeds_of_all_purposes_are_disjoint(test_first, validation_first, count, one, other):
     test = seeds.test_seeds(test_first, count)
     assert [*test[:2]] == [test_first, test_first + 1][:count]
     ranges = [test, seeds.validation_seeds(validation_first, count), training_range(one)]
@@ -34,24 +34,24 @@ def test_no_level_seed_serves_two_purposes(test_first, validation_first, count, 
     assert not any(overlap(*pair) for pair in itertools.combinations(ranges, 2))
 
 
-def test_training_seeds_end_where_the_next_training_seeds_begin():
+def test_ranges_of_consecutive_training_seeds_are_adjacent():
     assert len(list(seeds.training_seeds(3))) == seeds.TRAINING_STRIDE
     assert training_range(3).stop == training_range(4).start
-    # NumPy's and JAX's 32 bit integers hold the last of all.
+    # The largest seed fits 32-bit integers of NumPy and JAX.
     assert training_range(seeds.MAX_TRAINING_SEED - 1).stop < 2**31
 
 
 @pytest.mark.parametrize(
     ("make", "limit"), [(seeds.test_seeds, TESTS), (seeds.validation_seeds, VALIDATIONS)]
 )
-def test_episodes_stay_in_their_range(make, limit):
+def test_seeds_outside_their_range_raise_an_error(make, limit):
     assert len(make(limit - 10, 10)) == 10
-    for first, count, says in [
+    for first, count, message in [
         (limit - 10, 11, "leave their range"), (0, limit + 1, "leave their range"),
         (limit, 1, r"the first \w+ seed must be"), (-1, 1, r"the first \w+ seed must be"),
         (0.0, 1, r"the first \w+ seed must be"), (0, 0, r"the number of \w+ episodes must be"),
     ]:  # fmt: skip
-        with pytest.raises(UserError, match=says):
+        with pytest.raises(UserError, match=message):
             make(first, count)
     for seed in (-1, seeds.MAX_TRAINING_SEED, 1.0, True):
         with pytest.raises(UserError, match="training seed"):
@@ -59,7 +59,7 @@ def test_episodes_stay_in_their_range(make, limit):
 
 
 @given(st.lists(st.integers(0, 60), max_size=8), st.integers(0, 40), st.integers(1, 20))
-def test_check_disjoint_refuses_exactly_what_is_shared(demonstrated, first, count):
+def test_check_disjoint_rejects_exactly_the_shared_seeds(demonstrated, first, count):
     episodes = range(first, first + count)
     shared = set(demonstrated) & set(episodes)
     if shared:
@@ -70,5 +70,5 @@ def test_check_disjoint_refuses_exactly_what_is_shared(demonstrated, first, coun
         seeds.check_disjoint(demonstrated, episodes)
 
 
-def test_seeds_of_64_bits_are_demonstrations_of_no_test_level():
+def test_check_disjoint_accepts_64_bit_seeds():
     seeds.check_disjoint([2**64 - 1, 2**32 + 5, -1], range(10))

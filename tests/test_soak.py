@@ -1,4 +1,4 @@
-"""Long work in one process: memory, compilation and open files stay what they were."""
+"""Long work in one process: memory, compilations and open files do not grow."""
 
 import gc
 import os
@@ -22,8 +22,8 @@ CYCLES = 300
 DOMAIN = BABYAI.make("GoToLocalS7N5", Settings(channels=4, rounds=1, sweeps=2, fields=2))
 
 
-class Watch:
-    """What a process holds, again and again; what it compiled in between."""
+class ResourceMonitor:
+    """Samples the open files and memory of the process, and counts compilations in between."""
 
     def __init__(self):
         self.files, self.memory, self.compiled, self._count = [], [], [], 0
@@ -32,7 +32,7 @@ class Watch:
     def _listen(self, name, seconds, **_):
         self._count += name == "/jax/core/compile/backend_compile_duration"
 
-    def look(self):
+    def sample(self):
         gc.collect()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         self.files.append(len(list(Path("/proc/self/fd").iterdir())))
@@ -42,7 +42,7 @@ class Watch:
 
 
 @only_long
-def test_train_plan_evaluate_over_and_over(tmp_path):
+def test_repeated_training_planning_and_evaluation_do_not_leak(tmp_path):
     model, learning = ModelConfig(layers=1, heads=2, width=16), TrainingConfig(steps=10, batch=4)
     mesh = sharding.make_mesh(learning.batch)
     agent = leap.make_agent(Setup(DOMAIN, 1, 4, model, learning, leap.Settings()), mesh)
@@ -53,16 +53,16 @@ def test_train_plan_evaluate_over_and_over(tmp_path):
     data = sharding.replicate(
         windows.concatenate(demonstrations, DOMAIN.augmentations.extras), mesh
     )
-    watch = Watch()
+    monitor = ResourceMonitor()
     for cycle in range(CYCLES):
         state, key = begin(cycle)
-        saved = Checkpoints(tmp_path / f"{cycle % 3}" / f"{cycle}")
+        checkpoints = Checkpoints(tmp_path / f"{cycle % 3}" / f"{cycle}")
         state = training.train(
             step, state, lambda done: data, key, 10, lambda done, now, means: None
         )
-        saved.save(state)
-        restored = saved.restore(state)
-        saved.close()
+        checkpoints.save(state)
+        restored = checkpoints.restore(state)
+        checkpoints.close()
         params = jax.tree.map(jnp.asarray, sharding.to_host(restored.params))
         episodes = rollouts.evaluate(
             DOMAIN.make_adapter, [100 * cycle + i for i in range(3)], plan, params,
@@ -70,12 +70,12 @@ def test_train_plan_evaluate_over_and_over(tmp_path):
         )  # fmt: skip
         assert len(episodes.successes) == 3
         results.record(tmp_path / "rows.jsonl", toy_row(hash=str(cycle % 7)))
-        watch.look()
-    # Episodes leave a batch one by one, so a chunk of another size may still be compiled; what
-    # that takes is no leak, so memory counts from where nothing is compiled any more.
+        monitor.sample()
+    # Episodes leave a batch one by one, so early cycles may still compile a chunk of another size.
+    # Compiled programs are no leak, so memory counts only after compilation has ended.
     settled = CYCLES // 4
-    assert sum(watch.compiled[settled:]) == 0
-    assert max(watch.files[1:]) <= watch.files[1] + 2
-    # Orbax keeps some 0.2 MiB of every manager that has saved and restored; ours is nothing.
-    assert watch.memory[-1] < watch.memory[settled] + 10 + 0.3 * (CYCLES - settled)
+    assert sum(monitor.compiled[settled:]) == 0
+    assert max(monitor.files[1:]) <= monitor.files[1] + 2
+    # Orbax keeps some 0.2 MiB of every manager that saved and restored; leapjax keeps no memory.
+    assert monitor.memory[-1] < monitor.memory[settled] + 10 + 0.3 * (CYCLES - settled)
     assert len(results.read(tmp_path / "rows.jsonl")) == min(CYCLES, 7)

@@ -42,8 +42,8 @@ def save(demonstrations: list[Demonstration], name: str = NAME, domain: Domain =
     storage.save(name, Collection(demonstrations, {}), domain, "for a test")
 
 
-def refused(name: str = NAME, domain: Domain = LEVEL) -> str:
-    """The one line with which a data set is refused."""
+def load_error(name: str = NAME, domain: Domain = LEVEL) -> str:
+    """Returns the error message of one line with which a data set fails to load."""
     with pytest.raises(UserError) as raised:
         storage.load(name, domain)
     message = str(raised.value)
@@ -67,7 +67,7 @@ def saved(local_demonstrations) -> list[Demonstration]:
     return local_demonstrations
 
 
-def test_what_is_saved_is_loaded_and_replaced(saved):
+def test_saved_demonstrations_are_loaded_and_replaced(saved):
     rng = np.random.default_rng(0)
     endings = [(True, False), (False, True), (True, True), (False, False)]
     changed = [
@@ -83,7 +83,7 @@ def test_what_is_saved_is_loaded_and_replaced(saved):
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved[3:])
 
 
-def test_minari_itself_can_read_it(saved):
+def test_minari_reads_saved_data_sets(saved):
     assert list(minari.list_local_datasets()) == [NAME]
     dataset = minari.load_dataset(NAME)
     assert dataset.total_episodes == len(saved)
@@ -98,7 +98,7 @@ def test_minari_itself_can_read_it(saved):
 
 
 def domain_of(blank) -> Domain:
-    """A world of one's own, whose observations look like `blank`."""
+    """Makes a domain whose observations have the structure of `blank`."""
     return toy.DOMAIN._replace(blank=blank)
 
 
@@ -107,7 +107,7 @@ FIELDS = {"place": np.zeros((2, 3), np.float32), "lamps": np.zeros(2, np.uint8)}
 NESTED = {"own": {"count": np.zeros((), np.int32)}, "picture": np.zeros((40, 40, 3), np.uint8)}
 
 
-def own_demonstration(blank) -> Demonstration:
+def make_demonstration(blank) -> Demonstration:
     rng = np.random.default_rng(0)
     states = jax.tree.map(lambda x: (100 * rng.random((4, *x.shape))).astype(x.dtype), blank)
     rewards = rng.normal(size=3).astype(np.float32)
@@ -116,65 +116,65 @@ def own_demonstration(blank) -> Demonstration:
 
 
 @pytest.mark.parametrize("blank", [ARRAY, FIELDS, NESTED], ids=["array", "fields", "nested"])
-def test_observations_of_any_world(blank):
-    demonstrations = [own_demonstration(blank)] * 2
+def test_observations_of_any_structure_are_saved(blank):
+    demonstrations = [make_demonstration(blank)] * 2
     save(demonstrations, domain=domain_of(blank))
     assert_same(storage.load(NAME, domain_of(blank)).demonstrations, demonstrations)
 
 
-def test_observations_of_another_world_are_refused(minari_folder):
-    def put(field, values):
+def test_observations_of_another_domain_raise_an_error(minari_folder):
+    def replace_values(field, values):
         with h5py.File(file_of(minari_folder), "r+") as file:
-            instead(field, lambda before: values, "episode_0")(file)
+            edit(field, lambda before: values, "episode_0")(file)
 
-    save([own_demonstration(ARRAY)], domain=domain_of(ARRAY))
-    assert "no observation 'place'" in refused(domain=domain_of(FIELDS))
-    assert "observations has shape (4, 4)" in refused(domain=domain_of(np.zeros(5, np.float32)))
-    assert "must be integers" in refused(domain=domain_of(np.zeros(4, np.int32)))
-    put("observations", np.full((4, 4), np.nan))
-    assert "not finite" in refused(domain=domain_of(ARRAY))
-    save([own_demonstration(FIELDS)], domain=domain_of(FIELDS))
-    assert "must be numbers" in refused(domain=domain_of(ARRAY))
-    put("observations/lamps", np.full((4, 2), 256))
-    assert "do not fit uint8" in refused(domain=domain_of(FIELDS))
+    save([make_demonstration(ARRAY)], domain=domain_of(ARRAY))
+    assert "no observation 'place'" in load_error(domain=domain_of(FIELDS))
+    assert "observations has shape (4, 4)" in load_error(domain=domain_of(np.zeros(5, np.float32)))
+    assert "must be integers" in load_error(domain=domain_of(np.zeros(4, np.int32)))
+    replace_values("observations", np.full((4, 4), np.nan))
+    assert "not finite" in load_error(domain=domain_of(ARRAY))
+    save([make_demonstration(FIELDS)], domain=domain_of(FIELDS))
+    assert "must be numbers" in load_error(domain=domain_of(ARRAY))
+    replace_values("observations/lamps", np.full((4, 2), 256))
+    assert "do not fit uint8" in load_error(domain=domain_of(FIELDS))
 
 
-def test_demonstrations_that_an_earlier_version_wrote_are_refused(saved):
+def test_data_sets_of_an_earlier_version_raise_an_error(saved):
     name = "leapjax/GoToLocalS7N5/bot-5-seed0-v1"
     assert storage.name_dataset(LEVEL, 5, 0) == name.replace("v1", "v2")
     save(saved, name)
-    assert "earlier version" in refused(name)
+    assert "earlier version" in load_error(name)
     save(saved, name.replace("v1", "v2"))
     assert_same(storage.load(name.replace("v1", "v2"), LEVEL).demonstrations, saved)
 
 
 class Killed(BaseException):
-    """What a program that dies in the middle is to its callers."""
+    """Simulates that the system kills the program."""
 
 
-def killed_save(patched, name, calls, demonstrations):
-    """A save that dies with that call of a method."""
-    method, made = getattr(patched, name), []
+def kill_save(patched, name, calls, demonstrations):
+    """Saves, and is killed in call number `calls` of a method."""
+    method, made_calls = getattr(patched, name), []
 
-    def die(*args, **kwargs):
-        made.append(args)
-        if len(made) == calls:
+    def raise_killed(*args, **kwargs):
+        made_calls.append(args)
+        if len(made_calls) == calls:
             raise Killed
         return method(*args, **kwargs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(patched, name, die)
+        patch.setattr(patched, name, raise_killed)
         with pytest.raises(Killed):
             save(demonstrations)
 
 
-@pytest.mark.parametrize("moment", [(MinariStorage, "update_metadata"), (Path, "rename")])
-def test_a_killed_save_leaves_nothing_under_the_name(moment, local_demonstrations, minari_folder):
-    killed_save(*moment, 1, local_demonstrations)
-    assert any(minari_folder.glob(f"{writing.SCRATCH}*"))  # what a killed program leaves behind
+@pytest.mark.parametrize("killed_method", [(MinariStorage, "update_metadata"), (Path, "rename")])
+def test_a_killed_save_creates_no_data_set(killed_method, local_demonstrations, minari_folder):
+    kill_save(*killed_method, 1, local_demonstrations)
+    assert any(minari_folder.glob(f"{writing.SCRATCH}*"))  # the unfinished data set
     assert not storage.has_dataset(NAME)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # Minari warns of what is no data set
+        warnings.simplefilter("error")  # Minari warns about incomplete data sets
         assert list(minari.list_local_datasets()) == []
         save(local_demonstrations)
         assert list(minari.list_local_datasets()) == [NAME]
@@ -182,24 +182,24 @@ def test_a_killed_save_leaves_nothing_under_the_name(moment, local_demonstration
     assert not any(minari_folder.glob(f"{writing.SCRATCH}*"))
 
 
-def test_a_killed_save_leaves_what_was_there(saved):
-    killed_save(MinariStorage, "update_metadata", 1, saved[:1])
+def test_a_killed_save_keeps_the_previous_data_set(saved):
+    kill_save(MinariStorage, "update_metadata", 1, saved[:1])
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
-    killed_save(Path, "rename", 2, saved[:1])  # between two names: the next save mends it
+    kill_save(Path, "rename", 2, saved[:1])  # between two renames; the next save repairs it
     assert not storage.has_dataset(NAME)
     save(saved[:1], "leapjax/other-v0")
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
-def test_a_data_set_does_not_take_the_place_of_a_folder_of_others(saved):
+def test_saving_does_not_replace_a_folder_of_data_sets(saved):
     parent = NAME.rpartition("/")[0]
     with pytest.raises(UserError, match=f"{parent!r} is a folder of data sets"):
         save(saved[:1], parent)
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
 
 
-def test_several_processes_make_the_same_data_set(local_demonstrations, minari_folder):
-    """Threads with one process id, as processes in containers have, on an empty folder."""
+def test_concurrent_saves_write_one_data_set(local_demonstrations, minari_folder):
+    """Threads share a process id, as processes in containers may; the folder is empty."""
     with futures.ThreadPoolExecutor(4) as pool:
         jobs = [pool.submit(save, local_demonstrations) for _ in range(4)]
         for job in jobs:
@@ -208,7 +208,7 @@ def test_several_processes_make_the_same_data_set(local_demonstrations, minari_f
     assert sorted(path.name for path in minari_folder.iterdir()) == [writing.LOCK, "leapjax"]
 
 
-def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
+def test_a_full_disk_raises_an_error(local_demonstrations, monkeypatch):
     monkeypatch.setattr(files, "SPARE", 2**60)
     with pytest.raises(UserError, match=r"\d+ MiB are free in .* make room"):
         save(local_demonstrations)
@@ -224,7 +224,7 @@ def test_a_disk_without_room_is_one_line(local_demonstrations, monkeypatch):
 
 
 @pytest.mark.parametrize("path", ["file", "", "file/sets"])
-def test_a_folder_of_data_sets_that_cannot_be(path, tmp_path, monkeypatch):
+def test_an_impossible_folder_of_data_sets_raises_an_error(path, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", path)
@@ -233,55 +233,55 @@ def test_a_folder_of_data_sets_that_cannot_be(path, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["leapjax/none-v0", "no such name!", "leapjax/GoToLocalS7N5"])
-def test_a_missing_data_set(saved, name):
-    assert "no Minari data set" in refused(name)
+def test_a_missing_data_set_raises_an_error(saved, name):
+    assert "no Minari data set" in load_error(name)
     assert storage.has_dataset(NAME) and not storage.has_dataset("a" * 300)
 
 
-def test_nobody_is_told_to_delete_data_of_their_own(minari_folder):
+def test_errors_suggest_deleting_only_data_that_the_library_made(minari_folder):
     ours, theirs = storage.name_dataset(LEVEL, 1, 0), "my/own-v0"
     for name in (ours, theirs):
         (minari_folder / name / "data").mkdir(parents=True)
-        assert "cannot be read" in refused(name)
-    assert refused(ours).endswith("delete it and it is made again, or restore it")
-    assert refused(theirs).endswith("): restore it")
+        assert "cannot be read" in load_error(name)
+    assert load_error(ours).endswith("delete it and it is made again, or restore it")
+    assert load_error(theirs).endswith("): restore it")
 
 
-def announced(folder):
-    """A change of what the metadata say."""
+def announce_episodes(folder):
+    """Changes the number of episodes in the metadata."""
     path = folder / "metadata.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "total_episodes": 10**12}))
 
 
-def cut_short(folder):
+def truncate_file(folder):
     path = folder / "main_data.hdf5"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
 
 
-def endless(folder):
+def replace_by_pipe(folder):
     (folder / "metadata.json").unlink()
     os.mkfifo(folder / "metadata.json")
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "reason"),
     [
-        (cut_short, "cannot be read"),
+        (truncate_file, "cannot be read"),
         (lambda folder: (folder / "metadata.json").write_text("[" * 100_000), "cannot be read"),
         (lambda folder: (folder / "metadata.json").unlink(), "cannot be read"),
         (lambda folder: (folder / "main_data.hdf5").unlink(), "cannot be read"),
-        (endless, "cannot be read"),
+        (replace_by_pipe, "cannot be read"),
         (shutil.rmtree, "no Minari data set"),
-        (announced, "1000000000000 episodes are announced, 5 are"),
+        (announce_episodes, "1000000000000 episodes are announced, 5 are"),
     ],
 )
-def test_damaged_files(saved, minari_folder, change, says):
+def test_damaged_files_raise_an_error(saved, minari_folder, change, reason):
     change(minari_folder / NAME / "data")
-    assert says in refused()
+    assert reason in load_error()
 
 
-def instead(field, change, episode="episode_2"):
-    """A change of one array of an episode."""
+def edit(field, change, episode="episode_2"):
+    """Makes a change of one array of an episode."""
 
     def replace(file):
         values = change(file[episode][field][()])
@@ -291,36 +291,36 @@ def instead(field, change, episode="episode_2"):
     return replace
 
 
-def first(field, value):
-    """A change of one number."""
+def set_first(field, value):
+    """Makes a change of the first number in an array of an episode."""
 
-    def write(file):
+    def set_number(file):
         values = file["episode_3"][field]
         values[(0,) * values.ndim] = value
 
-    return write
+    return set_number
 
 
-def in_infos(build):
-    """A change of what Minari reads beside the arrays that are needed."""
+def add_info(build):
+    """Makes a change of the infos, which Minari reads and leapjax does not need."""
     return lambda file: build(file["episode_0"].require_group("infos"))
 
 
-def diamonds(group):
-    """Each group is in the one before by two names: 2^40 ways lead to the last."""
+def add_diamonds(group):
+    """Adds a chain of groups with two names each, so that 2^40 paths lead to the last."""
     for _ in range(40):
         group["left"] = inner = group.file.create_group(None)
         group["right"] = inner
         group = inner
 
 
-def chain(group):
+def add_chain(group):
     for _ in range(500):
         group = group.create_group("x")
 
 
-def squeeze(group, name, shape):
-    """Half a gigabyte of zeros, in half a megabyte of a file."""
+def write_zeros(group, name, shape):
+    """Replaces an array by zeros: half a gigabyte in half a megabyte of the file."""
     del group[name]
     chunk = (2**22, *shape[1:])
     array = group.create_dataset(name, shape, "u1", chunks=chunk, compression="gzip")
@@ -329,61 +329,61 @@ def squeeze(group, name, shape):
         array.id.write_direct_chunk((start, *(0 for _ in shape[1:])), packed)
 
 
-def squeezed(name, shape):
-    return lambda file: squeeze(file["episode_0"], name, shape)
+def replace_by_zeros(name, shape):
+    return lambda file: write_zeros(file["episode_0"], name, shape)
 
 
 GOAL = "observations/goal"
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "reason"),
     [
         (lambda file: file.__delitem__("episode_2"), "cannot be read"),
         (lambda file: file.move("episode_1", "episode_7"), "episode_1 is not there"),
         (lambda file: file["episode_1"].__delitem__("rewards"), "rewards"),
-        (instead(GOAL, lambda values: values[:-1]), "goal has shape"),
-        (instead(GOAL, lambda values: np.full(len(values), b"x")), "goal"),
-        (instead("actions", lambda values: values[:0]), "no actions"),
-        (instead("actions", lambda values: values.astype(np.int64) + 2**32), "actions run from"),
-        (instead("rewards", lambda values: np.append(values, 1.0)), "rewards have shape"),
-        (instead("rewards", lambda values: values + 1e300), "numbers that do not fit float32"),
-        (instead("terminations", np.ones_like), "ended with step 0, and it goes on to step"),
-        (instead("truncations", lambda marks: marks[-1]), "have shape ()"),
-        (instead("truncations", lambda marks: np.full(len(marks), 2)), "must be true or false"),
-        (instead("truncations", lambda marks: np.full(len(marks), b"yes")), "must be true or fal"),
-        (first("rewards", np.nan), "rewards: numbers that do not fit float32"),
-        (first("observations/grid", 11), "grid objects"),
-        (first("observations/pose", 7), "positions"),
-        (first("observations/goal", -2), "goals"),
-        (first("observations/instruction", 100), "instruction"),
-        (first("actions", 6), "actions"),
-        (in_infos(diamonds), "is an object that has another name too"),
-        (in_infos(lambda group: group.__setitem__("root", group.file["/"])), "another name"),
-        (in_infos(chain), "is a group in 17 groups"),
-        (in_infos(lambda group: group.__setitem__("kind", np.dtype("f4"))), "not an array of this"),
-        # Shapes are compared before anything is unpacked.
-        (squeezed("observations/instruction", (2**27, 4)), "has shape (134217728, 4)"),
-        (squeezed("actions", (2**29,)), "rewards have shape"),
+        (edit(GOAL, lambda values: values[:-1]), "goal has shape"),
+        (edit(GOAL, lambda values: np.full(len(values), b"x")), "goal"),
+        (edit("actions", lambda values: values[:0]), "no actions"),
+        (edit("actions", lambda values: values.astype(np.int64) + 2**32), "actions run from"),
+        (edit("rewards", lambda values: np.append(values, 1.0)), "rewards have shape"),
+        (edit("rewards", lambda values: values + 1e300), "numbers that do not fit float32"),
+        (edit("terminations", np.ones_like), "ended with step 0, and it goes on to step"),
+        (edit("truncations", lambda marks: marks[-1]), "have shape ()"),
+        (edit("truncations", lambda marks: np.full(len(marks), 2)), "must be true or false"),
+        (edit("truncations", lambda marks: np.full(len(marks), b"yes")), "must be true or fal"),
+        (set_first("rewards", np.nan), "rewards: numbers that do not fit float32"),
+        (set_first("observations/grid", 11), "grid objects"),
+        (set_first("observations/pose", 7), "positions"),
+        (set_first("observations/goal", -2), "goals"),
+        (set_first("observations/instruction", 100), "instruction"),
+        (set_first("actions", 6), "actions"),
+        (add_info(add_diamonds), "is an object that has another name too"),
+        (add_info(lambda group: group.__setitem__("root", group.file["/"])), "another name"),
+        (add_info(add_chain), "is a group in 17 groups"),
+        (add_info(lambda group: group.__setitem__("kind", np.dtype("f4"))), "not an array of this"),
+        # Shapes are checked before arrays are unpacked.
+        (replace_by_zeros("observations/instruction", (2**27, 4)), "has shape (134217728, 4)"),
+        (replace_by_zeros("actions", (2**29,)), "rewards have shape"),
     ],
 )
-def test_damaged_arrays(saved, minari_folder, monkeypatch, change, says):
+def test_damaged_arrays_raise_an_error(saved, minari_folder, monkeypatch, change, reason):
     with h5py.File(file_of(minari_folder), "r+") as file:
         change(file)
     assert file_of(minari_folder).stat().st_size < 2**21
-    if "has shape (134" in says:
+    if "has shape (134" in reason:
         monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
-    assert says in refused()
+    assert reason in load_error()
 
 
-def test_another_level_or_shape(saved, minari_folder):
-    with h5py.File(file_of(minari_folder), "r+") as file:  # numbers are marks, too
-        instead("terminations", lambda marks: marks.astype(np.float32))(file)
+def test_data_of_another_level_or_shape_raise_an_error(saved, minari_folder):
+    with h5py.File(file_of(minari_folder), "r+") as file:  # marks may be floats
+        edit("terminations", lambda marks: marks.astype(np.float32))(file)
     assert_same(storage.load(NAME, LEVEL).demonstrations, saved)
-    assert "level PickUpLoc needs" in refused(domain=BABYAI.make("PickUpLoc", Settings()))
+    assert "level PickUpLoc needs" in load_error(domain=BABYAI.make("PickUpLoc", Settings()))
     for side, words, field in ((8, WORDS, "grid"), (SIDE, 9, "instruction")):
         other = LEVEL._replace(blank=observations.blank(side, words))
-        assert f"{field} has shape" in refused(domain=other)
+        assert f"{field} has shape" in load_error(domain=other)
 
 
 @pytest.mark.parametrize(
@@ -393,7 +393,7 @@ def test_another_level_or_shape(saved, minari_folder):
         (str(2**70), storage.UNKNOWN_SEED), (None, storage.UNKNOWN_SEED),
     ],
 )  # fmt: skip
-def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stored, seed):
+def test_seeds_of_64_bits_are_kept_and_others_become_unknown(saved, minari_folder, stored, seed):
     with h5py.File(file_of(minari_folder), "r+") as file:
         attributes = file["episode_0"].attrs
         del attributes["seed"]
@@ -404,23 +404,23 @@ def test_seeds_of_64_bits_are_kept_and_others_unknown(saved, minari_folder, stor
     assert loaded.demonstrations[1].seed == saved[1].seed
 
 
-def test_what_does_not_fit_into_memory_is_not_unpacked(saved, minari_folder, monkeypatch):
+def test_arrays_larger_than_memory_are_not_unpacked(saved, minari_folder, monkeypatch):
     with h5py.File(file_of(minari_folder), "r+") as file:
-        squeeze_infos = file["episode_3"].require_group("infos")
-        squeeze_infos["x"] = 0
-        squeeze(squeeze_infos, "x", (2**22,))
+        infos = file["episode_3"].require_group("infos")
+        infos["x"] = 0
+        write_zeros(infos, "x", (2**22,))
     memory = {"SC_PAGE_SIZE": 2**10, "SC_PHYS_PAGES": 2**13}  # 8 MiB
     monkeypatch.setattr(os, "sysconf", memory.__getitem__)
-    assert_same(storage.load(NAME, LEVEL, most=3).demonstrations, saved[:3])  # it is not needed
+    assert_same(storage.load(NAME, LEVEL, most=3).demonstrations, saved[:3])  # skips episode 3
     monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
-    assert "at least 0 GiB of memory would be needed" in refused()
+    assert "at least 0 GiB of memory would be needed" in load_error()
 
 
 PICTURE = np.zeros((32, 40, 3), np.uint8)
 
 
-def other_data_set(space, states, *, jpeg=False) -> None:
-    """A data set of somebody else, of one episode that is cut off, and without its seed."""
+def write_with_minari(space, states, *, jpeg=False) -> None:
+    """Writes a data set with Minari alone: one truncated episode, without its seed."""
     steps = len(jax.tree.leaves(states)[0]) - 1
     episode = EpisodeBuffer(
         id=0, observations=list(states) if jpeg else states, actions=[0] * steps,
@@ -433,43 +433,43 @@ def other_data_set(space, states, *, jpeg=False) -> None:
     )  # fmt: skip
 
 
-def save_frames(frames):
-    """A data set of pictures that Minari keeps as JPEG."""
+def write_frames(frames):
+    """Writes a data set of pictures, which Minari stores as JPEG."""
     space = gym.spaces.Box(0, 255, PICTURE.shape, np.uint8)
-    other_data_set(space, frames.astype(np.uint8), jpeg=True)
+    write_with_minari(space, frames.astype(np.uint8), jpeg=True)
 
 
 NOISE = np.random.default_rng(0).integers(0, 256, (3, *PICTURE.shape))
 
 
-# In frames of one length, or of several.
+# JPEG frames of equal or different lengths.
 @pytest.mark.parametrize("frames", [np.zeros_like(NOISE), NOISE], ids=["alike", "different"])
-def test_pictures_that_minari_keeps_as_jpeg(frames):
-    save_frames(frames)
+def test_jpeg_pictures_are_loaded(frames):
+    write_frames(frames)
     (found,) = storage.load(NAME, domain_of(PICTURE)).demonstrations
     assert found.observations.shape == frames.shape
     assert found.observations.any() == frames.any()
     other = domain_of(np.zeros((32, 32, 3), np.uint8))
-    assert "observations has shape (3, 32, 40, 3), level Line needs (3, 32, 32, 3)" in refused(
+    assert "observations has shape (3, 32, 40, 3), level Line needs (3, 32, 32, 3)" in load_error(
         domain=other
     )
 
 
 @pytest.mark.parametrize("shape", [(3000, 3000, 3), (40, 32, 3)])
 def test_a_frame_of_another_size_is_not_unpacked(minari_folder, monkeypatch, shape):
-    save_frames(NOISE)
+    write_frames(NOISE)
     packed = io.BytesIO()
     Image.fromarray(np.zeros(shape, np.uint8)).save(packed, "JPEG")
     with h5py.File(file_of(minari_folder), "r+") as file:
         file["episode_0/observations"][1] = np.frombuffer(packed.getvalue(), np.uint8)
     monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
-    assert "a frame of shape" in refused(domain=domain_of(PICTURE))
+    assert "a frame of shape" in load_error(domain=domain_of(PICTURE))
 
 
-def test_a_users_data_set_without_seeds(local_demonstrations):
+def test_a_data_set_without_seeds_is_loaded(local_demonstrations):
     given = local_demonstrations[0]
     states, steps = given.observations._asdict(), len(given.actions)
-    other_data_set(storage.make_observation_space(LEVEL.blank), states)
+    write_with_minari(storage.make_observation_space(LEVEL.blank), states)
     expected = given._replace(
         actions=np.zeros(steps, np.int32), rewards=np.arange(steps, dtype=np.float32),
         terminated=False, truncated=True, seed=storage.UNKNOWN_SEED,
@@ -484,13 +484,13 @@ def test_minigrids_own_observations_need_a_seed(local_demonstrations):
     picture = gym.spaces.Box(0, 255, (7, 7, 3), np.uint8)
     words = gym.spaces.Text(20, charset="abcdefghijklmnopqrstuvwxyz ")
     space = gym.spaces.Dict(image=picture, direction=gym.spaces.Discrete(4), mission=words)
-    other_data_set(space, given)
-    assert "can be used, only 1 without the seed of their reset" in refused()
+    write_with_minari(space, given)
+    assert "can be used, only 1 without the seed of their reset" in load_error()
 
 
-def test_every_level_has_a_cache_of_its_own():
+def test_every_level_has_its_own_cache():
     known = [levels.find_level(name) for name in (*levels.LEVELS, *levels.registered_levels())]
     ids = [storage.name_dataset(LEVEL._replace(level=level.name), 500, 0) for level in known]
     ids += [storage.name_dataset(LEVEL, count, seed) for count in (5, 50) for seed in (0, 1)]
-    shared = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
-    assert not shared
+    duplicates = {ids[i] for i in range(len(ids)) if ids[i] in ids[:i]}
+    assert not duplicates

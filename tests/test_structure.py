@@ -1,4 +1,4 @@
-"""The README says what is true, and public names are documented."""
+"""Documents agree with the code and the rows, and public names are documented."""
 
 import importlib
 import inspect
@@ -30,12 +30,12 @@ def test_the_public_names_are_documented():
     listed = re.findall(r"^::: leapjax\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
     assert sorted(listed) == leapjax.__all__
     for name in leapjax.__all__:
-        said = inspect.getdoc(getattr(leapjax, name)) or ""
-        assert len(said) > 20 and not said.startswith(f"{name}("), name
+        doc = inspect.getdoc(getattr(leapjax, name)) or ""
+        assert len(doc) > 20 and not doc.startswith(f"{name}("), name
 
 
-def fields_of(kind):
-    """The names of the fields of a named tuple or a dataclass."""
+def list_fields(kind):
+    """Lists the fields of a named tuple or a dataclass."""
     return getattr(kind, "_fields", None) or getattr(kind, "__dataclass_fields__", {}).keys()
 
 
@@ -43,11 +43,11 @@ def test_fields_are_documented_in_the_docstring_of_their_class():
     public = [getattr(leapjax, name) for name in leapjax.__all__]
     public = [each for each in public if isinstance(each, type)]
     documented = [*public, types.Window, types.TransitionWindow, ModelConfig, TrainingConfig]
-    assert sum(map(len, map(fields_of, documented))) > 100
+    assert sum(map(len, map(list_fields, documented))) > 100
     for kind in documented:
-        said = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
-        for field in fields_of(kind):
-            assert re.search(rf"^    {field}: \S", said, re.MULTILINE), f"{kind.__name__}.{field}"
+        doc = inspect.getdoc(kind).partition("\nAttributes:\n")[2]
+        for field in list_fields(kind):
+            assert re.search(rf"^    {field}: \S", doc, re.MULTILINE), f"{kind.__name__}.{field}"
 
 
 def test_the_readme_snippets_run():
@@ -55,13 +55,13 @@ def test_the_readme_snippets_run():
     snippets = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
     names: dict = {}
     for snippet in snippets:
-        exec(compile(snippet, "README.md", "exec"), names)  # one session, as a reader has
+        exec(compile(snippet, "README.md", "exec"), names)  # a single session, as for a reader
     assert names["plans"].actions.shape == (7, 8) and bool(names["plans"].satisfied.all())
     assert not (names["plans"].actions == 0).any()
     assert names["episodes"].successes.mean() >= 0.9
 
 
-def test_the_tables_are_what_the_rows_say():
+def test_the_tables_match_the_rows():
     documents = report.make_documents(ROOT)
     for path, text in documents.items():
         assert path.read_text() == text, f"{path}: run python -m experiments.report"
@@ -73,7 +73,7 @@ def test_no_row_is_stale():
     assert not [(row["level"], row["preset"], row["hash"]) for row in stale]
 
 
-def test_the_readme_names_files_that_exist():
+def test_files_named_in_the_readme_exist():
     readme = (ROOT / "README.md").read_text()
     links = re.findall(r"\]\((?!http)([^)#]+)\)", readme)
     for name in links + re.findall(r"^(\S+/\S*)  +\S", readme, flags=re.MULTILINE):
@@ -88,7 +88,7 @@ PROGRAMS = [
 ]
 
 
-# One of each way to be a program; the others are in the long form.
+# A program of each kind; the long form runs all.
 USUAL = ("__main__", "publish", "report", "stars", "properties", "planning")
 
 
@@ -100,9 +100,7 @@ def exit_code(main, *arguments):
 
 
 @pytest.mark.parametrize("name", [n for n in PROGRAMS if LONG or n.split(".")[1] in USUAL])
-def test_every_program_says_how_it_is_used_and_refuses_what_it_does_not_know(
-    name, tmp_path, monkeypatch, capsys
-):
+def test_programs_print_usage_and_reject_unknown_arguments(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     main = importlib.import_module(name).main
     monkeypatch.setattr(jax_setup, "start", lambda *rest, **more: pytest.fail("began"))
@@ -113,8 +111,8 @@ def test_every_program_says_how_it_is_used_and_refuses_what_it_does_not_know(
     assert not list(tmp_path.iterdir())
 
 
-def test_neither_imports_nor_a_command_line_start_a_backend():
-    """Devices are chosen when a program starts: after its imports, and its command line."""
+def test_imports_and_command_lines_start_no_backend():
+    """A program chooses its devices when it starts, after its imports and its command line."""
     paths = [
         path
         for name in ("leapjax", "experiments", "benchmarks")
@@ -137,7 +135,7 @@ assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()
 
 
 @pytest.mark.parametrize("name", report.EXPERIMENTS)
-def test_the_episodes_that_are_kept_are_those_of_the_rows(name):
+def test_recorded_episodes_match_their_rows(name):
     path = ROOT / "results" / f"{name}.jsonl"
     rows = {row["hash"]: row for row in results.read(path)}
     for hashed, played in results.read_episodes(path).items():

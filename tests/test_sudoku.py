@@ -1,4 +1,4 @@
-"""Sudoku: boards have one solution, whatever is done to them; its rules as an energy."""
+"""Sudoku: boards keep a unique solution under transformations; the rules are an energy."""
 
 import copy
 import functools
@@ -42,21 +42,21 @@ LEVELS = pytest.mark.parametrize("level", [SMALL, LARGE], ids=str)
 
 @functools.cache
 def groups(side):
-    """The cells of each row, column and box: `[3 side, side]`."""
+    """Returns the cells of each row, column and box: `[3 side, side]`."""
     cells, box = np.arange(side**2).reshape(side, side), {4: 2, 9: 3}[side]
     boxes = cells.reshape(box, box, box, box).swapaxes(1, 2).reshape(side, side)
     return np.concatenate([cells, cells.T, boxes])
 
 
-def solved(digits, side):
-    """Whether every group holds every digit."""
+def is_solved(digits, side):
+    """Returns whether every group holds every digit."""
     return all(sorted(digits[group]) == list(range(1, side + 1)) for group in groups(side))
 
 
-def test_the_search_finds_every_board_and_no_other():
+def test_search_finds_exactly_the_solutions():
     every = boards.find_solutions(np.zeros(16, np.int32), most=1000)
-    assert len(every) == len({tuple(board) for board in every}) == 288  # as is known of 4 by 4
-    assert all(solved(board, 4) for board in every)
+    assert len(every) == len({tuple(board) for board in every}) == 288  # the known number
+    assert all(is_solved(board, 4) for board in every)
     assert boards.find_solutions(np.where(np.isin(np.arange(16), [0, 3]), 2, 0)) == []
     clues = "530070000600195000098000060800060003400803001700020006060000280000419005000080079"
     solution = "534678912672195348198342567859761423426853791713924856961537284287419635345286179"
@@ -65,10 +65,10 @@ def test_the_search_finds_every_board_and_no_other():
 
 
 @LEVELS
-def test_boards_have_so_many_clues_and_one_solution(level):
+def test_drawn_boards_have_the_clues_of_the_level_and_one_solution(level):
     drawn = [boards.draw(level, seed) for seed in range(10)]
     for seed, (clues, solution) in enumerate(drawn):
-        assert (clues > 0).sum() == level.fewest and solved(solution, level.side)
+        assert (clues > 0).sum() == level.fewest and is_solved(solution, level.side)
         np.testing.assert_array_equal(clues, np.where(clues > 0, solution, 0))
         (only,) = boards.find_solutions(clues)
         np.testing.assert_array_equal(only, solution)
@@ -76,7 +76,7 @@ def test_boards_have_so_many_clues_and_one_solution(level):
     assert len({tuple(clues) for clues, _ in drawn}) == 10
 
 
-def test_a_seed_has_the_board_that_recorded_rows_were_played_on():
+def test_seeds_draw_the_boards_of_recorded_rows():
     digest = hashlib.sha256()
     for level in (SMALL, LARGE, Level(9, 26, 26)):
         for seed in range(50):
@@ -85,7 +85,7 @@ def test_a_seed_has_the_board_that_recorded_rows_were_played_on():
     assert digest.hexdigest()[:16] == "f6ed6fdc74873327"
 
 
-def test_a_range_draws_the_boards_of_its_levels_equally_often():
+def test_range_draws_each_number_of_clues_equally_often():
     counts = []
     for seed in range(120):
         clues, solution = boards.draw(Level(4, 5, 8), seed)
@@ -98,7 +98,7 @@ def test_a_range_draws_the_boards_of_its_levels_equally_often():
 @pytest.mark.parametrize(
     ("name", "level"), [("Sudoku9x36", LARGE), ("Sudoku9x31-42", Level(9, 31, 42))]
 )
-def test_a_name_says_how_many_clues_a_board_has(name, level):
+def test_level_name_sets_the_number_of_clues(name, level):
     assert boards.find_level(name) == level
 
 
@@ -112,7 +112,7 @@ def test_a_name_says_how_many_clues_a_board_has(name, level):
         ("Sudoku4x8-6", "the fewest clues come first: Sudoku4x6-8"),
     ],
 )
-def test_levels_that_cannot_be_drawn_are_refused(name, message):
+def test_invalid_level_names_raise_an_error(name, message):
     with pytest.raises(UserError, match=message):
         boards.find_level(name)
 
@@ -122,17 +122,17 @@ def read_digits(line):
 
 
 SEVENTEEN = "800000043000206000000000000000100670090530000000000200002003000500000900000040000"
-# Published boards that take a search of cells alone seconds to minutes.
+# Published boards; a search of cells alone takes seconds to minutes.
 UNSOLVABLE = ".....5.8....6.1.43..........1.5........1.6...3.......553.....61........4........."
 BRUTE_FORCE = "..............3.85..1.2.......5.7.....4...1...9.......5......73..2.1........4...9"
 
 
 @pytest.mark.parametrize(("line", "count"), [(SEVENTEEN, 1), (UNSOLVABLE, 0), (BRUTE_FORCE, 1)])
-def test_sparse_and_unsolvable_boards_take_no_time(line, count):
+def test_sparse_and_unsolvable_boards_are_searched_quickly(line, count):
     begun = time.process_time()
     found = boards.find_solutions(read_digits(line))
     assert time.process_time() - begun < 5 and len(found) == count
-    assert all(solved(solution, 9) for solution in found)
+    assert all(is_solved(solution, 9) for solution in found)
 
 
 @pytest.mark.parametrize(
@@ -145,12 +145,12 @@ def test_sparse_and_unsolvable_boards_take_no_time(line, count):
         (np.full(81, -1), "run from -1 to -1, expected 0 to 9"),
     ],
 )
-def test_arrays_that_are_no_boards_are_refused(board, message):
+def test_invalid_boards_raise_an_error(board, message):
     with pytest.raises(UserError, match=message):
         boards.find_solutions(board)
 
 
-def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
+def test_solution_is_rewarded_and_a_wrong_digit_ends_the_episode():
     adapter = SudokuAdapter(4, functools.partial(boards.draw, SMALL))
     first = adapter.reset(1)
     assert (first.digits > 0).sum() == SMALL.fewest and first.cell == 0
@@ -166,8 +166,8 @@ def test_the_solution_is_rewarded_and_a_wrong_digit_is_the_last():
 
 
 @functools.cache
-def transformed(level):
-    """The window at a cell of a demonstration, with another board: compiled once."""
+def compile_transform(level):
+    """Compiles (key, index) -> a transformed window of demonstrations, once per level."""
     domain = make(f"Sudoku{level.side}x{level.fewest}", Settings())
     data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
     steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
@@ -177,13 +177,13 @@ def transformed(level):
 
 @LEVELS
 @pytest.mark.parametrize("cell", [0, 7])
-def test_a_transformed_window_is_that_of_another_board(level, cell):
+def test_transformed_window_shows_another_solvable_board(level, cell):
     seen, rest = set(), level.cells - cell
     for seed, episode in itertools.product(range(4), range(2)):
-        window = transformed(level)(jax.random.key(seed), episode * level.cells + cell)
+        window = compile_transform(level)(jax.random.key(seed), episode * level.cells + cell)
         window = jax.tree.map(np.asarray, window)
         board, past = window.context.observation, window.context.past
-        (solution,) = boards.find_solutions(board.digits)  # what is left has one solution
+        (solution,) = boards.find_solutions(board.digits)  # the open cells have one solution
         np.testing.assert_array_equal(window.actions[:rest] + 1, solution[cell:])
         assert (window.actions[rest:] == level.side).all()  # the end action
         assert board.cell == cell and (board.digits[:cell] > 0).all()
@@ -203,34 +203,34 @@ def test_a_transformed_window_is_that_of_another_board(level, cell):
     assert len(seen) == 8
 
 
-def at(cell, digits):
-    """The context of a board of 4 by 4."""
+def context_at(cell, digits):
+    """Returns the context of a 4 by 4 board before cell `cell`."""
     board = boards.Board(np.asarray(digits, np.int32), np.int32(cell))
     return blank_context(make("Sudoku4x6", Settings()), 0)._replace(observation=board)
 
 
-def test_a_position_of_a_plan_is_the_cell_that_it_fills():
+def test_plan_positions_encode_the_cells_they_fill():
     module, digits = BoardTokens(4, width=8, whole=False), np.arange(16) % 5
-    params = random_like(jax.eval_shape(module.init, jax.random.key(0), at(0, digits)))
+    params = random_like(jax.eval_shape(module.init, jax.random.key(0), context_at(0, digits)))
     encode = functools.partial(module.apply, params, horizon=16, method="encode_positions")
     places = jax.jit(
-        lambda cell: encode(at(0, digits)._replace(observation=boards.Board(digits, cell)))
+        lambda cell: encode(context_at(0, digits)._replace(observation=boards.Board(digits, cell)))
     )
-    tokens = module.apply(params, at(0, digits))
+    tokens = module.apply(params, context_at(0, digits))
     assert tokens.shape == (17, 8)
     whole = np.asarray(places(0))
-    np.testing.assert_array_equal(whole, tokens[:16])  # what the network sees of a cell
+    np.testing.assert_array_equal(whole, tokens[:16])  # as the network sees each cell
     assert len(np.unique(whole, axis=0)) == 16
-    for cell in (1, 7, 15, 16):  # later in an episode the plan begins there; 16: a solved board
+    for cell in (1, 7, 15, 16):  # the plan begins at the next cell; 16: a solved board
         np.testing.assert_array_equal(places(cell), np.roll(whole, -cell, axis=0))
 
 
 @pytest.mark.parametrize("cell", [0, 6])
-def test_each_head_sees_rows_columns_boxes_or_the_whole_plan(cell):
+def test_attention_heads_see_rows_columns_boxes_or_the_whole_plan(cell):
     config, everywhere = ModelConfig(layers=1, heads=4, width=16), np.arange(16)
     module = build_masked_model(config, Sizes(5, 0, 16, 16), BoardTokens(4, 16, whole=True))
     board = boards.Board(everywhere.astype(np.int32) % 5, np.int32(cell))
-    context = at(cell, board.digits)._replace(observation=board)
+    context = context_at(cell, board.digits)._replace(observation=board)
 
     def score(module, plan):
         memory = module.encode(context)
@@ -243,24 +243,24 @@ def test_each_head_sees_rows_columns_boxes_or_the_whole_plan(cell):
     scores = quick_jit(jax.vmap(functools.partial(module.apply, method=score), (None, 0)))
     cells = (cell + everywhere) % 16
     for head in range(4):
-        heard = copy.deepcopy(params)
-        value = heard["params"]["transformer"]["blocks_0"]["value"]
+        one_head = copy.deepcopy(params)
+        value = one_head["params"]["transformer"]["blocks_0"]["value"]
         for leaf in value.values():
-            leaf[..., everywhere // 4 != head] = 0  # no other head says anything
-        seen = scores(heard, plans)
+            leaf[..., everywhere // 4 != head] = 0  # silences the other heads
+        seen = scores(one_head, plans)
         differs = np.abs(seen[1:] - seen[0]).max(axis=-1) > 1e-6  # [changed, position]
         kind = groups(4).reshape(3, 4, 4)[head] if head < 3 else [everywhere]
         together = [[any({a, b} <= {*group} for group in kind) for a in cells] for b in cells]
         np.testing.assert_array_equal(differs, together)
 
 
-def test_too_few_heads_for_the_groups_are_refused():
+def test_too_few_heads_for_the_groups_raise_an_error():
     with pytest.raises(UserError, match="2 heads: .* use at least 4 heads"):
         make_attention_mask(ModelConfig(heads=2), 3, groups=jnp.ones((3, 3, 3), bool))
 
 
-def broken(digits, side):
-    """Pairs of cells with the same digit in one row, column or box."""
+def count_conflicts(digits, side):
+    """Counts pairs of cells with the same digit in a row, column or box."""
     pairs = {
         pair for group in groups(side) for pair in itertools.combinations(sorted(group.tolist()), 2)
     }
@@ -268,47 +268,49 @@ def broken(digits, side):
 
 
 @pytest.mark.parametrize(("cell", "horizon"), [(0, 16), (7, 16), (7, 5)])
-def test_the_energy_of_the_rules_counts_what_breaks_them(cell, horizon):
-    """On a board whose cells before `cell` are written already."""
+def test_energy_of_the_rules_counts_conflicts(cell, horizon):
+    """The cells before `cell` are written already."""
     energy, rng = rules(4, weight=3.0), np.random.default_rng(0)
     clues, solution = boards.draw(SMALL, 0)
     written = np.where(np.arange(16) < cell, solution, clues)
-    memory, end = energy.encode((), at(cell, written)), min(16, cell + horizon)
+    memory, end = energy.encode((), context_at(cell, written)), min(16, cell + horizon)
     clue, empty = (
         cell + np.flatnonzero(found) for found in (written[cell:end], written[cell:end] == 0)
     )
 
-    def plan_of(digits):
-        """What writes a board; 1 after its end."""
+    def make_plan(digits):
+        """Returns the plan that writes a board; it continues with 1 after the board's end."""
         return jnp.asarray(np.append(digits, np.ones(16))[cell : cell + horizon] - 1, int)
 
-    assert float(energy.total((), memory, plan_of(solution))) == 0
+    assert float(energy.total((), memory, make_plan(solution))) == 0
     for _ in range(10):
         board = np.where(written > 0, written, rng.integers(1, 5, 16))
         board[end:] = written[end:]
-        total = float(energy.total((), memory, plan_of(board)))
-        assert total == pytest.approx(3.0 * broken(board, 4))
+        total = float(energy.total((), memory, make_plan(board)))
+        assert total == pytest.approx(3.0 * count_conflicts(board, 4))
         # A conditional is the total with each digit in turn, up to a constant.
         where = int(rng.choice(empty))
-        for others, plan in ((board, plan_of(board)), (written, jnp.full(horizon, 5))):  # MASK
+        for others, plan in ((board, make_plan(board)), (written, jnp.full(horizon, 5))):  # MASK
             tried = [np.where(np.arange(16) == where, digit, others) for digit in range(1, 5)]
-            totals = np.array([3.0 * broken(each, 4) for each in tried])
+            totals = np.array([3.0 * count_conflicts(each, 4) for each in tried])
             found = energy.conditional((), memory, plan, jnp.array([where - cell]))[0]
             np.testing.assert_allclose(found[:4] - found[0], totals - totals[0], rtol=1e-5)
             assert np.isinf(found[4])  # the end action
     changed = np.where(np.arange(16) == clue[0], solution % 4 + 1, solution)
-    assert np.isinf(energy.total((), memory, plan_of(changed)))
+    assert np.isinf(energy.total((), memory, make_plan(changed)))
     after = jnp.arange(end - cell, horizon)  # positions beyond the board
-    for row in np.asarray(energy.conditional((), memory, plan_of(solution), after)):
+    for row in np.asarray(energy.conditional((), memory, make_plan(solution), after)):
         np.testing.assert_array_equal(row, [0.0] * 4 + [np.inf])
 
 
-def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
+def test_rules_alone_solve_boards_by_confident_filling_or_by_sampling():
     clues, solution = map(np.stack, zip(*(boards.draw(SMALL, s) for s in range(40)), strict=True))
-    contexts = jax.tree.map(lambda *leaves: np.stack(leaves), *(at(0, digits) for digits in clues))
+    contexts = jax.tree.map(
+        lambda *leaves: np.stack(leaves), *(context_at(0, digits) for digits in clues)
+    )
     keys = jax.random.split(jax.random.key(0), 40)
 
-    def share(energy, params, config):
+    def measure_success(energy, params, config):
         plan = compile_planner(energy, config, chunk_sizes=(40,))(params, keys, contexts)
         np.testing.assert_array_equal(np.where(clues > 0, plan.actions + 1, 0), clues)
         return (plan.actions + 1 == solution).all(axis=1).mean()
@@ -317,17 +319,17 @@ def test_rules_alone_solve_boards_by_what_is_certain_or_by_sampling():
     left_to_right = GibbsConfig(16, iterations=16, fill="sequential")
     refined = GibbsConfig(16, iterations=160, temperature=1.0, restarts=10)
     energy = rules(4)
-    assert share(energy, (), left_to_right) < share(energy, (), certain)
-    assert share(energy, (), certain) > 0.9 and share(energy, (), refined) > 0.9
+    assert measure_success(energy, (), left_to_right) < measure_success(energy, (), certain)
+    assert measure_success(energy, (), certain) > 0.9 and measure_success(energy, (), refined) > 0.9
     both = compose([energy, energy], [0.5, 0.5])
-    assert share(both, ((), ()), certain) == share(energy, (), certain)
+    assert measure_success(both, ((), ()), certain) == measure_success(energy, (), certain)
 
 
-def test_a_turned_board_has_the_same_solutions_under_other_names():
+def test_turned_board_has_the_renamed_solution_and_the_same_energies():
     turn = functools.partial(boards.turn, side=4)
     energy = symmetric(rules(4), functools.partial(turn, horizon=18))  # two actions after the end
     clues, solution = boards.draw(SMALL, 1)
-    context, seen, rng = at(0, clues), set(), np.random.default_rng(0)
+    context, seen, rng = context_at(0, clues), set(), np.random.default_rng(0)
     plan = np.append(solution - 1, [4, 4])
     memory = energy.encode((), context)
     where, empty = jnp.arange(16), np.flatnonzero(clues == 0)
@@ -339,7 +341,7 @@ def test_a_turned_board_has_the_same_solutions_under_other_names():
             found - 1, turned.names[turned.places, plan[turned.places]][:16]
         )
         seen.add(tuple(turned.context.observation.digits))
-        # The rules know no rows by number: they do not change when the board is turned.
+        # The rules treat all rows alike, so turning the board does not change them.
         tried = np.where(rng.random(18) < 0.4, 5, np.append(rng.integers(0, 4, 16), [0, 0]))  # MASK
         for tokens in (plan, tried):
             before, after = (
@@ -351,9 +353,9 @@ def test_a_turned_board_has_the_same_solutions_under_other_names():
 
 
 @pytest.mark.parametrize(("cell", "horizon"), [(3, 16), (0, 8)])
-def test_plans_of_a_part_of_a_board_are_not_turned(cell, horizon):
+def test_plans_of_a_part_of_a_board_stay_unturned(cell, horizon):
     clues, solution = boards.draw(SMALL, 1)
-    context = at(cell, np.where(np.arange(16) < cell, solution, clues))
+    context = context_at(cell, np.where(np.arange(16) < cell, solution, clues))
     turned = boards.turn(jax.random.key(0), context, side=4, horizon=horizon)
     jax.tree.map(np.testing.assert_array_equal, turned.context, context)
     np.testing.assert_array_equal(turned.places, np.arange(horizon))
@@ -367,7 +369,7 @@ def write_boards(folder, *lines):
 
 
 def make_lines(count):
-    """Boards of 4 by 4 cells, as lines of text."""
+    """Returns 4 by 4 boards as lines of text."""
     return ["".join(map(str, boards.draw(SMALL, seed)[0])) for seed in range(count)]
 
 
@@ -383,7 +385,7 @@ def test_held_out_episodes_play_the_boards_of_a_file_in_order(tmp_path):
         np.testing.assert_array_equal(adapter.solution, solution - 1)
     drawn = domain.demonstrations.collect(5, 0, lambda done: None).demonstrations
     counts = [(demonstration.observations.digits[0] > 0).sum() for demonstration in drawn]
-    assert min(counts) >= 8  # training draws the level's boards
+    assert min(counts) >= 8  # training draws boards of the level
 
 
 @pytest.mark.parametrize(
@@ -395,7 +397,7 @@ def test_held_out_episodes_play_the_boards_of_a_file_in_order(tmp_path):
         ("." * 16, "line 4: the board has several solutions, expected exactly one; correct the"),
     ],
 )
-def test_a_wrong_line_of_a_file_is_named(line, message, tmp_path, capsys):
+def test_error_names_the_invalid_line_of_a_board_file(line, message, tmp_path, capsys):
     path = write_boards(tmp_path, *make_lines(1), line)
     options = f"--level Sudoku4x6 --boards {path} --episodes".split()
     assert sudoku.main([*options, "2"]) == 2
@@ -406,28 +408,22 @@ def test_a_wrong_line_of_a_file_is_named(line, message, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--episodes", "4"],
-            "boards for 3 of the 4 episodes: play at most 3",
-        ),
+        (["--episodes", "4"], "boards for 3 of the 4 episodes: play at most 3"),
         (["--test-seed", "10000002", "--episodes", "2"], "has boards for 1 of the 2 episodes"),
         (["--test-seed", "0", "--episodes", "2"], "has no level of seed 0 (--test-seed"),
-        (
-            ["--validation", "--episodes", "2"],
-            "test levels of the seeds from 10000000 on",
-        ),
+        (["--validation", "--episodes", "2"], "test levels of the seeds from 10000000 on"),
         (["--boards", "missing.txt"], "cannot read missing.txt"),
         (["--boards", os.devnull], "cannot read /dev/null: not a file"),
     ],
 )
-def test_episodes_that_a_file_does_not_have_are_refused(options, message, tmp_path, capsys):
+def test_invalid_episodes_or_board_files_are_one_error_line(options, message, tmp_path, capsys):
     path = write_boards(tmp_path, *make_lines(3))
     assert sudoku.main(["--level", "Sudoku4x6", "--boards", str(path), *options]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
 
 
-def test_a_row_is_named_by_the_contents_of_a_file_and_a_network_is_not(tmp_path):
+def test_contents_of_a_board_file_identify_rows_but_not_networks(tmp_path):
     folders = [tmp_path / name for name in "abc"]
     for folder, count in zip(folders, (3, 3, 2), strict=True):
         folder.mkdir()
@@ -439,13 +435,13 @@ def test_a_row_is_named_by_the_contents_of_a_file_and_a_network_is_not(tmp_path)
     )
     names = [hash_config(config, 0) for config in (plain, *configs)]
     assert names[1] == names[2] and len(set(names)) == 3
-    said = list_settings(configs[0], 0)["domain_settings"]["boards"]
-    assert said == make_domain(configs[0]).held_out.name and said.startswith("hard.txt ")
+    setting = list_settings(configs[0], 0)["domain_settings"]["boards"]
+    assert setting == make_domain(configs[0]).held_out.name and setting.startswith("hard.txt ")
     specified = [specify(config, 0, make_domain(config)) for config in (plain, *configs)]
     assert len(set(map(describe_identity, specified))) == 1
 
 
-def test_data_that_solve_no_board_are_refused():
+def test_data_that_solve_no_board_raise_an_error():
     source = make("Sudoku4x6", Settings()).demonstrations
     states = source.collect(1, 0, lambda done: None).demonstrations[0].observations
     source.check(states, "here")
@@ -459,7 +455,7 @@ def test_data_that_solve_no_board_are_refused():
 
 
 @only_long
-def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypatch, quick_begin):
+def test_program_trains_and_plans_with_and_without_rules(tmp_path, monkeypatch, quick_begin):
     monkeypatch.chdir(tmp_path)
     (only,) = (search for search in searches.SEARCHES if search.name == "all at once")
     monkeypatch.setattr(searches, "SEARCHES", (only,))
@@ -480,7 +476,7 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
         ("rules", "N = 16, confident"), ("rules", "N = 1"),
         ("leap", "N = 16, confident, learned Sudoku4x8"),
     ]  # fmt: skip
-    # Eight clues leave little open. What two steps have learned is next to nothing.
+    # Eight clues leave few cells open. A network learns almost no Sudoku in two steps.
     assert rows[2]["successes"] == rows[3]["successes"] == 8 > rows[0]["successes"]
     assert rows[3]["train_steps"] == rows[3]["demos"] == rows[3]["params"] == 0
 
@@ -494,13 +490,13 @@ def test_the_program_trains_and_plans_with_rules_and_without(tmp_path, monkeypat
         (sudoku, ["--rules", "nan"], "--rules must be finite, got nan"),
     ],
 )
-def test_rules_that_cannot_be_had_are_one_line(program, arguments, message, capsys):
+def test_unavailable_rules_are_one_error_line(program, arguments, message, capsys):
     assert program.main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
 
 
-def test_a_mixture_adds_digits_of_the_solution_to_boards_of_17_givens(tmp_path, capsys):
+def test_mixture_adds_digits_of_the_solution_to_boards_of_17_givens(tmp_path, capsys):
     source, target = write_boards(tmp_path, *[SEVENTEEN] * 40), tmp_path / "mixture.txt"
     assert sudoku_mixture.main([str(source), str(target), "--count", "36"]) == 0
     made = np.array([read_digits(line) for line in target.read_text().split()])

@@ -42,13 +42,13 @@ rotate_all, reflect_all, rename_all = (
 
 
 def front(observation: Observation) -> np.ndarray:
-    """The cell that the agent faces: object, colour and state."""
+    """Returns the cell that the agent faces: object, colour and state."""
     x, y, direction = (int(v) for v in observation.pose)
     return observation.grid[x + FRONT[direction][0], y + FRONT[direction][1]]
 
 
 def wander(adapter: BabyAIAdapter, rng: np.random.Generator) -> int:
-    """An action of a random walk that likes to meet, carry, drop and open things."""
+    """Draws an action of a random walk that prefers to meet, carry, drop and open things."""
     faced = adapter.env.grid.get(*adapter.env.front_pos)
     if faced is not None and faced.type != "wall" and rng.random() < 0.7:
         return TOGGLE if faced.type == "door" else PICKUP
@@ -59,7 +59,7 @@ def wander(adapter: BabyAIAdapter, rng: np.random.Generator) -> int:
 
 @functools.cache
 def states(name: str) -> list[Observation]:
-    """States of random walks, and of the bot, who unlocks doors."""
+    """Samples states of random walks, and of the bot, which unlocks doors."""
     rng = np.random.default_rng(0)
     adapter = BabyAIAdapter(levels.find_level(name))
     found = []
@@ -71,7 +71,7 @@ def states(name: str) -> list[Observation]:
             if transition.terminated:
                 break
             found.append(transition.observation)
-    # What matters is rare, so it is drawn on its own.
+    # Interesting states are rare, so each kind is drawn separately.
     rare = (
         lambda o: front(o)[0] == DOOR,
         lambda o: front(o)[0] in (KEY, BALL, BOX) and not o.carried[0],
@@ -80,8 +80,8 @@ def states(name: str) -> list[Observation]:
         lambda o: True,
     )
     chosen = set()
-    for is_so in rare:
-        chosen.update(rng.permutation([i for i, o in enumerate(found) if is_so(o)])[:8].tolist())
+    for matches in rare:
+        chosen.update(rng.permutation([i for i, o in enumerate(found) if matches(o)])[:8].tolist())
     return [found[int(i)] for i in sorted(chosen)]
 
 
@@ -96,7 +96,7 @@ def unstack(tree: Observation) -> list[Observation]:
 
 @functools.cache
 def successors(name: str) -> list[list[Observation]]:
-    """For each of the six actions, the state after it from each of `states`."""
+    """Returns the successors of `states` for each of the six actions."""
     return [[stepped(state, action) for state in states(name)] for action in range(6)]
 
 
@@ -106,7 +106,7 @@ def assert_equivariant(
     actions: Sequence[int] = range(6),
     skip: Callable[[Observation, int], bool] = lambda state, action: False,
 ) -> None:
-    """Transforming then stepping is stepping then transforming, in all states at once."""
+    """Asserts that transforming then stepping equals stepping then transforming, in all states."""
     transformed = unstack(transform(stack(states(name))))
     for action in range(6):
         expected = unstack(transform(stack(successors(name)[action])))
@@ -115,7 +115,7 @@ def assert_equivariant(
                 assert_same_observation(stepped(state, actions[action]), after)
 
 
-def test_the_states_exercise_every_action():
+def test_states_exercise_every_action():
     changed, doors = Counter(), Counter()
     for name, action in itertools.product(LEVELS, range(6)):
         for before, after in zip(states(name), successors(name)[action], strict=True):
@@ -128,15 +128,15 @@ def test_the_states_exercise_every_action():
 
 
 @pytest.mark.parametrize("name", LEVELS)
-def test_turning_mirroring_and_renaming_commute_with_stepping(name):
+def test_rotating_reflecting_and_recolouring_commute_with_stepping(name):
     for quarters in (1, 2, 3):
         assert_equivariant(name, lambda batch, by=quarters: rotate_all(batch, by))
     swapped = symmetries.reflect_actions(jnp.arange(9)).tolist()
     assert swapped == [RIGHT, LEFT, 2, 3, 4, 5, 6, 7, 8]  # end, MASK and PAD included
     assert_equivariant(name, lambda batch: reflect_all(batch, MIRRORED), swapped)
-    renaming = recolouring([1, 2, 0, 5, 3, 4], {})
+    renaming = make_renaming([1, 2, 0, 5, 3, 4], {})
     assert_equivariant(name, lambda batch: rename_all(batch, renaming))
-    # Who turns by the own direction faces right.
+    # Rotating by the agent's direction makes the agent face right.
     batch = stack(states(name))
     turned = unstack(jax.jit(jax.vmap(symmetries.rotate))(batch, batch.pose[:, 2]))
     for before, after in zip(states(name), turned, strict=True):
@@ -145,7 +145,7 @@ def test_turning_mirroring_and_renaming_commute_with_stepping(name):
         assert front(after)[0] == front(before)[0]
 
 
-def recolouring(colours: Sequence[int], objects: dict[int, int]) -> Renaming:
+def make_renaming(colours: Sequence[int], objects: dict[int, int]) -> Renaming:
     kinds = np.arange(11)
     words = np.arange(vocabulary.SIZE)
     words[vocabulary.colour_words()] = vocabulary.colour_words()[list(colours)]
@@ -157,11 +157,11 @@ def recolouring(colours: Sequence[int], objects: dict[int, int]) -> Renaming:
 
 @pytest.mark.parametrize("name", LEVELS[:5])
 @pytest.mark.parametrize("order", [(BALL, BOX, KEY), (KEY, BOX, BALL)])
-def test_objects_are_alike_where_no_door_is_locked(name, order):
-    renaming = recolouring([5, 4, 3, 2, 1, 0], dict(zip((KEY, BALL, BOX), order, strict=True)))
+def test_renaming_objects_commutes_with_stepping_without_locked_doors(name, order):
+    renaming = make_renaming([5, 4, 3, 2, 1, 0], dict(zip((KEY, BALL, BOX), order, strict=True)))
 
     def opens_a_box(state: Observation, action: int) -> bool:
-        # A box that is toggled opens and is gone, which no other object does.
+        # Only a box vanishes when toggled: it opens.
         return action == TOGGLE and front(state)[0] in (KEY, BALL, BOX)
 
     assert_equivariant(name, lambda batch: rename_all(batch, renaming), skip=opens_a_box)
@@ -188,15 +188,15 @@ any_observation = st.builds(
 
 @settings(max_examples=40, deadline=None)
 @given(any_observation, st.integers(0, 3), st.integers(0, 7))
-def test_mirrors_and_turns_are_a_group(state, first, second):
+def test_rotations_and_reflections_form_a_group(state, first, second):
     assert_same_observation(rotate(rotate(state, first), second), rotate(state, first + second))
     assert_same_observation(rotate(state, 4), state)
     mirrored = jax.device_get(reflect(state, MIRRORED))
     assert_same_observation(reflect(mirrored, MIRRORED), state)
-    # Mirroring turns turns around.
+    # Reflecting reverses rotations.
     one = reflect(rotate(state, first), MIRRORED)
     assert_same_observation(one, rotate(mirrored, -first % 4))
-    # The goal moves as the cell that it is in.
+    # The goal moves with its cell.
     for moved in (jax.device_get(rotate(state, first)), mirrored):
         if state.goal[0] < 0:
             assert tuple(moved.goal) == (-1, -1)
@@ -209,25 +209,25 @@ def test_mirrors_and_turns_are_a_group(state, first, second):
 restate = jax.jit(lambda ids: symmetries.restate(ids, *vocabulary.joining_words()))
 
 
-def test_both_ways_to_tell_a_sequence_mean_the_same():
-    """MiniGrid's own judgement of both instructions is the same at every step."""
+def test_restated_sequences_keep_their_meaning():
+    """MiniGrid judges the original and the restated instruction alike at every step."""
     one, other = (BabyAIAdapter(levels.find_level("GoToSeqS5R2")) for _ in range(2))
     compared = 0
     for seed in range(40):
-        state, said = one.reset(seed), one.env.instrs
+        state, task = one.reset(seed), one.env.instrs
         other.reset(seed)
         restated = np.asarray(restate(state.instruction))
-        if not isinstance(said, BeforeInstr | AfterInstr):
+        if not isinstance(task, BeforeInstr | AfterInstr):
             np.testing.assert_array_equal(restated, state.instruction)
             continue
-        swapped = AfterInstr if isinstance(said, BeforeInstr) else BeforeInstr
+        swapped = AfterInstr if isinstance(task, BeforeInstr) else BeforeInstr
         other.env.instrs = swapped(other.env.instrs.instr_b, other.env.instrs.instr_a)
         other.env.instrs.reset_verifier(other.env)
         assert vocabulary.decode(restated) == other.env.instrs.surface(other.env)
         bot, transition = demonstrations.FullViewBot(one.env), None
         while transition is None or not (transition.terminated or transition.truncated):
             action = int(bot.replan())
-            transition, same = one.step(action), other.step(action)
-            assert (transition.terminated, transition.success) == (same.terminated, same.success)
+            transition, twin = one.step(action), other.step(action)
+            assert (transition.terminated, transition.success) == (twin.terminated, twin.success)
         compared += transition.success
     assert compared > 10

@@ -1,4 +1,4 @@
-"""One planner of many BabyAI levels: levels with members, and training on parts of the data."""
+"""One planner plays many BabyAI levels: mixtures of levels, and training on parts of the data."""
 
 import itertools
 import json
@@ -31,7 +31,7 @@ def two(monkeypatch, tmp_path):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
 
 
-def test_no_level_that_is_held_out_or_its_twin_is_learned():
+def test_training_levels_exclude_held_out_levels_and_their_debug_twins():
     members = set(levels.find_level("BabyAI").members)
     assert members | set(levels.HELD_OUT) == set(levels.registered_levels())
     for name in levels.HELD_OUT:
@@ -41,8 +41,8 @@ def test_no_level_that_is_held_out_or_its_twin_is_learned():
     assert set(levels.find_level("BabyAI10").members) < members and len(members) == 89
 
 
-def test_a_seed_plays_a_member_and_pads_it():
-    """Each episode is that of the member alone; the padding is of zeros."""
+def test_mixture_plays_and_pads_a_member_for_each_seed():
+    """Each episode equals the member's own episode, padded with zeros."""
     together = BabyAIAdapter(TWO)
     for seed in (5, 6, 8, 7):
         name = TWO.members[seed % 2]
@@ -58,22 +58,22 @@ def test_a_seed_plays_a_member_and_pads_it():
             padded, plain = (each.step(action).observation for each in (together, alone))
 
 
-def test_parts_have_one_shape_and_lose_only_padding():
+def test_splitting_by_side_removes_only_padding():
     found = demonstrations.collect(TWO, 12, 0).demonstrations
     small, large = demonstrations.split_by_side(found)
     assert [len(small), len(large)] == [6, 6]
     for part, side, words in ((small, 8, 5), (large, 9, 10)):
         for each in part:
             (whole,) = (d for d in found if d.seed == each.seed)
-            grid, said = each.observations.grid, each.observations.instruction
-            assert grid.shape[1:3] == (side, side) and said.shape[1] <= words
+            grid, text = each.observations.grid, each.observations.instruction
+            assert grid.shape[1:3] == (side, side) and text.shape[1] <= words
             assert grid.sum() == whole.observations.grid.sum()
-            assert said.sum() == whole.observations.instruction.sum()
-        windows.concatenate(part, mark_needed_cells)  # of one shape
+            assert text.sum() == whole.observations.instruction.sum()
+        windows.concatenate(part, mark_needed_cells)  # raises unless all have one shape
 
 
-def test_the_demonstrator_plays_each_level(two, capsys):
-    """Its steps are those of demonstrations; a level that it cannot solve is one, too."""
+def test_demonstrator_reports_the_results_of_each_level(two, capsys):
+    """It plays the steps of demonstrations; an unsolved level has a result, too."""
     played = [SMALL, "BabyAI-KeyInBox-v0"]
     assert demonstrator.main(["--level", *played, "--episodes", "3"]) == 0
     solved, failed = json.loads(Path("runs/demonstrator.json").read_text()).values()
@@ -88,7 +88,7 @@ def test_the_demonstrator_plays_each_level(two, capsys):
 
 
 @pytest.mark.parametrize("by", ["step", "episode"])
-def test_parts_take_turns_as_their_windows_are_many(by):
+def test_parts_take_turns_in_proportion_to_their_windows(by):
     lengths = {"step": [4, 12, 48], "episode": [1, 1, 1]}[by]
     counts = {"step": [1, 1, 1], "episode": [1, 3, 12]}[by]
     parts = [
@@ -101,10 +101,10 @@ def test_parts_take_turns_as_their_windows_are_many(by):
     for each, share in enumerate((1 / 16, 3 / 16, 12 / 16)):
         assert chosen.count(each) == pytest.approx(1600 * share, abs=3)
     gaps = [len(list(group)) for each, group in itertools.groupby(chosen) if each == 2]
-    assert max(gaps) <= 8  # at even distances
+    assert max(gaps) <= 8  # evenly spread
 
 
-def test_the_network_of_the_paper_reads_grids_of_one_side_only(two, capsys):
+def test_paper_network_rejects_levels_of_several_sizes(two, capsys):
     arguments = [*SINGLE, "--level", "Two", "--preset", "paper", "--demos", "2"]
     assert babyai.main(arguments) == 2
     assert "Two has no encoder for architecture 'paper'" in " ".join(
@@ -113,8 +113,8 @@ def test_the_network_of_the_paper_reads_grids_of_one_side_only(two, capsys):
 
 
 @only_long
-def test_a_planner_of_two_levels_plays_each(two):
-    """It resumes as it would have gone on, and has a row for each level."""
+def test_planner_of_two_levels_plays_each_level_and_a_third(two):
+    """Two equal runs have equal parameters; a run reports a row for each level."""
     arguments = [*TINY, "--level", "Two", "--demos", "12", "--steps", "6"]
     assert babyai.main([*arguments, "--runs", "whole"]) == 0
     rows = results.read(Path("whole/babyai.jsonl"))
@@ -124,7 +124,7 @@ def test_a_planner_of_two_levels_plays_each(two):
     same = load(folder).params, load(other).params
     jax.tree.map(np.testing.assert_array_equal, *same)
 
-    planner = load(folder, level="BabyAI-GoToLocalS6N3-v0")  # a third level, of another size
+    planner = load(folder, level="BabyAI-GoToLocalS6N3-v0")  # a third level of another size
     adapter = planner.domain.make_adapter()
     context = planner.specification.context
     history = rollouts.History(adapter.reset(0), context, adapter.num_actions, 0)

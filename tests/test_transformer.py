@@ -46,7 +46,7 @@ def gelu(x):
 
 
 def oracle(params, x, mask):
-    """Outputs at every token: token i attends to j if `mask[i, j]`, or `mask[head, i, j]`."""
+    """Computes all outputs; token i attends to j if `mask[i, j]` or `mask[head, i, j]`."""
     params, mask = params["params"], np.broadcast_to(mask, (HEADS, len(x), len(x)))
     x = x.astype(np.float64)
     size = WIDTH // HEADS
@@ -58,10 +58,10 @@ def oracle(params, x, mask):
         for head in range(HEADS):
             part = slice(head * size, (head + 1) * size)
             for i in range(len(x)):
-                seen = np.flatnonzero(mask[head, i])
-                scores = keys[seen, part] @ queries[i, part] / np.sqrt(size)
+                visible = np.flatnonzero(mask[head, i])
+                scores = keys[visible, part] @ queries[i, part] / np.sqrt(size)
                 weights = np.exp(scores - scores.max())
-                attended[i, part] = weights / weights.sum() @ values[seen, part]
+                attended[i, part] = weights / weights.sum() @ values[visible, part]
         x = x + linear(p["output"], attended)
         h = linear(p["expand"], norm(p["norm_perceptron"], x))
         x = x + linear(p["contract"], gelu(h))
@@ -69,41 +69,41 @@ def oracle(params, x, mask):
 
 
 def joint_mask(prefix_mask=True, mask=True):
-    """The prefix sees itself; the tokens see the prefix and each other: where they may."""
+    """Joins the mask of the prefix, which sees only itself, with the mask of the tokens."""
     joint = np.zeros((PREFIX + TOKENS, PREFIX + TOKENS), bool)
     joint[:PREFIX, :PREFIX] = prefix_mask
     joint[PREFIX:] = mask
     return joint
 
 
-def some_mask(rows, columns):
-    """Half of all pairs, and each token itself."""
+def random_mask(rows, columns):
+    """Draws a mask with about half of all pairs; each token sees itself."""
     own = np.eye(rows, columns, columns - rows, dtype=bool)
     return own | (np.random.default_rng(rows + columns).random((rows, columns)) < 0.4)
 
 
-AMONG_PREFIX, OF_TOKENS = some_mask(PREFIX, PREFIX), some_mask(TOKENS, PREFIX + TOKENS)
+PREFIX_MASK, TOKEN_MASK = random_mask(PREFIX, PREFIX), random_mask(TOKENS, PREFIX + TOKENS)
 CLOSE = {"rtol": 1e-4, "atol": 1e-4}
 JOINED = np.concatenate([FIXED, X])
 
 
 def test_attention_equals_the_oracle():
-    mask = some_mask(TOKENS, TOKENS)
-    of_heads = np.stack([mask.T, mask])
-    for given, seen in ((None, np.ones_like(mask)), (of_heads, of_heads), (mask, mask)):
-        expected = oracle(PARAMS, X, seen)
-        np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE, given), expected, **CLOSE)
-    for other in (mask.T, np.ones_like(mask)):  # rows look, columns are looked at
+    mask = random_mask(TOKENS, TOKENS)
+    head_masks = np.stack([mask.T, mask])
+    for argument, visible in ((None, np.ones_like(mask)), (head_masks, head_masks), (mask, mask)):
+        expected = oracle(PARAMS, X, visible)
+        np.testing.assert_allclose(run(PARAMS, X, EVERYWHERE, argument), expected, **CLOSE)
+    for other in (mask.T, np.ones_like(mask)):  # rows are queries, columns are keys
         assert np.abs(oracle(PARAMS, X, other) - expected).max() > 0.05
 
 
 def test_a_cached_prefix_equals_running_all_tokens_together():
-    for masks in ((), (AMONG_PREFIX, OF_TOKENS)):
+    for masks in ((), (PREFIX_MASK, TOKEN_MASK)):
         actual = run_with_prefix(PARAMS, FIXED, X, EVERYWHERE, *masks)
         expected = oracle(PARAMS, JOINED, joint_mask(*masks))[PREFIX:]
         np.testing.assert_allclose(actual, expected, **CLOSE)
-    # Each of the two masks matters.
-    for other in (joint_mask(mask=OF_TOKENS), joint_mask(AMONG_PREFIX)):
+    # Both masks matter.
+    for other in (joint_mask(mask=TOKEN_MASK), joint_mask(PREFIX_MASK)):
         assert np.abs(oracle(PARAMS, JOINED, other)[PREFIX:] - expected).max() > 0.05
 
 
@@ -114,11 +114,11 @@ def test_a_causal_mask_hides_later_tokens():
         np.testing.assert_array_equal(causal_mask(TOKENS, prefix), expected)
 
 
-def test_last_layer_at_queried_positions_is_the_full_output_there():
+def test_outputs_at_queried_positions_equal_the_full_outputs():
     queried = np.array([3, 3, 0])
 
     def outputs(queried):
-        return run_with_prefix(PARAMS, FIXED, X, queried, AMONG_PREFIX, OF_TOKENS)
+        return run_with_prefix(PARAMS, FIXED, X, queried, PREFIX_MASK, TOKEN_MASK)
 
     np.testing.assert_allclose(outputs(queried), outputs(EVERYWHERE)[queried], rtol=1e-5, atol=1e-5)
 

@@ -1,4 +1,4 @@
-"""Values that methods learn with the default settings of an environment are the exact ones."""
+"""With the default settings of an environment, methods learn exact values."""
 
 import functools
 import itertools
@@ -23,7 +23,7 @@ STATES, SLIP, DISCOUNT = 24, 0.2, 0.99
 
 
 class Corridor(gym.Env):
-    """Action 1 leads forward to the goal, but one step in five goes the other way."""
+    """Action 1 steps forward to the goal, but a fifth of the steps go the other way."""
 
     observation_space = gym.spaces.Discrete(STATES)
     action_space = gym.spaces.Discrete(2)
@@ -41,20 +41,20 @@ class Corridor(gym.Env):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def registered():
+def register_corridor():
     gym.register("SlipperyCorridor-v0", Corridor, max_episode_steps=150)
     yield
     del gym.registry["SlipperyCorridor-v0"]
 
 
 def walk(env, seed, rng):
-    """An episode that steps forward with a probability of 40 to 90%."""
+    """Records an episode of a policy that steps forward with a probability of 40 to 90%."""
     share = rng.uniform(0.4, 0.9)
     return record_episode(env, lambda seen: int(rng.random() < share), seed)
 
 
 def iterate_values(read_value):
-    """Exact Q-values [STATES, 2], given (Q-values) -> the values [STATES] of their states."""
+    """Computes exact Q-values [STATES, 2]; `read_value` maps Q-values to state values [STATES]."""
     q = np.zeros((STATES, 2))
     for _ in range(3000):
         value = DISCOUNT * read_value(q)
@@ -66,7 +66,7 @@ def iterate_values(read_value):
 
 
 def find_expectiles(q, actions, share):
-    """The expectile of each state's two Q-values, given the shares [STATES, 2] of actions."""
+    """Computes the expectile of each state's two Q-values, for shares [STATES, 2] of actions."""
     high = share * np.take_along_axis(actions, q.argmax(1)[:, None], 1)[:, 0]
     low = (1 - share) * np.take_along_axis(actions, q.argmin(1)[:, None], 1)[:, 0]
     return (high * q.max(1) + low * q.min(1)) / (high + low)
@@ -74,8 +74,8 @@ def find_expectiles(q, actions, share):
 
 @only_long
 @pytest.mark.parametrize("method", ["bcq", "iql", "qr_dqn", "rem"])
-def test_values_of_the_defaults_are_exact(method):
-    """And the best action is found in each state, of which no demonstration takes it always.
+def test_default_settings_learn_exact_values(method):
+    """Methods also find the best action in each state, which demonstrations do not always take.
 
     CQL is left out, because its conservative term raises the values of the data's actions. MOPO is
     left out, because its values do not converge in so few steps.
@@ -84,7 +84,7 @@ def test_values_of_the_defaults_are_exact(method):
     env, learned = domain.make_adapter().env, []
     data = [walk(env, seed, rng) for seed in range(500)]
     with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # of values that rewards do not allow
+        warnings.simplefilter("error", UserWarning)  # for values that rewards do not allow
         planner = leap.fit(
             data, domain, method, model=SMALL,
             progress=lambda _, means: learned.append(means["value"]),
@@ -114,8 +114,8 @@ def test_values_of_the_defaults_are_exact(method):
 
 @pytest.mark.parametrize("terminated", [True, False])
 @pytest.mark.parametrize("rewards", [[0.0, 0.0, 1.0], [1.0, 1.0, -3.0], [-1.0, -2.0, 20.0]])
-def test_rewards_allow_zero_and_returns_of_episodes_made_of_their_steps(rewards, terminated):
-    """What comes after eight steps changes a return by 48 times their discount at most."""
+def test_value_range_covers_zero_and_returns_of_recombined_steps(rewards, terminated):
+    """Steps after the eighth change a return by at most 48 times their discount."""
     discount = 0.5
     data = [Demonstration(np.zeros(4), np.zeros(3, np.int32), np.array(rewards), terminated,
                           not terminated, 0)]  # fmt: skip
@@ -131,7 +131,7 @@ def test_rewards_allow_zero_and_returns_of_episodes_made_of_their_steps(rewards,
     np.testing.assert_allclose(allowed, (min(0, *found), max(0, *found)), rtol=0, atol=48 * 0.5**8)
 
 
-def test_without_a_discount_only_an_end_bounds_what_rewards_allow():
+def test_without_a_discount_only_termination_bounds_the_value_range():
     episode = Demonstration(
         np.zeros(3), np.zeros(2, np.int32), np.array([0.0, 1.0]), True, False, 0
     )
@@ -141,8 +141,8 @@ def test_without_a_discount_only_an_end_bounds_what_rewards_allow():
 
 
 @pytest.mark.parametrize(("method", "value"), [("bcq", 1.2), ("iql", -0.2), ("bc", 1.2)])
-def test_values_that_rewards_do_not_allow_give_a_warning(method, value, monkeypatch):
-    """But a method that learns no values may report what it likes."""
+def test_values_outside_the_value_range_give_a_warning(method, value, monkeypatch):
+    """A method that learns no values, such as bc, gives no warning."""
 
     def train(step, state, choose_data, key, steps, report):
         for mean in (7.0, 1.05, value):  # only the last counts
@@ -155,7 +155,7 @@ def test_values_that_rewards_do_not_allow_give_a_warning(method, value, monkeypa
     episode = Demonstration(
         np.array([0, 1, 1]), np.int32([1, 1]), np.float32([0, 1]), True, False, 0
     )
-    with warnings.catch_warnings(record=True, action="always") as given:
+    with warnings.catch_warnings(record=True, action="always") as caught:
         leap.fit([episode], domain, method, model=SMALL)
-    found = [str(each.message) for each in given if "rewards allow 0 to 1" in str(each.message)]
+    found = [str(each.message) for each in caught if "rewards allow 0 to 1" in str(each.message)]
     assert len(found) == (method != "bc")

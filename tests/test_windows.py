@@ -14,12 +14,12 @@ from leapjax.domains.babyai.observations import Observation
 from leapjax.types import Context, Demonstration, Window
 
 SIDE, WORDS, DROP = 8, 3, 4
-END, PAD = 6, 8  # of a set of seven actions: MASK, 7, is between them
+END, PAD = 6, 8  # of seven actions; MASK, 7, lies between them
 LENGTHS = (1, 4, 2, 7)
 
 
-def toy_demonstration(rng: np.random.Generator, steps: int, episode: int) -> Demonstration:
-    """Random numbers; its pose says which episode and which step a state is of."""
+def make_demonstration(rng: np.random.Generator, steps: int, episode: int) -> Demonstration:
+    """Makes random states, whose pose holds the episode and the step."""
     n = steps + 1
     pose = np.stack([np.full(n, episode), np.arange(n), rng.integers(0, 4, n)], axis=1)
     return Demonstration(
@@ -31,19 +31,19 @@ def toy_demonstration(rng: np.random.Generator, steps: int, episode: int) -> Dem
             rng.integers(1, 30, (n, WORDS)).astype(np.int32),
         ),
         rng.integers(0, END, steps).astype(np.int32),
-        (rng.integers(-9, 10, steps) / 4).astype(np.float32),  # their sums are exact
+        (rng.integers(-9, 10, steps) / 4).astype(np.float32),  # sums of quarters are exact
         terminated=episode in (0, 2),
         truncated=episode in (1, 2),
         seed=episode,
     )
 
 
-def toy_demonstrations(seed: int = 0) -> list[Demonstration]:
+def make_demonstrations(seed: int = 0) -> list[Demonstration]:
     rng = np.random.default_rng(seed)
-    return [toy_demonstration(rng, steps, episode) for episode, steps in enumerate(LENGTHS)]
+    return [make_demonstration(rng, steps, episode) for episode, steps in enumerate(LENGTHS)]
 
 
-def laid_out(demonstrations: list[Demonstration]) -> Steps:
+def join_steps(demonstrations: list[Demonstration]) -> Steps:
     return windows.concatenate(demonstrations, extras=mark_needed_cells)
 
 
@@ -52,7 +52,7 @@ def on_device(steps: Steps) -> Steps:
 
 
 def slow_window(demonstration: Demonstration, start: int, context: int, horizon: int) -> Window:
-    """What a window is, one element at a time."""
+    """Builds a window one element at a time."""
     states, actions = demonstration.observations, demonstration.actions
     past, taken, given = [], [], []
     for step in range(start - context, start):
@@ -74,43 +74,43 @@ def slow_window(demonstration: Demonstration, start: int, context: int, horizon:
         np.array(planned, np.int32),
         np.ones(horizon, bool),
         np.float32(sum(demonstration.rewards[start:].tolist())),
-        slow_way(demonstration, start),
+        slow_free_cells(demonstration, start),
     )
 
 
-def slow_way(demonstration: Demonstration, start: int) -> np.ndarray:
-    """The cells that must stay free, one step at a time."""
-    way = np.zeros(demonstration.observations.grid.shape[1:3], bool)
+def slow_free_cells(demonstration: Demonstration, start: int) -> np.ndarray:
+    """Marks the cells that must stay free, one step at a time."""
+    free = np.zeros(demonstration.observations.grid.shape[1:3], bool)
     for step, (x, y, direction) in enumerate(demonstration.observations.pose.tolist()):
         if step < start:
             continue
-        way[x, y] = True
+        free[x, y] = True
         if step < len(demonstration.actions) and demonstration.actions[step] == DROP:
             dx, dy = ((1, 0), (0, 1), (-1, 0), (0, -1))[direction]
-            way[min(max(x + dx, 0), len(way) - 1), min(max(y + dy, 0), len(way) - 1)] = True
-    return way
+            free[min(max(x + dx, 0), len(free) - 1), min(max(y + dy, 0), len(free) - 1)] = True
+    return free
 
 
 def assert_same(actual, expected) -> None:
-    """The same arrays, of the same types."""
+    """Compares arrays and their dtypes."""
     jax.tree.map(np.testing.assert_array_equal, actual, expected)
     types = jax.tree.map(lambda x: x.dtype, actual)
     assert types == jax.tree.map(lambda x: x.dtype, expected)
 
 
-def each_step():
-    """The row of each step of the toy demonstrations, its demonstration, and its number."""
-    steps = [(d, step) for d in toy_demonstrations() for step in range(len(d.actions))]
+def list_steps():
+    """Lists the row, the demonstration and the number of each step."""
+    steps = [(d, step) for d in make_demonstrations() for step in range(len(d.actions))]
     return [(row, *step) for row, step in enumerate(steps)]
 
 
-def test_steps_are_all_that_happened_in_order():
-    steps = laid_out(toy_demonstrations())
-    for row, demonstration, step in each_step():
+def test_steps_hold_all_episodes_in_order():
+    steps = join_steps(make_demonstrations())
+    for row, demonstration, step in list_steps():
         n = len(demonstration.actions)
         episode = demonstration.seed
         assert (steps.starts[episode], steps.lengths[episode]) == (row - step, n)
-        for later in (0, 1):  # the state before the action, and the one after it: the last one too
+        for later in (0, 1):  # the states before and after the action, the final state included
             assert_same(
                 jax.tree.map(lambda x, i=steps.state[row] + later: x[i], steps.observations),
                 jax.tree.map(lambda x, i=step + later: x[i], demonstration.observations),
@@ -120,25 +120,25 @@ def test_steps_are_all_that_happened_in_order():
         assert steps.return_so_far[row] == sum(demonstration.rewards[:step].tolist())
         assert steps.terminated[row] == (step == n - 1 and episode in (0, 2))
         assert (steps.step[row], steps.remaining[row]) == (step, n - step)
-        np.testing.assert_array_equal(steps.extras[row], slow_way(demonstration, step))
+        np.testing.assert_array_equal(steps.extras[row], slow_free_cells(demonstration, step))
     assert len(steps.actions) == sum(LENGTHS)
     assert len(steps.observations.grid) == sum(LENGTHS) + len(LENGTHS)
 
 
 @pytest.mark.parametrize(("context", "horizon"), [(0, 1), (2, 3), (5, 5)])
-def test_every_window_against_the_slow_one(context, horizon):
-    steps = on_device(laid_out(toy_demonstrations()))
+def test_windows_equal_the_slow_version(context, horizon):
+    steps = on_device(join_steps(make_demonstrations()))
     find = jax.jit(lambda steps, i: windows.window(steps, i, context, horizon, END))
-    for row, demonstration, start in each_step():
+    for row, demonstration, start in list_steps():
         assert_same(find(steps, row), slow_window(demonstration, start, context, horizon))
 
 
 @pytest.mark.parametrize("context", [0, 2])
-def test_transitions_are_what_was_before_and_after_every_step(context):
-    steps = on_device(laid_out(toy_demonstrations()))
+def test_transition_windows_hold_the_contexts_before_and_after_a_step(context):
+    steps = on_device(join_steps(make_demonstrations()))
     find = jax.jit(lambda steps, i: windows.transition_window(steps, i, context, END))
-    for row, demonstration, step in each_step():
-        # One step longer, so that the state after the last step is one that windows start at.
+    for row, demonstration, step in list_steps():
+        # One step longer, so that a window can start at the state after the last step.
         states = jax.tree.map(lambda x: np.concatenate([x, x[-1:]]), demonstration.observations)
         actions, rewards = (np.append(x, 0) for x in (demonstration.actions, demonstration.rewards))
         longer = demonstration._replace(observations=states, actions=actions, rewards=rewards)
@@ -146,19 +146,19 @@ def test_transitions_are_what_was_before_and_after_every_step(context):
         assert found.actions.shape == (0,)
         assert found.context.actions[-1] == actions[step]
         assert found.context.rewards[-1] == rewards[step]
-        np.testing.assert_array_equal(found.extras, slow_way(demonstration, step))
+        np.testing.assert_array_equal(found.extras, slow_free_cells(demonstration, step))
         assert_same(windows.before(found.context), slow_window(longer, step, context, 0).context)
         assert_same(windows.after(found.context), slow_window(longer, step + 1, context, 0).context)
 
 
-def test_states_keep_their_type():
-    """A network that is trained must see what it sees when it acts, `~` of booleans included."""
+def test_states_keep_their_dtypes():
+    """Training and acting must give a network the same dtypes: `~` differs for integers."""
     kinds = {"flags": bool, "pixels": np.uint8, "counts": np.int32, "numbers": np.float32}
     states = {name: np.ones((4, 2), kind) for name, kind in kinds.items()}
     episode = Demonstration(states, np.zeros(3, np.int32), np.zeros(3, np.float32), True, False, 0)
     steps = on_device(windows.concatenate([episode]))
     whole = windows.window(steps, jnp.int32(1), 2, 3, END)
-    assert whole.extras == ()  # which are only there where they are asked for
+    assert whole.extras == ()  # extras exist only on request
     start = whole.context
     taken = windows.transition_window(steps, jnp.int32(1), 2, END).context
     unrolled = windows.unrolled_window(steps, jnp.int32(1), 2, 3, END).context
@@ -171,9 +171,9 @@ def test_states_keep_their_type():
 
 @pytest.mark.parametrize(("context", "horizon"), [(0, 4), (2, 3)])
 def test_unrolled_windows_hold_every_context_of_their_plan(context, horizon):
-    steps = on_device(laid_out(toy_demonstrations()))
+    steps = on_device(join_steps(make_demonstrations()))
     find = jax.jit(lambda s, i: windows.unrolled_window(s, i, context, horizon, END))
-    for row, demonstration, start in each_step():
+    for row, demonstration, start in list_steps():
         n = len(demonstration.actions)
         found = find(steps, row)
         expected = slow_window(demonstration, start, context, horizon)
@@ -194,29 +194,29 @@ def test_unrolled_windows_hold_every_context_of_their_plan(context, horizon):
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4, 5))
 def draw(key, steps, batch: int, context: int, horizon: int, by: str) -> Window:
-    """A batch, as an agent draws it."""
+    """Draws a batch as agents do."""
     indices = windows.sample_steps(key, steps, batch, by)
     return jax.vmap(lambda i: windows.window(steps, i, context, horizon, END))(indices)
 
 
 def sample(key: int, batch: int, by: str, context: int = 2, horizon: int = 3) -> Window:
-    steps = on_device(laid_out(toy_demonstrations()))
+    steps = on_device(join_steps(make_demonstrations()))
     return draw(jax.random.key(key), steps, batch, context, horizon, by)
 
 
 @pytest.mark.parametrize("by", windows.SAMPLINGS)
-def test_a_batch_holds_windows_of_the_data_and_is_a_function_of_its_key(by):
+def test_batches_hold_windows_of_the_data_and_depend_only_on_the_key(by):
     batch, same, other = (jax.device_get(sample(key, 32, by)) for key in (5, 5, 4))
     jax.tree.map(np.testing.assert_array_equal, batch, same)
     assert not np.array_equal(batch.context.observation.pose, other.context.observation.pose)
-    demonstrations = toy_demonstrations()
+    demonstrations = make_demonstrations()
     for row in range(32):
         one = jax.tree.map(lambda leaf, r=row: leaf[r], batch)
         episode, start, _ = one.context.observation.pose
         assert_same(one, slow_window(demonstrations[episode], int(start), 2, 3))
 
 
-def test_every_demonstration_every_step_or_every_start_counts_the_same():
+def test_samplings_are_uniform_over_episodes_steps_or_starts():
     def is_uniform(observed):
         return len(observed) == 1 or stats.chisquare(observed).pvalue > 1e-3
 
@@ -238,23 +238,23 @@ def test_every_demonstration_every_step_or_every_start_counts_the_same():
         sample(0, 4, "window")
 
 
-def test_padding_changes_no_window():
-    steps = laid_out(toy_demonstrations())
-    padded = windows.concatenate(toy_demonstrations(), extras=mark_needed_cells, padded=True)
+def test_padding_does_not_change_windows():
+    steps = join_steps(make_demonstrations())
+    padded = windows.concatenate(make_demonstrations(), extras=mark_needed_cells, padded=True)
     assert len(padded.actions) == len(padded.extras) == 16 > len(steps.actions) == padded.count
     assert len(padded.observations.grid) == 32 > len(steps.observations.grid)
-    # JAX's CPU devices share what begins so, and each copies what does not.
+    # JAX's CPU devices share aligned arrays, and copy others for each device.
     assert all(leaf.ctypes.data % 64 == 0 for leaf in (padded.actions, padded.observations.grid))
     for by in windows.SAMPLINGS:
         same = [draw(jax.random.key(0), on_device(data), 64, 2, 5, by) for data in (steps, padded)]
         jax.tree.map(np.testing.assert_array_equal, *same)
-    # What a run learns from has the name that it would have without padding.
+    # The fingerprint of a run's data does not depend on padding.
     jax.tree.map(np.testing.assert_array_equal, windows.unpadded(padded), steps)
     assert windows.fingerprint(windows.unpadded(padded)) == windows.fingerprint(steps)
     assert windows.fingerprint(padded) != windows.fingerprint(steps)
 
 
-def test_frames_that_are_mapped_are_in_memory_once(tmp_path):
+def test_memory_mapped_frames_are_copied_once(tmp_path):
     rows, side = 128, 84
     stored = np.arange(2 * rows * side * side).astype(np.uint8).reshape(2 * rows, side, side)
     np.save(tmp_path / "frames.npy", stored)
@@ -278,7 +278,7 @@ def test_frames_that_are_mapped_are_in_memory_once(tmp_path):
     assert name == windows.fingerprint(windows.concatenate(games))
 
 
-def test_the_recent_part_of_a_context_is_its_end():
+def test_recent_returns_the_last_steps_of_a_context():
     context = Context(
         observation=np.int32(9), past=np.arange(3), actions=np.array([4, 5, 6]),
         rewards=np.array([0.1, 0.2, 0.3]), step=np.int32(3), return_so_far=np.float32(0.6),

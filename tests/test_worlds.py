@@ -45,54 +45,54 @@ LEFT, RIGHT, PICKUP, MASK = 0, 1, 3, mask_token(NUM_ACTIONS)
 LAVA_LEVELS = {"GoToLavaEasy": (0, 2), "GoToLavaMedium": (0, 5), "GoToLavaHard": (4, 4)}
 EPISODES = range(60)
 ERRANDS = [("GoToVia", FEW_TURNS), ("GoToViaDetour", DETOUR_TURNS)]
-rolled = jax.jit(roll)
-same = np.testing.assert_array_equal
+compiled_roll = jax.jit(roll)
+assert_equal = np.testing.assert_array_equal
 
 
-def context_of(observation, past=0):
+def to_context(observation, past=0):
     return History(observation, past, NUM_ACTIONS).context()
 
 
-def first(name, seed, past=0):
-    """An adapter after reset, and the context that its episode begins with."""
+def begin(name, seed, past=0):
+    """Returns an adapter after reset, and the first context."""
     adapter = BabyAIAdapter(find_level(name))
-    return adapter, context_of(adapter.reset(seed), past)
+    return adapter, to_context(adapter.reset(seed), past)
 
 
-def cells_of(context, *kinds):
+def find_cells(context, *kinds):
     cells = np.argwhere(np.isin(context.observation.grid[..., 0], kinds))
     return set(map(tuple, cells.tolist()))
 
 
 @pytest.mark.parametrize("name", ["GoToObjMazeS4R2Close", "GoToLavaHard", "PickUpLoc"])
-def test_a_plan_of_turns_and_moves_is_rolled_as_minigrid_does(name):
-    """Step by step, until the episode ends; and lava ends it where the penalty says so."""
+def test_roll_matches_minigrid_for_turns_and_moves(name):
+    """Compares every pose of an episode, and the lava penalty with the death of the agent."""
     adapter, rng = BabyAIAdapter(find_level(name)), np.random.default_rng(0)
     entered, count = 0, jax.jit(lava)
     for seed in range(12):
         observation = adapter.reset(seed)
         actions = rng.choice([LEFT, RIGHT, FORWARD, FORWARD, FORWARD, FORWARD], 40)
-        poses = np.asarray(rolled(observation, actions))
-        same(poses[0], observation.pose)
+        poses = np.asarray(compiled_roll(observation, actions))
+        assert_equal(poses[0], observation.pose)
         for step, action in enumerate(actions.tolist(), start=1):
             transition = adapter.step(action)
-            same(transition.observation.pose, poses[step])
+            assert_equal(transition.observation.pose, poses[step])
             if transition.terminated or transition.truncated:
                 break
         died = transition.terminated and not transition.success
         entered += died
-        assert count(context_of(observation), np.where(np.arange(40) < step, actions, END)) == died
+        assert count(to_context(observation), np.where(np.arange(40) < step, actions, END)) == died
     assert (entered > 0) == (name == "GoToLavaHard")
 
 
 def facing(thing, fill=False):
-    """A context whose agent faces a thing; or every free cell of the room holds it."""
+    """Makes a context whose agent faces a thing; `fill` puts it into every free cell."""
     observation = BabyAIAdapter(find_level("GoToLocalS8N1")).reset(1)
     grid = observation.grid.copy()
     grid[tuple(observation.pose[:2] + FRONT[observation.pose[2]])] = thing
     if fill:
         grid[1:-1, 1:-1][grid[1:-1, 1:-1, 0] == 1] = thing
-    return context_of(observation._replace(grid=grid), 3)
+    return to_context(observation._replace(grid=grid), 3)
 
 
 HANDLING = [PICKUP, FORWARD, LEFT, PICKUP, END]
@@ -113,44 +113,44 @@ PLAN = [LEFT, FORWARD, RIGHT, END, LEFT]
         (left_turns, KEY_AHEAD, [MASK, LEFT, LEFT], 0),
         (partial(turns_over, budget=2), KEY_AHEAD, PLAN, 0),
         (partial(turns_over, budget=1), KEY_AHEAD, PLAN, 1),
-        (partial(turns_over, budget=3), TURNED, PLAN, 1),  # two are remembered
+        (partial(turns_over, budget=3), TURNED, PLAN, 1),  # two turns are in the context
         (partial(turns_over, budget=2), TURNED, [MASK, LEFT, LEFT], 0),
-        # What is not chosen yet is no revisit.
+        # Masked actions are no revisits.
         (count_revisits, KEY_AHEAD, [MASK, LEFT, RIGHT], 0),
         (count_revisits, KEY_AHEAD, [LEFT, MASK, RIGHT], 0),
         (count_revisits, KEY_AHEAD, [LEFT, RIGHT, LEFT], 2),
-        # Handling the thing in front can be spared; the second time nothing is there.
+        # `handling` ignores the first PICKUP: the second faces an empty cell.
         (partial(count_revisits, handling=False), KEY_AHEAD, HANDLING, 4),
         (partial(count_revisits, handling=True), KEY_AHEAD, HANDLING, 3),
     ],
 )
-def test_penalties_of_plans_written_by_hand(penalty, context, plan, expected):
+def test_penalties_of_hand_written_plans(penalty, context, plan, expected):
     assert float(penalty(context, jnp.array(plan))) == expected
 
 
-def test_poses_count_as_often_as_the_agent_has_been_there():
-    """As a list of the poses that it went through says, remembered, now and planned."""
+def test_revisits_count_all_earlier_visits_of_a_pose():
+    """Compares with a list of the past, current and planned poses."""
     adapter, rng = BabyAIAdapter(find_level("GoToLocalS8N1")), np.random.default_rng(0)
     count, most, revisited = jax.jit(count_revisits), 6, 0
     for seed in range(30):
         history = History(adapter.reset(seed), most, adapter.num_actions)
-        been = [tuple(history.context().observation.pose)]
+        visited = [tuple(history.context().observation.pose)]
         for action in rng.choice([LEFT, RIGHT, FORWARD], rng.integers(1, 12)).tolist():
             transition = adapter.step(action)
             history.advance(action, transition.observation, transition.reward)
-            been.append(tuple(transition.observation.pose))
-        been, expected = been[-most - 1 :], 0
+            visited.append(tuple(transition.observation.pose))
+        visited, expected = visited[-most - 1 :], 0
         plan = rng.choice([LEFT, RIGHT, FORWARD, END], 10, p=[0.3, 0.3, 0.3, 0.1])
         ended = np.flatnonzero([*(plan == END), True])[0]
-        for pose in np.asarray(rolled(history.context().observation, plan))[1 : ended + 1]:
-            expected += been.count(tuple(pose))
-            been.append(tuple(pose))
+        for pose in np.asarray(compiled_roll(history.context().observation, plan))[1 : ended + 1]:
+            expected += visited.count(tuple(pose))
+            visited.append(tuple(pose))
         assert count(history.context(), plan) == expected
         revisited += expected
     assert revisited > 30
 
 
-def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
+def test_count_steps_returns_the_fewest_turns_and_moves():
     size, start = 7, (3, 3, 0)
     found, layer = {}, [start]
     for steps in range(4 * size):  # breadth first, as MiniGrid turns and moves
@@ -167,22 +167,22 @@ def test_steps_to_a_cell_are_the_fewest_turns_and_moves():
 
 
 @pytest.mark.parametrize(("level", "budget"), ERRANDS)
-def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal(level, budget):
-    """As the world decides: it ends at the goal, and forgets a cell that was visited.
+def test_visit_penalties_match_the_environment(level, budget):
+    """The environment ends at the goal, and empties the coloured cell after a visit.
 
-    Among several things that are alike each is the goal.
+    Every object like the goal counts as the goal.
     """
     adapter, rng = WatchedErrand(level, budget), np.random.default_rng(0)
     distance, early = jax.jit(steps_to_visit), jax.jit(goal_before_visit)
     outcomes = set()
     for seed in range(40):
-        now = before = context_of(adapter.reset(seed))
-        assert len(cells_of(now, FLOOR)) == 1 and not cells_of(hide_marks(now), FLOOR)
+        now = before = to_context(adapter.reset(seed))
+        assert len(find_cells(now, FLOOR)) == 1 and not find_cells(hide_marks(now), FLOOR)
         actions = rng.choice([LEFT, RIGHT, FORWARD, FORWARD, FORWARD], 60)
         for action in actions.tolist():
             violations, context = adapter.violations, now
             transition = adapter.step(action)
-            now = context_of(transition.observation)
+            now = to_context(transition.observation)
             ended_early = transition.terminated and not transition.success
             assert early(context, jnp.array([action, MASK])) == ended_early
             assert not ended_early or adapter.violations > violations
@@ -190,7 +190,7 @@ def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal(level, budget):
                 break
         played = np.where(np.arange(60) < adapter.env.step_count, actions, END)
         missed = distance(before, played)
-        left = bool(cells_of(now, FLOOR))
+        left = bool(find_cells(now, FLOOR))
         assert (missed > 0) == left
         assert (missed >= now.observation.grid[..., 0].size) == ended_early
         outcomes.add((left, bool(transition.success)))
@@ -198,7 +198,7 @@ def test_a_plan_has_to_visit_the_coloured_cell_before_its_goal(level, budget):
 
 
 @pytest.mark.parametrize("kind", [Watched, WatchedTurns])
-def test_what_breaks_a_constraint_is_counted(kind):
+def test_violations_of_constraints_are_counted(kind):
     adapter, rng = kind("GoToLavaHard"), np.random.default_rng(0)
     deaths = turns = 0
     for seed in range(20):
@@ -219,19 +219,19 @@ def test_what_breaks_a_constraint_is_counted(kind):
         assert counts == [0] * FEW_TURNS + [1, 2]
 
 
-def test_who_should_pick_something_up_is_told_to_go_to_it():
-    _, context = first("PickUpObjMazeS4", 0)
-    said = decode(context.observation.instruction)
-    told = decode(np.asarray(replace_pick_up(context).observation.instruction))
-    assert said.startswith("pick up the ") and told == said.replace("pick up", "go to")
+def test_replace_pick_up_instructs_to_go_to_the_object():
+    _, context = begin("PickUpObjMazeS4", 0)
+    original = decode(context.observation.instruction)
+    replaced = decode(np.asarray(replace_pick_up(context).observation.instruction))
+    assert original.startswith("pick up the ") and replaced == original.replace("pick up", "go to")
 
 
 @pytest.mark.parametrize("name", LAVA_LEVELS)
-def test_there_is_as_much_lava_as_said_and_a_way_around_it(name):
+def test_lava_levels_have_the_specified_lava_and_a_path_around_it(name):
     counts = []
     for seed in EPISODES:
-        adapter, context = first(name, seed)
-        counts.append(len(cells_of(context, LAVA)))
+        adapter, context = begin(name, seed)
+        counts.append(len(find_cells(context, LAVA)))
         start = observations.agent_cell(adapter.env)
         assert adapter.goal in observations.path_lengths(
             adapter.env.grid, start, through_objects=False
@@ -240,53 +240,53 @@ def test_there_is_as_much_lava_as_said_and_a_way_around_it(name):
     assert low <= min(counts) and max(counts) == high
 
 
-def test_the_planner_sees_no_lava_and_everything_else():
-    _, context = first("GoToLavaHard", 3, past=2)
+def test_hide_lava_changes_only_lava_cells():
+    _, context = begin("GoToLavaHard", 3, past=2)
     where = context.observation.grid[..., 0] == LAVA
-    seen = np.asarray(hide_lava(context).observation.grid)
-    assert where.any() and (seen[where] == [1, 0, 0]).all()
-    same(seen[~where], context.observation.grid[~where])
+    visible = np.asarray(hide_lava(context).observation.grid)
+    assert where.any() and (visible[where] == [1, 0, 0]).all()
+    assert_equal(visible[~where], context.observation.grid[~where])
 
 
-def test_a_way_to_plan_sees_open_doors_and_what_comes_back_costs_as_its_name_says():
+def test_ways_hide_open_doors_and_penalise_revisits_as_named():
     def total(params, memory, actions):
         return (memory.observation.grid[..., 0] == 4).sum().astype(float)
 
     counts = from_total(lambda params, context: context, total, NUM_ACTIONS)
-    (_, context), (_, closed) = first("GoToObjMazeS4", 0), first("GoToObjMazeS4R2Close", 0)
-    doors = len(cells_of(context, 4))
-    assert doors and not cells_of(hide_open_doors(context), 4)
-    assert cells_of(hide_open_doors(closed), 4) == cells_of(closed, 4) != set()
+    (_, context), (_, closed) = begin("GoToObjMazeS4", 0), begin("GoToObjMazeS4R2Close", 0)
+    doors = len(find_cells(context, 4))
+    assert doors and not find_cells(hide_open_doors(context), 4)
+    assert find_cells(hide_open_doors(closed), 4) == find_cells(closed, 4) != set()
     (case,) = (case for case in CASES if case.name == "generalization-hard")
     for way in case.ways:
         energy = way.minimise([counts])
-        seen = 0 if way.name.endswith("open doors seen as empty") else doors
+        visible = 0 if way.name.endswith("open doors seen as empty") else doors
         back = AGAIN if "exploring" in way.name else 0
         found = energy.total((), energy.encode((), context), jnp.array(TURNS))
-        assert found == seen + back
+        assert found == visible + back
 
 
-def test_obstacles_are_between_agent_and_key_and_each_half_sees_its_own():
+def test_obstacles_lie_between_agent_and_key_and_split_into_halves():
     for seed in EPISODES:
-        adapter, context = first("GoToBehindObstacles", seed)
+        adapter, context = begin("GoToBehindObstacles", seed)
         pose, goal = context.observation.pose[:2], np.array(adapter.goal)
         assert (abs(goal - pose) == 3).all()
-        objects = cells_of(context, 5, 6, 7)
+        objects = find_cells(context, 5, 6, 7)
         low, high = np.minimum(goal, pose), np.maximum(goal, pose)
         assert all((low <= cell).all() and (cell <= high).all() for cell in objects)
-        one, other = (cells_of(hide_half_of_obstacles(context, part), 5, 6, 7) for part in (0, 1))
+        one, other = (find_cells(hide_half_of_obstacles(context, part), 5, 6, 7) for part in (0, 1))
         assert len(objects) == 7 and len(one) == len(other) == 4
         assert one | other == objects and one & other == {adapter.goal}
 
 
-def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
+def test_a_fifth_of_turns_slip_and_other_actions_never_slip():
     adapter = BabyAIAdapter(find_level("GoToObjMazeS4Slip"))
 
     def taken():
         adapter.reset(7)
         return [(adapter.step(0).truncated, adapter.taken)[1] for _ in range(30)]
 
-    assert taken() == taken() and len(set(taken())) > 1  # a seed decides how it slips
+    assert taken() == taken() and len(set(taken())) > 1  # the seed determines the slips
     counts, rng = np.zeros((END, END)), np.random.default_rng(0)
     for seed in range(40):
         adapter.reset(seed)
@@ -300,45 +300,45 @@ def test_only_turns_slip_a_fifth_of_them_and_to_any_other_action():
     for action, others in enumerate(shares):
         slipped = np.delete(others, action)
         assert (0.15 < slipped.sum() < 0.25) if action in TURNS else not slipped.any()
-        assert action not in TURNS or slipped.min() > 0.02  # each is a fifth of them
+        assert action not in TURNS or slipped.min() > 0.02  # expected: 0.04 each
 
 
 @pytest.mark.parametrize("name", ["GoToObjMazeS4Slip", "GoToObjMazeS4Mistakes"])
-def test_what_is_recorded_is_what_was_done(name):
-    """The actions of a demonstration lead, on the plain level, through its states."""
+def test_demonstrations_record_the_executed_actions(name):
+    """On the plain level, the actions of a demonstration lead through its states."""
     plain = BabyAIAdapter(LEVELS["GoToObjMazeS4"])
     for demonstration in demonstrations.collect(find_level(name), 5, 0).demonstrations:
         plain.reset(demonstration.seed)
         for step, action in enumerate(demonstration.actions.tolist(), start=1):
             transition = plain.step(action)
-            same(transition.observation.grid, demonstration.observations.grid[step])
+            assert_equal(transition.observation.grid, demonstration.observations.grid[step])
         assert transition.success
 
 
 def test_a_quarter_of_the_actions_are_mistakes(monkeypatch):
-    """A random action is the one that the demonstrator wanted once in six times."""
-    bots, wanted = demonstrations.FullViewBot, []
+    """A random action equals the bot's choice with probability 1/6."""
+    bots, chosen = demonstrations.FullViewBot, []
 
-    def watched(env):
+    def watch_bot(env):
         bot = bots(env)
         replan = bot.replan
-        bot.replan = lambda action: wanted.append(int(replan(action))) or wanted[-1]
+        bot.replan = lambda action: chosen.append(int(replan(action))) or chosen[-1]
         return bot
 
-    monkeypatch.setattr(demonstrations, "FullViewBot", watched)
+    monkeypatch.setattr(demonstrations, "FullViewBot", watch_bot)
     adapter, wrong = BabyAIAdapter(find_level("GoToObjMazeS4Mistakes")), []
     for seed in range(80):
-        wanted.clear()
+        chosen.clear()
         demonstration = demonstrations.demonstrate(adapter, seed, Counter())
         if demonstration is not None:
-            wrong.extend(demonstration.actions != wanted)
+            wrong.extend(demonstration.actions != chosen)
     assert len(wrong) > 700 and np.mean(wrong) == pytest.approx(0.25 * 5 / 6, abs=0.04)
 
 
-def test_mislabelled_demonstrations_are_the_same_but_for_labels():
+def test_mislabelled_demonstrations_differ_only_in_their_labels():
     good = demonstrations.collect(LEVELS["GoToObjMazeS4"], 60, 0).demonstrations
     bad = demonstrations.collect(find_level("GoToObjMazeS4Mislabelled"), 60, 0).demonstrations
     for a, b in zip(good, bad, strict=True):
-        same(a.observations.grid, b.observations.grid)
+        assert_equal(a.observations.grid, b.observations.grid)
     wrong = np.concatenate([a.actions != b.actions for a, b in zip(good, bad, strict=True)])
     assert abs(wrong.mean() - 0.25 * 5 / 6) < 0.05

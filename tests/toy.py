@@ -1,4 +1,4 @@
-"""A world so small that its networks compile in seconds: walk along a line to its middle."""
+"""A toy world whose networks compile in seconds: walk along a line to its middle."""
 
 import flax.linen as nn
 import jax
@@ -30,31 +30,31 @@ def observe(place):
 
 
 def mirror(key, window):
-    """The mirror image of a window, or not."""
-    flip = jax.random.bernoulli(key)
+    """Mirrors a window with probability 1/2."""
+    flipped = jax.random.bernoulli(key)
 
-    def mirrored(actions):
+    def mirror_actions(actions):
         swapped = jnp.array([RIGHT, LEFT, WAIT, END])[jnp.minimum(actions, END)]
-        return jnp.where(flip & (actions <= END), swapped, actions)
+        return jnp.where(flipped & (actions <= END), swapped, actions)
 
-    def seen(states):
-        return jnp.where(flip, states * jnp.array([-1, 1, 1]), states)
+    def mirror_states(states):
+        return jnp.where(flipped, states * jnp.array([-1, 1, 1]), states)
 
     context = window.context._replace(
-        observation=seen(window.context.observation),
-        past=seen(window.context.past),
-        actions=mirrored(window.context.actions),
+        observation=mirror_states(window.context.observation),
+        past=mirror_states(window.context.past),
+        actions=mirror_actions(window.context.actions),
     )
-    return window._replace(context=context, actions=mirrored(window.actions))
+    return window._replace(context=context, actions=mirror_actions(window.actions))
 
 
-def nothing(*arguments):
+def raise_not_implemented(*arguments):
     raise NotImplementedError
 
 
 DOMAIN = Domain(
     level="Line",
-    make_adapter=nothing,
+    make_adapter=raise_not_implemented,
     actions=("left", "right", "wait", "end"),
     max_steps=FARTHEST,
     blank=np.zeros(3, np.float32),
@@ -64,7 +64,7 @@ DOMAIN = Domain(
 
 
 def learn(agent, data, steps):
-    """A state after so many steps of training, and the metrics on the way."""
+    """Trains an agent; returns its state and the metrics on the way."""
     metrics, placed = [], jax.tree.map(jnp.asarray, data)
     state = training.train(
         training.make_train_step(agent), quick_jit(agent.init)(jax.random.key(0)),
@@ -75,7 +75,7 @@ def learn(agent, data, steps):
 
 
 def demonstrations():
-    """The shortest way from every place."""
+    """Makes the shortest demonstration from every place but the middle."""
     found = []
     for start in (x for x in range(-FARTHEST, FARTHEST + 1) if x):
         places = [start]

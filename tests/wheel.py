@@ -1,4 +1,4 @@
-"""What an installed wheel must do, away from its checkout; `make package` runs it."""
+"""Checks an installed wheel outside its checkout; `make package` runs this file."""
 
 import re
 import sys
