@@ -183,13 +183,20 @@ def compare_iterations(rows: Sequence[Row]) -> str:
 
 
 def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]]]:
-    """Groups the rows of training seed 0 by level, title of the setting, and N."""
-    first = select([row for row in rows if row["seed"] == 0], LEVELS, BY_ITERATIONS)
+    """Groups the rows of training seed 0 by level, title of the setting, and N.
+
+    Takes rows of a checkpoint played again where there are any: then all N have one network.
+    """
+    first = [row for row in rows if row["seed"] == 0]
+    trained = select(first, LEVELS, BY_ITERATIONS)
+    again = select([row for row in first if not row["train_steps"]], LEVELS, BY_ITERATIONS)
     found: dict[str, dict[str, dict[float, Row]]] = {}
     for level in LEVELS:
         for title in ITERATED:
             by_count: dict[float, Row] = {
-                n: of[0] for n in ITERATIONS if (of := first[level, (title, n)])
+                n: of[0]
+                for n in ITERATIONS
+                if (of := again[level, (title, n)] or trained[level, (title, n)])
             }
             if len(by_count) > 1:  # a single N does not show the effect of iterations
                 found.setdefault(level, {})[title] = by_count
