@@ -1,10 +1,22 @@
-"""Random parameters of untrained networks, whose outputs depend on their inputs."""
+"""Small agents, and random parameters that make outputs depend on inputs."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax import sharding
+from leapjax.agents.base import Setup
+from leapjax.methods import find_method
+from leapjax.models.config import ModelConfig
+from leapjax.presets import find_preset
+
+
+def make_leap_agent(name, domain, **model):
+    """Makes LEAP's agent with a small network; `name` is the name of the domain."""
+    config = find_preset(name, domain.level, "leap", "leapjax")
+    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0, **model)
+    setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
+    return find_method("leap").make_agent(setup, None)
 
 
 def random_like(shapes, scale=0.5, seed=0):

@@ -69,26 +69,29 @@ def untrained_run(folder, *options):
     domain = make_domain(chosen)
     specification = specify(chosen, chosen.seeds[0], domain)
     pretrained.save_specification(folder, specification)
-    agent = pretrained.make_agent(specification, domain)
-    params = random_parameters(agent, 0.1)
-    checkpoints = Checkpoints(
-        folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
-    )
-    checkpoints.save(TrainState(params, (), jnp.int32(specification.training.steps)))
-    checkpoints.close()
+    seal(folder, random_parameters(pretrained.make_agent(specification, domain), 0.1))
     return folder
 
 
-def seal(folder):
-    """Replaces the checkpoints of a folder by one parameter and its current specification."""
+def seal(folder, params=None):
+    """Saves `params`, or else one parameter, as the only checkpoint of a folder."""
     shutil.rmtree(folder / pretrained.CHECKPOINTS, ignore_errors=True)
     specification = pretrained.parse_specification(folder)
     checkpoints = Checkpoints(
         folder / pretrained.CHECKPOINTS, pretrained.describe_identity(specification)
     )
-    params = {"w": jnp.ones((30, 30))} if specification.method != "random" else {}
+    if params is None:
+        params = {"w": jnp.ones((30, 30))} if specification.method != "random" else {}
     checkpoints.save(TrainState(params, (), jnp.int32(specification.training.steps)))
     checkpoints.close()
+
+
+def run_python(*arguments, stdout=subprocess.PIPE, **environment):
+    """Runs Python in the folder of the repository; returns the completed process."""
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, env={**os.environ, **environment},
+        stdout=stdout, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
 
 
 class Place:

@@ -40,12 +40,6 @@ def counting_model():
     return pseudo_likelihood(lambda params, context: None, logits, ACTIONS)
 
 
-def test_predictions_see_only_earlier_actions():
-    right, counts = accuracy.find_hits(counting_model(), None, window([0, 1, 2, 0, 1]), end=True)
-    np.testing.assert_array_equal(right, [True, True, True, False, True])
-    assert counts.all()
-
-
 @pytest.mark.parametrize("end", [True, False])
 def test_actions_after_the_end_do_not_count(end):
     for third, known in ((2, True), (1, False)):  # the model expects the end after 2 only

@@ -1,6 +1,5 @@
 """The `main` of BabyAI, end to end at toy size, and its errors for wrong input."""
 
-import functools
 import json
 import shutil
 
@@ -58,7 +57,8 @@ def test_a_run_writes_a_row_metrics_and_checkpoints(workplace):
     (row,) = results.read(workplace / "runs" / "babyai.jsonl")
     assert (row["domain"], row["level"], row["method"]) == ("babyai", LEVEL, "leap")
     assert row["preset"] == "leapjax" and row["demos"] == 6
-    assert row["episodes"] == 3 and 0 <= row["mean_return"] <= row["successes"] / 3 <= 1
+    assert row["episodes"] == 3 and 0 <= row["mean_return"] <= row["success"] <= 1
+    assert row["success"] == row["successes"] / 3
     assert row["iterations"] == 3 and row["horizon"] == 5 and row["train_steps"] == 4
     assert row["configuration"]["training"]["batch"] == 4
     assert not (workplace / "results").exists()
@@ -120,6 +120,7 @@ def test_evaluating_a_checkpoint_keeps_its_seed_and_writes_pictures(workplace, t
         ("--level", "GoToLocalS8N7", f"level is {LEVEL}, not GoToLocalS8N7"),
         ("--horizon", "4", "horizon is 5, not 4"),
         ("--channels", "8", "channels is 4, not 8"),
+        ("--method", "iql", "method is leap, not iql"),
     ],
 )
 def test_options_that_contradict_a_checkpoint_raise_an_error(
@@ -142,13 +143,11 @@ def test_a_loaded_planner_keeps_the_horizon_and_observation_shapes_of_training(w
     assert (actions[:, 0] != 6).all()  # a plan never begins with the end action
     with pytest.raises(UserError, match="plans 5 actions, not 4: its horizon"):
         load(run_folder(workplace), GibbsConfig(horizon=4))
-    for level, context, message in (
-        ("GoToLocalS8N7", 0, r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"),
-        (LEVEL, 2, r"past.grid has shape \(2, 7, 7, 3\), but .* \(0, 7"),
-    ):
-        make_adapter = functools.partial(BabyAIAdapter, LEVELS[level])
-        with pytest.raises(UserError, match=message):
-            rollouts.evaluate(make_adapter, [0], planner.plan, planner.params, context=context)
+    larger = LEVELS["GoToLocalS8N7"]
+    with pytest.raises(UserError, match=r"grid has shape \(8, 8, 3\), but .* \(7, 7, 3\)"):
+        rollouts.evaluate(
+            lambda: BabyAIAdapter(larger), [0], planner.plan, planner.params, context=0
+        )
 
 
 def test_recording_skips_recorded_runs_unless_forced(workplace, capsys):
@@ -187,15 +186,12 @@ def test_both_presets_run_on_any_level_with_context(workplace, name, level, quic
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--level", "GoToLocalS7N6"], "did you mean GoToLocalS7N5"),
-        (["--method", "bcx"], "unknown method 'bcx': expected one of leap, classifier"),
         (["--demos", "0"], "--demos must be at least 1"),
         (["--horizon", "50", "--resampled", "1"], "longer than any episode"),
         (["--executed", "6"], "--executed 6 is not in 1 .. 5"),
         (["--target-return", "2"], "--method leap is told of returns with --returns only"),
         (["--test-seed", "99999999", "--episodes", "2"], "test seeds"),
         (["--demonstrations", DATASET, "--demos", "7"], "fewer than 7: ask for 6"),
-        (["--checkpoint", "nowhere"], "nowhere is not a checkpoint"),
     ],
 )
 def test_wrong_input_prints_one_line_and_exits_with_code_2(workplace, capsys, arguments, message):
@@ -245,14 +241,6 @@ def test_a_run_does_not_overwrite_a_run_of_another_configuration(tmp_path, monke
     assert babyai.main(arguments) == 2
     assert "is of another configuration" in capsys.readouterr().err
     assert specification.read_text() == before
-
-
-def test_a_run_trains_on_a_data_set_of_the_user(workplace):
-    arguments = ["--steps", "1", "--demos", "6", "--demonstrations", DATASET, "--runs", "mine"]
-    assert babyai.main([*RANDOM, *arguments]) == 0
-    folders = only_folder(workplace / "mine"), run_folder(workplace)
-    found, expected = (json.loads((folder / "data.json").read_text()) for folder in folders)
-    assert found == expected
 
 
 def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, monkeypatch):

@@ -3,7 +3,6 @@
 import importlib
 import os
 import re
-import subprocess
 import sys
 
 import pytest
@@ -16,21 +15,13 @@ from leapjax import scores
 from leapjax.errors import UserError
 from leapjax.methods import METHODS
 from leapjax.running import command_line, results, startup
-from tests.programs import RANDOM, ROOT, toy_row
-
-LEVEL = "GoToLocalS7N5"
-
-
-def python(*arguments, **options):
-    command = [sys.executable, *arguments]
-    return subprocess.run(command, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False,
-                          env={**os.environ, "PYTHONPATH": str(ROOT)}, **options)  # fmt: skip
+from tests.programs import run_python, toy_row
 
 
 @pytest.mark.parametrize("command", ["leapjax", "experiments babyai", "experiments.babyai"])
 def test_the_version_needs_no_jax(command):
     """-S hides all installed packages, and with them the version."""
-    completed = python("-S", "-m", *command.split(), "--version", stdout=subprocess.PIPE)
+    completed = run_python("-S", "-m", *command.split(), "--version")
     assert (completed.returncode, completed.stderr) == (0, "")
     assert completed.stdout in ("leapjax 0+unknown\n", f"leapjax {leapjax.__version__}\n")
 
@@ -57,7 +48,7 @@ def test_usage_lines_say_how_a_program_was_started(main, started, command, monke
 def test_a_closed_output_pipe_ends_a_program_quietly():
     reader, writer = os.pipe()
     os.close(reader)
-    completed = python("-m", "experiments", "--help", stdout=writer)
+    completed = run_python("-m", "experiments", "--help", stdout=writer)
     os.close(writer)
     assert (completed.returncode, completed.stderr) == (startup.UNREAD, "")
 
@@ -141,10 +132,3 @@ def test_tables_end_with_the_mean_over_seeds():
     assert columns["seed"] == ["0", "1", "0", "1", "2", "mean of 2", "mean of 2"]
     low, high = scores.interval_over_seeds([5, 7], [10, 10])
     assert columns["success [95%]"][-2] == f"60.0% [{low:.1%}, {high:.1%}]"
-
-
-def test_rows_have_a_success_rate(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert babyai.main([*RANDOM, "--level", LEVEL]) == 0
-    (found,) = results.read(tmp_path / "runs" / "babyai.jsonl")
-    assert found["success"] == found["successes"] / 3

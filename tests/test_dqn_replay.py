@@ -135,14 +135,6 @@ def test_episodes_cut_by_a_file_are_dropped_and_counted(tmp_path):
         assert dropped == {CUT_BEFORE: 1, CUT_AFTER: 1}
 
 
-def test_last_row_of_a_shard_is_ignored(tmp_path):
-    episodes = make_episodes([5, 6])
-    store_shard(tmp_path, make_rows(episodes))  # its last row ends the second episode
-    demonstrations, dropped = read(tmp_path)
-    assert_same_episodes(demonstrations, episodes[:1])
-    assert dropped == {CUT_AFTER: 1}
-
-
 @pytest.mark.parametrize("padding", [3, 0])
 def test_black_frames_of_an_episode_are_kept(tmp_path, padding):
     episodes = make_episodes([2, 3, 9, 1])

@@ -324,12 +324,6 @@ def test_negative_penalty_does_not_offset_violations():
     assert_close(found.total, without.total - 5 * first)
 
 
-def test_view_reads_a_part_of_the_context():
-    context = {"tilt": random_table(8, 2, ACTIONS), "more": np.float32(1)}
-    seen = evaluate(view(ENUMERABLE, lambda context: context["tilt"]), context=context)
-    assert_equal(seen.total, evaluate(ENUMERABLE, context=context["tilt"]).total)
-
-
 # Energies of methods that choose one action at a time.
 
 

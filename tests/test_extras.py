@@ -4,18 +4,15 @@ import contextlib
 import importlib.metadata
 import os
 import re
-import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 
 from leapjax import extras
 from leapjax.errors import UserError
-from tests.programs import only_long
+from tests.programs import ROOT, only_long, run_python
 
-ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 HEAVY = {*extras.EXTRAS, "chex", "flax"}
 
@@ -91,13 +88,6 @@ def core_only(tmp_path_factory):
     return {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
 
 
-def run(arguments, environment):
-    return subprocess.run(
-        [sys.executable, *arguments],
-        cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True,
-    )  # fmt: skip
-
-
 LOADING = """
 import sys
 import leapjax
@@ -108,7 +98,7 @@ assert "orbax" not in sys.modules
 
 @pytest.mark.parametrize("code", [pytest.param(PLANNING, marks=only_long), LOADING])
 def test_installed_extras_are_not_imported_unless_needed(code):
-    process = run(["-c", code], {})
+    process = run_python("-c", code)
     assert process.returncode == 0, process.stderr
 
 
@@ -120,7 +110,7 @@ for path in ("GoToLocalS7N5", "no-such-run"):
     except leap.UserError as error:
         print(error)
 """
-    process = run(["-c", PLANNING + loading], core_only)
+    process = run_python("-c", PLANNING + loading, **core_only)
     assert process.returncode == 0, process.stderr
     *_, needed, unknown = process.stdout.splitlines()
     assert 'is not installed: pip install ".[babyai]"' in needed
@@ -136,7 +126,7 @@ for path in ("GoToLocalS7N5", "no-such-run"):
     ],
 )
 def test_programs_print_one_line_if_their_extra_is_missing(core_only, arguments, extra):
-    process = run(["-m", *arguments.split()], core_only)
+    process = run_python("-m", *arguments.split(), **core_only)
     assert (process.returncode, process.stdout) == (2, "")
     assert re.fullmatch(
         rf'error: \w+ is not installed: pip install "\.\[{extra}\]".*\n', process.stderr

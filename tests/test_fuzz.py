@@ -15,7 +15,6 @@ import typing
 import warnings
 from pathlib import Path
 
-import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ from leapjax.presets import find_preset
 from leapjax.running import command_line, results
 from leapjax.types import TrainState
 from tests.programs import LONG, only_long, toy_row
-from tests.test_storage import LEVEL, NAME, SIDE
+from tests.test_storage import LEVEL, NAME
 
 CASES = 600 if LONG else 25  # for each of seven kinds of input
 
@@ -168,7 +167,7 @@ def test_damaged_arrays_load_valid_values_or_raise_an_error(data_set, seed):
     for demonstration in loaded or []:
         # HDF5 keeps no checksums: loaded values may differ from saved ones, but they are valid.
         grid, actions = demonstration.observations.grid, demonstration.actions
-        assert grid.shape == (len(actions) + 1, SIDE, SIDE, 3) and len(actions) > 0
+        assert grid.shape == (len(actions) + 1, *LEVEL.blank.grid.shape) and len(actions) > 0
         assert actions.min() >= 0 and actions.max() < 7 and grid[..., 0].max() <= 10
 
 
@@ -203,31 +202,10 @@ def test_data_cannot_run_code(data_set, tmp_path):
     assert not trap.exists()
 
 
-@pytest.mark.parametrize(
-    ("message", "link", "options"),
-    [
-        # 8 TB of zeros: chunks that were never written take no room in the file.
-        ("claims 8000000", None, {"shape": (10**12,), "dtype": "i8", "chunks": (1000,)}),
-        ("is a link", h5py.ExternalLink("/etc/passwd", "/"), None),
-        ("is a link", h5py.SoftLink("/episode_1/actions"), None),
-        ("not an array of this file", None,
-         {"shape": (9,), "dtype": "i8", "external": [("/etc/passwd", 0, 72)]}),
-    ],
-)  # fmt: skip
-def test_links_and_unwritten_arrays_raise_an_error(data_set, message, link, options):
-    def change(folder):
-        with h5py.File(folder / "main_data.hdf5", "r+") as file:
-            del file["episode_0/actions"]
-            if options:
-                file.create_dataset("episode_0/actions", **options)
-            else:
-                file["episode_0/actions"] = link
-
-    def read():
-        with pytest.raises(UserError, match=message):
-            read_data_set(data_set, change)
-
-    try_read(read)
+def test_objects_among_weights_are_not_unpickled(tmp_path):
+    np.savez(tmp_path / "weights.npz", identity=np.array([object()]))
+    with pytest.raises(UserError, match="cannot read"):
+        weights.read(tmp_path / "weights.npz", STATE.params, "mine")
 
 
 ROW = toy_row(

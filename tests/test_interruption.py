@@ -24,7 +24,7 @@ from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
 from leapjax.running.metrics import read_metrics
 from leapjax.running.progress import Meter
 from leapjax.types import TrainState
-from tests.programs import RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run
+from tests.programs import RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run, run_python
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
@@ -129,7 +129,7 @@ def test_library_installs_no_handlers():
         "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL\n"
         "assert sys.unraisablehook is sys.__unraisablehook__"
     )
-    subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True)
+    assert run_python("-c", check).returncode == 0
 
 
 def test_dropped_signal_is_raised_at_the_next_check():

@@ -59,7 +59,7 @@ def make_model(architecture, past):
     """Makes a tiny model with random parameters: `(params, evaluate)`.
 
     `evaluate(params, context, actions, position)` compiles once and returns the logits at all
-    positions and at one alone, the conditional energies at one position, and the total energy.
+    positions and at one alone, and the total energy.
     """
     module = make_module(build_masked_model, architecture, past)
 
@@ -77,7 +77,6 @@ def make_model(architecture, past):
         return {
             "logits": logits(params, memory, actions, EVERYWHERE),
             "alone": logits(params, memory, actions, position[None])[0],
-            "conditional": energy.conditional(params, memory, actions, position[None])[0],
             "total": energy.total(params, memory, actions),
         }
 
@@ -120,14 +119,8 @@ def run(architecture, past, context, actions, position=0):
     return {name: np.asarray(value) for name, value in results.items()}
 
 
-def log_softmax(logits):
-    logits = logits.astype(np.float64)
-    shifted = logits - logits.max(-1, keepdims=True)
-    return shifted - np.log(np.exp(shifted).sum(-1, keepdims=True))
-
-
 def largest_change(after, before):
-    """Returns the largest change of the finite logits or energies."""
+    """Returns the largest change of the finite logits."""
     finite = np.isfinite(before)
     np.testing.assert_array_equal(np.isfinite(after), finite)
     return np.abs(after[finite] - before[finite]).max()
@@ -151,36 +144,6 @@ def test_end_is_forbidden_at_the_first_position_only(architecture, past):
         np.testing.assert_array_equal(np.isneginf(output["logits"]), forbidden)
         assert np.isfinite(output["logits"][~forbidden]).all()
         assert np.isfinite(output["total"]) == (actions == [0, 1, 2])
-
-
-@EACH_NETWORK
-def test_total_equals_a_loop_over_masked_positions(architecture, past):
-    context = random_context(2, past)
-    for actions in ([0, 1, 2], [3, END, END], [1, 1, 0]):
-        expected = 0.0
-        for t in range(HORIZON):
-            masked = np.array(actions)
-            masked[t] = MASK
-            logits = run(architecture, past, context, masked)["logits"][t]
-            expected -= log_softmax(logits)[actions[t]]
-        total = run(architecture, past, context, actions)["total"]
-        assert total == pytest.approx(expected, rel=1e-4)
-
-
-@EACH_NETWORK
-def test_masked_positions_do_not_see_their_own_action(architecture, past):
-    context = random_context(4, past)
-    for t in range(HORIZON):
-        seen, unseen = [], []
-        for action in range(ACTIONS):
-            actions = np.array([0, 1, 2])
-            actions[t] = action
-            unseen.append(run(architecture, past, context, actions, t)["conditional"])
-            seen.append(run(architecture, past, context, actions, (t + 1) % 3)["conditional"])
-        np.testing.assert_array_equal(unseen, np.broadcast_to(unseen[0], (ACTIONS, ACTIONS)))
-        # Every other position sees it.
-        for other in seen[1:]:
-            assert largest_change(other, seen[0]) > 1e-3
 
 
 @EACH_NETWORK

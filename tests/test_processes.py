@@ -8,8 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-from leapjax import processes
-from leapjax.errors import UserError
 from leapjax.rollouts import Episodes, join
 from leapjax.running.jax_setup import Cluster
 from tests.programs import ROOT, only_long, place_with_a_run
@@ -83,16 +81,6 @@ def test_a_signal_to_one_process_stops_both_resumably(place):
 def test_invalid_clusters_raise_an_error(options, message):
     with pytest.raises(ValueError, match=message):
         Cluster(**options)
-
-
-def test_a_single_process_returns_results_and_raises_errors():
-    def fail():
-        raise UserError("no")
-
-    for call in (processes.run_on_first, processes.run_together):
-        assert call(lambda: 3) == 3
-        with pytest.raises(UserError, match="no"):
-            call(fail)
 
 
 def test_episodes_of_processes_are_joined_in_order():

@@ -80,7 +80,7 @@ def test_episodes_equal_the_lockstep_rollout(context, executed, limit):
     np.testing.assert_allclose(found.returns, expected.returns, atol=1e-5)
     assert found.plans == expected.plans and found.passes == expected.passes > found.plans
     assert 0 < found.successes.sum() < len(seeds)
-    assert len(set(found.lengths)) > 2
+    assert len(set(found.lengths)) > 2 and 0 in found.lengths  # some episodes are given up
 
 
 def play(params=1.0, seeds=(0, 1, 2), seed=0, world=WALK, energy=ENERGY, config=CONFIG, **options):
@@ -104,12 +104,6 @@ def play(params=1.0, seeds=(0, 1, 2), seed=0, world=WALK, energy=ENERGY, config=
 def test_invalid_arguments_raise_an_error(wrong, message):
     with pytest.raises(ValueError, match=message):
         play(**wrong)
-
-
-def test_empty_plans_give_up_the_episode():
-    lazy = leap.from_total(lambda *_: (), lambda p, c, a: (a != END).sum(), END + 1)
-    found = play((), range(5), energy=lazy, config=leap.GibbsConfig(2, 20))
-    assert not found.lengths.any() and not found.successes.any() and found.plans == 5
 
 
 def alter(state=lambda state: state, **changes):

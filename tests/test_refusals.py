@@ -9,9 +9,7 @@ import pwd
 import re
 import resource
 import shutil
-import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,15 +26,14 @@ from leapjax import checkpoints, files, pretrained
 from leapjax.checkpoints import Checkpoints, states
 from leapjax.configuration import make_domain, specify
 from leapjax.data import storage
-from leapjax.domains.babyai import bot, demonstrations, levels
+from leapjax.domains.babyai import bot, levels
 from leapjax.domains.babyai.adapter import BabyAIAdapter
-from leapjax.domains.babyai.bot import FullViewBot
 from leapjax.errors import UserError
 from leapjax.running import jax_setup, startup
 from leapjax.running import main as running
 from leapjax.running.command_line import parse
 from leapjax.types import TrainState
-from tests.programs import ROOT, TOY_RUN, only_long, seal, toy_row, untrained_run
+from tests.programs import TOY_RUN, only_long, run_python, seal, toy_row, untrained_run
 
 OTHER = "another configuration"
 
@@ -401,10 +398,7 @@ def test_missing_device_raises_a_one_line_error(monkeypatch):
     ],
 )
 def test_odd_environment_variables_print_a_one_line_error(variable, value, pattern):
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.stars", "--level", "St\u00e4r \u00b1"],
-        capture_output=True, text=True, cwd=ROOT, env={**os.environ, variable: value}, check=False,
-    )  # fmt: skip
+    done = run_python("-m", "experiments.stars", "--level", "St\u00e4r \u00b1", **{variable: value})
     (line,) = done.stderr.splitlines()
     assert done.returncode == 2
     assert re.match(pattern, line)
@@ -457,20 +451,18 @@ def test_filling_disk_raises_an_error_and_keeps_older_files(workplace, capfd, ca
     check_params(workplace / "a", 1.0)
 
 
-def test_bot_that_never_decides_is_a_failed_demonstration(monkeypatch):
+def test_bot_that_never_decides_raises_an_error(monkeypatch):
     """MiniGrid's bot cycles through subgoals forever in one in six levels of UnlockToUnlock."""
 
-    class Undecided(Subgoal):
+    class Silent(Subgoal):
         def replan_before_action(self):
             return None
 
     def process(self, instruction):
-        self.stack.append(Undecided(self))
+        self.stack.append(Silent(self))
 
-    monkeypatch.setattr(FullViewBot, "_process_instr", process)
-    adapter, dropped = BabyAIAdapter(levels.find_level("GoToLocalS7N5")), Counter()
+    monkeypatch.setattr(bot.FullViewBot, "_process_instr", process)
+    adapter = BabyAIAdapter(levels.find_level("GoToLocalS7N5"))
+    adapter.reset(0)
     with pytest.raises(bot.Undecided):
-        adapter.reset(0)
-        FullViewBot(adapter.env).replan()
-    assert demonstrations.demonstrate(adapter, 0, dropped) is None
-    assert dropped == {demonstrations.FAILED: 1}
+        bot.FullViewBot(adapter.env).replan()

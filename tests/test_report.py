@@ -38,16 +38,15 @@ ROWS = [
 ]  # fmt: skip
 
 
-def read_cells(table, level):
-    (line,) = (line for line in table.splitlines() if level in line)
-    return [cell.strip() for cell in line.strip("|").split("|")]
+def read_table(table):
+    """Returns the cells of each line below the head of a Markdown table."""
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
 
 
 def test_only_rows_of_a_setting_count_and_training_rows_are_preferred():
-    found = read_cells(babyai.compare_settings(ROWS, babyai.SETTINGS), "S8N7")
-    assert found[:4] == ["GoToLocalS8N7", "95.0%", "-", "-"]
-    assert found[4] == "95.0% (90.0, 100.0), 2 seeds"
-    assert found[5] == "-"
+    lines = read_table(babyai.compare_settings(ROWS, babyai.SETTINGS))
+    found = {level: cells for level, *cells in lines}["GoToLocalS8N7"]
+    assert found[:5] == ["95.0%", "-", "-", "95.0% (90.0, 100.0), 2 seeds", "-"]
 
 
 def test_each_setting_has_its_own_column():
@@ -57,8 +56,9 @@ def test_each_setting_has_its_own_column():
         row(played=True, executed=3, rate=1.0, mean_length=4.0),
         row(played=True, executed=1, rate=0), row(played=True, iterations=1, rate=0),
     ]  # fmt: skip
-    found = read_cells(babyai.compare_settings([*ROWS, *others], babyai.SETTINGS), "S8N7")
-    assert [cell.split("%")[0] for cell in found[1:]] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
+    lines = read_table(babyai.compare_settings([*ROWS, *others], babyai.SETTINGS))
+    found = {level: cells for level, *cells in lines}["GoToLocalS8N7"]
+    assert [cell.split("%")[0] for cell in found] == ["95.0", "10.0", "80.0", "95.0", "100.0"]
 
 
 def test_intervals_above_or_below_the_published_number_are_marked():
@@ -76,8 +76,8 @@ def test_methods_are_compared_with_the_paper_and_the_best_is_bold(tmp_path):
         row(method="bc", name="paper", rate=0.2), row("PickUpLoc"),
         row(method="dt", steps=1, rate=1.0),  # other steps than the preset's
     ]  # fmt: skip
-    lines = babyai.compare_methods(rows).splitlines()[2:]
-    found = {line[2]: line[3:-1] for line in ([c.strip() for c in x.split("|")] for x in lines)}
+    lines = read_table(babyai.compare_methods(rows))
+    found = {method: entries for _, method, *entries in lines}
     assert len(lines) == len(found) and tuple(found) == babyai.COMPARED  # rows of a single level
     published = [entries[0] for entries in found.values()]
     assert published == ["-", "61.5%", "63.0%", "71.5%", "63.5%", "45.0%", "81.5%", "95.0%"]
@@ -105,9 +105,8 @@ def test_levels_are_sorted_by_whether_they_were_learned_then_by_success():
     unknown, hard, easy = "BabyAI-PickupDist-v0", "BabyAI-Unlock-v0", "BabyAI-GoTo-v0"
     rows = [level_row(easy, 1.0), level_row(hard, 0.0), level_row(unknown, 0.5)]
     bot = {"episodes": 200, "successes": 190, "mean_success_length": 5.0}
-    lines = babyai.list_levels(rows, dict.fromkeys((unknown, hard, easy), bot)).splitlines()[2:]
-    found = [[cell.strip().split(" [")[0] for cell in line.split("|")[1:-1]] for line in lines]
-    assert found == [
+    lines = read_table(babyai.list_levels(rows, dict.fromkeys((unknown, hard, easy), bot)))
+    assert [[cell.split(" [")[0] for cell in line] for line in lines] == [
         ["PickupDist (not learned)", "50.0%", "7.5", "95.0%", "5.0"],
         ["Unlock", "0.0%", "-", "95.0%", "5.0"],
         ["GoTo", "100.0%", "7.5", "95.0%", "5.0"],
@@ -152,9 +151,8 @@ def test_searches_are_compared_on_training_and_hard_boards():
     older = rows[1]["configuration"]["planner"]
     del older["judge"], older["enough"]  # older rows lack these settings
     assert [report.is_used(row) for row in rows] == [True] * 5 + [False]
-    lines = [[cell.strip().split(" ")[0] for cell in line.split("|")[1:-1]]
-             for line in puzzles.compare_boards(rows).splitlines()[2:]]  # fmt: skip
-    assert lines == [
+    lines = read_table(puzzles.compare_boards(rows))
+    assert [[cell.split(" ")[0] for cell in line] for line in lines] == [
         ["most", "81", "90.0%", "60.0%", "70.0%"],
         ["all", "30", "-", "50.0%", "-"],
         ["restarts", "38", "-", "95.0%", "-"],
@@ -172,8 +170,7 @@ def test_searches_are_compared_by_level_and_energy(tmp_path):
     ]  # fmt: skip
     assert [report.is_used(row) for row in rows] == [True] * 6 + [False]
     columns = ["Star3x5, learned", "Sudoku4x6, rules", "Sudoku4x6, learned and rules"]
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]]
-             for line in puzzles.compare_searches(rows, columns).splitlines()[2:]]  # fmt: skip
+    lines = read_table(puzzles.compare_searches(rows, columns))
     found = {tuple(line[:2]): [cell.split(" ")[0] for cell in line[2:]] for line in lines}
     assert found["most certain first", "T"] == ["95.0%", "-", "70.0%"]
     assert found["Gibbs sampling, random order", "2 T"] == ["30.0%", "-", "-"]

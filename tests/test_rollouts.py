@@ -13,7 +13,7 @@ from leapjax import rollouts
 from leapjax.environments import GymnasiumAdapter, Transition
 from leapjax.errors import UserError
 from leapjax.planners import GibbsConfig
-from leapjax.rollouts import History, join
+from leapjax.rollouts import History
 from leapjax.types import Context
 from tests.recorder import Recorder
 
@@ -311,13 +311,6 @@ def test_episodes_depend_only_on_their_seeds_in_any_batch():
     for subset in ([20], seeds[::-1], seeds[3:6]):
         assert play_seeds(subset) == {seed: together[seed] for seed in subset}
     assert play_seeds(seeds, seed=1) == play_seeds(seeds, seed=1) != together
-
-
-def test_join_combines_parallel_episodes():
-    first, second, whole = (walk(seeds=seeds, steps=2) for seeds in ([0, 3], [6], [0, 3, 6]))
-    joined = join([first, second])
-    assert_same_episodes(joined, whole)
-    assert joined.seconds == max(first.seconds, second.seconds)
 
 
 def test_plans_that_start_with_the_end_finish_the_episode():

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +15,7 @@ from leapjax.domain import Augmentations
 from leapjax.domains.babyai.encoders import state_tokens as babyai
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
-from leapjax.models.encoder import Encoder
-from tests import toy
+from tests import mixed, toy
 from tests.parameters import random_state
 from tests.programs import only_long
 from tests.quick import quick_jit
@@ -27,23 +25,7 @@ MODEL = ModelConfig(architecture="paper", layers=1, heads=2, width=16, dropout=0
 TRAINING = TrainingConfig(steps=10, batch=12, consecutive=RUN, windows="step")
 
 
-class StateTokens(Encoder):
-    """A token for each state of a context."""
-
-    width: int
-
-    @nn.compact
-    def __call__(self, context):
-        states = jnp.concatenate([context.past, context.observation[None]])
-        return nn.Dense(self.width)(states)
-
-
-DOMAIN = toy.DOMAIN._replace(
-    encoders={**toy.DOMAIN.encoders, "paper": lambda model, sizes: StateTokens(model.width)}
-)
-
-
-def setup(run=RUN, domain=DOMAIN, **settings) -> Setup:
+def setup(run=RUN, domain=mixed.DOMAIN, **settings) -> Setup:
     training = dataclasses.replace(TRAINING, consecutive=run)
     chosen = leap.Settings(masking="each", **settings)
     return Setup(domain, CONTEXT, HORIZON, MODEL, training, chosen)
@@ -56,9 +38,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def runs(data):
-    return quick_jit(run_batches(setup(domain=DOMAIN._replace(augmentations=Augmentations()))))(
-        jax.random.key(0), data
-    )
+    return quick_jit(run_batches(setup()))(jax.random.key(0), data)
 
 
 def test_windows_of_a_run_are_consecutive_and_stop_at_the_last(runs):
@@ -101,7 +81,7 @@ def test_run_is_augmented_as_a_whole(data):
     def mark_window(key, window):
         return window._replace(return_to_go=jax.random.uniform(key))
 
-    domain = DOMAIN._replace(augmentations=Augmentations([mark_window]))
+    domain = mixed.DOMAIN._replace(augmentations=Augmentations([mark_window]))
     drawn = quick_jit(run_batches(setup(domain=domain)))(jax.random.key(0), data)
     marks = np.asarray(drawn.return_to_go)
     assert (marks == marks[:, :1]).all() and len(np.unique(marks)) == len(marks)
@@ -120,4 +100,4 @@ def test_runs_without_benefit_raise_an_error():
             method.make_agent(made, None)
     encoders = {"paper": lambda model, sizes: babyai.StateTokens(7, model.width)}
     with pytest.raises(UserError, match="4 consecutive windows without repeated states"):
-        leap.make_agent(setup(domain=DOMAIN._replace(encoders=encoders), repeat_state=False))
+        leap.make_agent(setup(domain=mixed.DOMAIN._replace(encoders=encoders), repeat_state=False))

@@ -4,14 +4,11 @@ import functools
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import satisfiability, satisfiability_solvers
 from experiments.common import searches
-from leapjax.agents.base import Setup
-from leapjax.data import windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.satisfiability import formulas
 from leapjax.domains.puzzles.satisfiability.domain import Settings, make
@@ -19,13 +16,11 @@ from leapjax.domains.puzzles.satisfiability.formulas import OPEN, Formula, Formu
 from leapjax.domains.puzzles.satisfiability.rules import rules
 from leapjax.energy import symmetric
 from leapjax.errors import UserError
-from leapjax.methods import find_method
-from leapjax.models.config import ModelConfig
-from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.types import pad_token
-from tests.parameters import random_parameters
+from tests.parameters import make_leap_agent, random_parameters
 from tests.programs import only_long
+from tests.toy import compile_augmentation
 
 SAT, NAE = Size(6, 20, differ=False), Size(6, 10, differ=True)
 NAMES = {SAT: "Sat6x20", NAE: "Nae6x10"}
@@ -44,9 +39,11 @@ def count_violated(literals, values, size):
 
 
 def enumerate_solutions(literals, size):
-    """Returns all assignments without violated clauses."""
-    every = itertools.product((0, 1), repeat=size.variables)
-    return {values for values in every if not count_violated(literals, values, size)}
+    """Returns all assignments that satisfy every clause."""
+    every = np.array(list(itertools.product((0, 1), repeat=size.variables)))
+    true = (every[:, literals // 2] == literals % 2).sum(axis=2)
+    good = ((true > 0) & ((true < 3) | (not size.differ))).all(axis=1)
+    return {tuple(values) for values in every[good].tolist()}
 
 
 @SIZES
@@ -77,20 +74,12 @@ def test_demonstrated_solution_is_uniform_among_all_solutions(size):
     ranks = []
     for seed in range(1500):
         literals, solution = formulas.draw(size, seed)
-        every = sorted(enumerate_solutions_fast(literals, size))
+        every = sorted(enumerate_solutions(literals, size))
         if len(every) == 4:
             ranks.append(every.index(tuple(solution)))
     counts = np.bincount(ranks, minlength=4)
     assert len(ranks) > 60
     assert ((counts - len(ranks) / 4) ** 2).sum() / (len(ranks) / 4) < 16.3  # p = 0.001
-
-
-def enumerate_solutions_fast(literals, size):
-    """Vectorises `enumerate_solutions`."""
-    every = np.array(list(itertools.product((0, 1), repeat=size.variables)))
-    true = (every[:, literals // 2] == literals % 2).sum(axis=2)
-    good = ((true > 0) & ((true < 3) | (not size.differ))).all(axis=1)
-    return {tuple(values) for values in every[good].tolist()}
 
 
 @SIZES
@@ -121,26 +110,13 @@ def test_episodes_succeed_exactly_for_solutions(size):
         assert succeeded == solutions
 
 
-@functools.cache
-def renamed(size):
-    """Compiles a function that cuts a window at a step of the demonstrations, and renames it."""
-    domain = make(NAMES[size], Settings())
-    data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
-    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
-    cut = functools.partial(windows.window, steps, context=2, horizon=size.variables, end=END)
-
-    def both(key, index):
-        return cut(index), formulas.rename(key, cut(index))
-
-    return jax.jit(both)
-
-
 @SIZES
 @pytest.mark.parametrize("step", [0, 1, 4])
 def test_renamed_windows_have_the_renamed_solutions(size, step):
     seen, rest = set(), size.variables - step
+    _, change = compile_augmentation("satisfiability", NAMES[size])
     for seed, episode in itertools.product(range(5), range(2)):
-        pair = renamed(size)(jax.random.key(seed), episode * size.variables + step)
+        pair = change(jax.random.key(seed), episode * size.variables + step)
         before, window = jax.tree.map(np.asarray, pair)
         old, new = before.context.observation, window.context.observation
         # The new literal of each old literal, read from the clauses, whose order stays.
@@ -222,22 +198,6 @@ def turn(size, horizon):
 
 
 @SIZES
-def test_turned_formulas_have_the_renamed_solutions(size):
-    (formula, _), seen = start(size, 0), set()
-    solutions = enumerate_solutions_fast(formula.literals, size)
-    for seed in range(5):
-        context, places, names = turn(size, 6)(jax.random.key(seed), observe(size, formula))
-        new, places, names = jax.tree.map(np.asarray, (context.observation, places, names))
-        assert new.variable == 0 and (new.values == OPEN).all()
-        assert sorted(places) == [*range(6)] and (np.sort(names) == [0, 1, END]).all()
-        renamed = {tuple(names[t, values[t]] for t in places) for values in solutions}
-        assert len(renamed) == len(solutions) > 0
-        assert enumerate_solutions_fast(new.literals, size) == renamed
-        seen.add(new.literals.tobytes())
-    assert len(seen) == 5
-
-
-@SIZES
 def test_turning_does_not_change_the_energy_of_the_rules(size):
     horizon, rng = 8, np.random.default_rng(0)  # two positions are after the last variable
     plain = rules(size.differ)
@@ -253,13 +213,18 @@ def test_turning_does_not_change_the_energy_of_the_rules(size):
             for one, seen in ((energy, memory), (plain, same))
         ]
 
-    totals = set()
+    totals, turned = set(), set()
     for seed in range(20):
         plan = rng.choice([0, 1, MASK], horizon, p=[0.4, 0.4, 0.2])
-        found, expected = weigh(jax.random.key(seed), plan)
+        key = jax.random.key(seed)
+        found, expected = weigh(key, plan)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
         totals.add(float(expected[0]))
+        formula = turn(size, horizon)(key, context).context.observation
+        assert formula.variable == 0 and (formula.values == OPEN).all()
+        turned.add(np.asarray(formula.literals).tobytes())
     assert len(totals) > 2  # so that an inverted permutation fails
+    assert len(turned) == 20
 
 
 @SIZES
@@ -272,12 +237,9 @@ def test_formulas_are_turned_only_for_plans_of_all_variables(size, known, horizo
     np.testing.assert_array_equal(turned.names, np.tile(np.arange(3), (horizon, 1)))
 
 
-def make_agent(**model):
-    config = find_preset("satisfiability", "Sat6x20", "leap", "leapjax")
-    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0, **model)
-    domain = make("Sat6x20", Settings(rounds=1))
-    setup = Setup(domain, 0, SAT.variables, model, config.training, config.method_settings)
-    return find_method("leap").make_agent(setup, None)
+make_agent = functools.partial(
+    make_leap_agent, "satisfiability", make("Sat6x20", Settings(rounds=1))
+)
 
 
 def test_network_ignores_the_order_of_clauses_literals_and_variables():
@@ -342,7 +304,7 @@ def test_solvers_find_a_solution_if_one_exists(size):
         if seed % 2:  # any signs: many of these have no solution
             literals = literals ^ rng.integers(2, size=literals.shape, dtype=np.int32)
             literals = np.concatenate([literals, literals ^ (np.arange(3) == seed % 3)])
-        every = enumerate_solutions_fast(literals, size)
+        every = enumerate_solutions(literals, size)
         found = satisfiability_solvers.backtrack(literals, size).values
         assert tuple(found) in every if every else found is None
         walked = satisfiability_solvers.walk(literals, size, seed)
@@ -357,20 +319,6 @@ def test_walk_does_not_start_at_the_drawn_solution():
         for seed in range(10)
     ]
     assert min(steps) > 0
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("Sat20", "unknown level 'Sat20': expected Sat<variables>x<clauses> or"),
-        ("sat20x91", "did you mean Sat20x91"),
-        ("Sat2x3", r"level Sat2x3: variables must be in 3 .. 100, got 2"),
-        ("Nae4x25", "level Nae4x25: at most 24 clauses exist, got 25"),
-    ],
-)
-def test_unknown_levels_raise_an_error(name, message):
-    with pytest.raises(UserError, match=message):
-        formulas.find_level(name)
 
 
 def test_invalid_demonstrations_raise_an_error():

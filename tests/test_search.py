@@ -374,21 +374,6 @@ def test_judges_energy_and_sum_choose_different_beams():
 # Dead ends.
 
 
-def test_dead_ends_do_not_crowd_out_allowed_plans():
-    """Only (1, 1) is allowed. Action 0 costs less, but leads to a dead end."""
-    energy = Energy(
-        lambda params, context: None,
-        lambda params, memory, actions, positions: (
-            -jnp.log(jnp.where(positions[:, None] == 0, jnp.array([0.5, 0.4]), 0.05))
-        ),
-        lambda params, memory, actions: jnp.zeros(()),
-        2,
-    )
-    only = constrain(energy, lambda context, plan: jnp.where((plan == 1).all(), 0.0, jnp.inf))
-    plan = plan_for(BeamConfig(2, 2), only)
-    assert plan.actions.tolist() == [1, 1] and plan.satisfied
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10**6),

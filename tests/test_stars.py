@@ -12,19 +12,16 @@ from PIL import Image
 
 from experiments import stars
 from experiments.common import searches
-from leapjax.agents.base import Setup
 from leapjax.data import windows
 from leapjax.domain import blank_context
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.stars.domain import Settings, make
 from leapjax.domains.puzzles.stars.graphs import Star, StarAdapter
 from leapjax.errors import UserError
-from leapjax.methods import find_method
 from leapjax.models.config import ModelConfig
-from leapjax.presets import find_preset
 from leapjax.running import results
 from leapjax.types import pad_token
-from tests.parameters import random_parameters
+from tests.parameters import make_leap_agent, random_parameters
 from tests.programs import only_long
 
 STAR = Star(arms=3, length=4)
@@ -135,7 +132,7 @@ def test_leaving_out_arms_keeps_the_path_and_whole_arms():
 
 def test_training_batches_shuffle_edges():
     """Leaving out arms puts the goal's arm first, so batches must shuffle the edges again."""
-    agent = make_agent(fewer_arms=True)
+    agent = make_leap_agent("stars", make("Star3x4", Settings(fewer_arms=True)))
     steps = jax.tree.map(jnp.asarray, windows.concatenate(collect_episodes()))
     graph = jax.device_get(jax.jit(agent.batch)(jax.random.key(0), steps)).context.observation
     kept = {len(np.unique(edges, axis=0)) for edges in graph.edges}
@@ -144,16 +141,8 @@ def test_training_batches_shuffle_edges():
     assert counts.min() > 0 and counts.max() < 3 * counts.mean()
 
 
-def make_agent(**settings):
-    config = find_preset("stars", "Star3x4", "leap", "leapjax")
-    model = ModelConfig(layers=1, heads=2, width=16, dropout=0.0)
-    domain = make("Star3x4", Settings(**settings))
-    setup = Setup(domain, 0, config.planner.horizon, model, config.training, config.method_settings)
-    return find_method("leap").make_agent(setup, None)
-
-
 def test_network_ignores_the_order_of_edges():
-    agent, context = make_agent(), blank_context(DOMAIN, 0)
+    agent, context = make_leap_agent("stars", DOMAIN), blank_context(DOMAIN, 0)
     params = random_parameters(agent)
     graph, _ = graphs.draw(STAR, 0)
     blank = np.full(STAR.length, DOMAIN.num_actions)
@@ -168,19 +157,6 @@ def test_network_ignores_the_order_of_edges():
     flipped = graph._replace(edges=graph.edges[:, ::-1])
     np.testing.assert_allclose(energies(shuffled), found, rtol=1e-4)
     assert np.abs(energies(flipped) - found)[:, :LABELS].max() > 1e-4
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("Star3", "unknown level 'Star3': expected Star<arms>x<edges of an arm>"),
-        ("star3x5", "did you mean Star3x5"),
-        ("Star100x100", "has 10001 nodes: at most 1000"),
-    ],
-)
-def test_unknown_levels_raise_an_error(name, message):
-    with pytest.raises(UserError, match=message):
-        graphs.find_level(name)
 
 
 def test_unknown_presets_and_invalid_data_raise_an_error(capsys):

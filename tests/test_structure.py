@@ -2,10 +2,7 @@
 
 import importlib
 import inspect
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,19 +13,13 @@ from leapjax import types
 from leapjax.agents.base import TrainingConfig
 from leapjax.models.config import ModelConfig
 from leapjax.running import jax_setup, results
-from tests.programs import LONG, ROOT
-
-
-def test_the_public_names_are_sorted_and_exist():
-    assert leapjax.__all__ == sorted(leapjax.__all__)
-    assert all(hasattr(leapjax, name) for name in leapjax.__all__)
-    assert set(leapjax.__all__) <= set(dir(leapjax))
-    assert not hasattr(leapjax, "no_such_name")
+from tests.programs import LONG, ROOT, run_python
 
 
 def test_the_public_names_are_documented():
     listed = re.findall(r"^::: leapjax\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
     assert sorted(listed) == leapjax.__all__
+    assert set(listed) <= set(dir(leapjax)) and not hasattr(leapjax, "no_such_name")
     for name in leapjax.__all__:
         doc = inspect.getdoc(getattr(leapjax, name)) or ""
         assert len(doc) > 20 and not doc.startswith(f"{name}("), name
@@ -120,7 +111,9 @@ def test_imports_and_command_lines_start_no_backend():
     ]
     modules = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
     program = f"""
-import importlib, os, jax
+import importlib, os
+del os.environ["JAX_NUM_CPU_DEVICES"]
+import jax
 for name in {[name for name in modules if not name.endswith("__init__")]}:
     importlib.import_module(name)
 from leapjax.running import jax_setup, command_line
@@ -129,9 +122,7 @@ for method in ("leap", "classifier", "random"):
 jax_setup.start()
 assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()
 """
-    environment = {k: v for k, v in os.environ.items() if k != "JAX_NUM_CPU_DEVICES"}
-    environment["LEAPJAX_COMPILATION_CACHE"] = "off"
-    subprocess.run([sys.executable, "-c", program], check=True, env=environment, cwd=ROOT)
+    assert run_python("-c", program, LEAPJAX_COMPILATION_CACHE="off").returncode == 0
 
 
 @pytest.mark.parametrize("name", report.EXPERIMENTS)

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from leapjax.models.transformer import Transformer, causal_mask
+from leapjax.models.transformer import Transformer
 from tests.parameters import random_like
 from tests.quick import quick_jit
 
@@ -105,13 +105,6 @@ def test_a_cached_prefix_equals_running_all_tokens_together():
     # Both masks matter.
     for other in (joint_mask(mask=TOKEN_MASK), joint_mask(PREFIX_MASK)):
         assert np.abs(oracle(PARAMS, JOINED, other)[PREFIX:] - expected).max() > 0.05
-
-
-def test_a_causal_mask_hides_later_tokens():
-    for prefix in (0, PREFIX):
-        tokens = range(prefix + TOKENS)
-        expected = [[j < prefix or j - prefix <= i for j in tokens] for i in EVERYWHERE]
-        np.testing.assert_array_equal(causal_mask(TOKENS, prefix), expected)
 
 
 def test_outputs_at_queried_positions_equal_the_full_outputs():

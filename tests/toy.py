@@ -1,12 +1,16 @@
 """A toy world whose networks compile in seconds: walk along a line to its middle."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from leapjax import training
+from leapjax.data import windows
 from leapjax.domain import Augmentations, Domain
+from leapjax.fitting import make_domain
 from leapjax.models.encoder import Encoder
 from leapjax.types import Demonstration
 from tests.quick import quick_jit
@@ -61,6 +65,26 @@ DOMAIN = Domain(
     encoders={"leapjax": lambda model, sizes: Token(model.width)},
     augmentations=Augmentations([mirror]),
 )
+
+
+@functools.cache
+def compile_augmentation(name, level):
+    """Collects demonstrations, and compiles a function that augments their window at a step.
+
+    Returns:
+        The demonstrations, and (key, step) -> the window before and after augmentation.
+    """
+    domain = make_domain(name, level)
+    data = domain.demonstrations.collect(4, 0, lambda done: None).demonstrations
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
+    sizes = {"context": 2, "horizon": domain.max_steps, "end": domain.num_actions - 1}
+    (augment,) = domain.augmentations.functions
+
+    def cut(key, step):
+        window = windows.window(steps, step, **sizes)
+        return window, augment(key, window)
+
+    return data, jax.jit(cut)
 
 
 def learn(agent, data, steps):
