@@ -79,7 +79,7 @@ def play(level: Level, played: Sequence[int]) -> dict[str, Any]:
     lengths = [len(each.actions) for each in found if each is not None]
     return {
         "episodes": len(played),
-        "successes": len(played) - dropped[FAILED],  # those that end at another match count, too
+        "successes": len(played) - dropped[FAILED],  # episodes that end at another match count, too
         "mean_success_length": float(np.mean(lengths)) if lengths else None,
     }
 

@@ -1,7 +1,7 @@
 """Sudoku: `python -m experiments.sudoku --help`.
 
-Trains a method to fill boards that it has never seen, then plans with what was trained in every
-way that there is, and reports success against the passes of the model that each takes.
+Trains a method on solved boards, then fills new boards with every search, and reports success
+against the passes that each search takes.
 """
 
 import sys

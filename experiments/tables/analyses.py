@@ -12,8 +12,8 @@ ANALYSES = {
     for program in (properties, stochastic, suboptimal, ablation)
 }
 PRESETS = ("paper", "leapjax")
-# One way for each method: LEAP executes whole plans, DT and IQL choose single actions. Sums stand
-# beside one of their parts.
+# One way for each method: LEAP executes whole plans, DT and IQL choose single actions. Below each
+# sum stands one part of it.
 AS_THE_PAPER = ("whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql")
 OF_THE_PAPER = ("adaptation", "generalization", "composition")
 EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))

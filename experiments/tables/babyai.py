@@ -59,7 +59,7 @@ BY_ITERATIONS = {
     for title, setting in ITERATED.items()
     for n in ITERATIONS
 }
-# The planner of all levels: what it plays, by level.
+# The planner of all levels on a single level, by level.
 EVERY = {
     name: Setting("leapjax", changes={"play": name}) for name in list_played(find_level("BabyAI"))
 }
@@ -73,7 +73,7 @@ USED = (
 def is_used(row: Row) -> bool:
     """Tells whether a row is in a table or a figure."""
     if row["level"] in MIXTURES:
-        return EVERY.get(row["played"], OURS).has(row)  # all in turn, or one of them
+        return EVERY.get(row["played"], OURS).has(row)  # a single level, or all levels
     return row["level"] in LEVELS and any(setting.has(row) for setting in USED)
 
 

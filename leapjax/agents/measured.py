@@ -20,8 +20,8 @@ def measure_settings(settings: Any, demonstrations: Sequence[Demonstration]) -> 
     """Returns settings of a method with a target return and a scale of rewards from the data.
 
     Args:
-        settings: settings of a method; what they give stays.
-        demonstrations: training data; if there are none, the settings stay as they are.
+        settings: settings of a method; values that they give stay.
+        demonstrations: training data; without data the settings stay as they are.
     """
     found: dict[str, float] = {}
     if demonstrations and lacks_target(settings):

@@ -73,7 +73,7 @@ def _together(level: Level, method: str) -> AnyConfig:
         preset="leapjax",
         demos=common.demonstrations(method, 300 * len(level.members)),
         episodes=200,  # of each level, too
-        context=64,  # past steps that show what was done
+        context=64,  # past steps, which show the tasks that are done
         model=common.our_model(method),
         training=common.our_training(method, steps=_steps(level), learning_rate=1.5e-3),
         planner=_our_search(level, method),

@@ -104,12 +104,12 @@ def complete(run: Run, versions: Mapping[str, str]) -> results.Row:
 
 
 def compare(experiment: Experiment, configs: Sequence[AnyConfig], console: Console) -> None:
-    """Prints how solvers that learn nothing do on the levels that were played, each level once."""
+    """Prints the results of solvers without learning on each played level."""
     if experiment.compare is None:
         return
     played = {config.play or config.level: choose_episode_seeds(config) for config in configs}
     for level, seeds in played.items():
-        console.print(f"{level}, solvers that learn nothing:")
+        console.print(f"{level}, solvers without learning:")
         console.print(experiment.compare(level, seeds))
 
 

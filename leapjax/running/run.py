@@ -37,7 +37,7 @@ class Experiment(NamedTuple):
         searches: (configuration) -> configurations that plan in other ways with the trained
             parameters; each makes a row. `None` if the experiment has a single way.
         animate: (planner, run, level seeds, path); draws how plans are refined and executed.
-        compare: (level, level seeds) -> table of solvers that learn nothing, on the same levels.
+        compare: (level, level seeds) -> table of solvers without learning, on the same levels.
         iterations: whether to draw success against the number of iterations.
         config: `Config`, or a subclass with the program's own names of options.
         paper: (level, method) -> the paper's success, in percent, or `None`. The field is `None` if

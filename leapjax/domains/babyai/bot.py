@@ -9,7 +9,7 @@ from minigrid.envs.babyai.core.roomgrid_level import RoomGridLevel
 from minigrid.envs.babyai.core.verifier import PutNextInstr
 from minigrid.utils.baby_ai_bot import BabyAIBot, DropSubgoal, GoNextToSubgoal, OpenSubgoal
 
-FOLLOW, MEASURE, DROP = "follow", "measure", "drop"  # what a path is searched for
+FOLLOW, MEASURE, DROP = "follow", "measure", "drop"  # purposes of a path
 MOST_LOOKS = 200  # looks at its subgoals after which a bot without an action is stuck
 
 
