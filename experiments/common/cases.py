@@ -13,7 +13,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from rich.console import Console
 from rich.table import Table
@@ -102,6 +102,12 @@ def draw_at(temperature: float) -> Callable[[Any], PlannerConfig]:
 NOISE = draw_at(4.0)
 
 
+class CountingAdapter(Adapter, Protocol):
+    """An adapter that counts violations of constraints, over all its episodes."""
+
+    violations: int
+
+
 class Case(NamedTuple):
     """Models, and the level that they plan on.
 
@@ -110,7 +116,7 @@ class Case(NamedTuple):
         models: the models.
         level: level to play.
         ways: ways to plan.
-        adapter: (level) -> adapter, by default the level's own; rows sum its `violations`. See
+        adapter: (level) -> adapter that counts violations; by default the level's own adapter. See
             `describe_function`.
     """
 
@@ -118,7 +124,7 @@ class Case(NamedTuple):
     models: Sequence[Model]
     level: str
     ways: Sequence[Way]
-    adapter: Callable[[str], Adapter] | None = None
+    adapter: Callable[[str], CountingAdapter] | None = None
 
 
 class Analysis(NamedTuple):
@@ -457,12 +463,14 @@ def play(
     specification = models[0].specification
     search = way.search(specification.planner)
     domain = make_played_domain(case.level, models)
-    adapters: list[Adapter] = []
+    counting: list[CountingAdapter] = []
     compile_seconds = 0.0
 
     def make_adapter() -> Adapter:
-        adapters.append(case.adapter(case.level) if case.adapter else domain.make_adapter())
-        return adapters[-1]
+        if case.adapter is None:
+            return domain.make_adapter()
+        counting.append(case.adapter(case.level))
+        return counting[-1]
 
     def episodes(config: PlannerConfig) -> Episodes:
         nonlocal compile_seconds
@@ -470,7 +478,7 @@ def play(
         begun = time.perf_counter()
         planner.compile(options.episodes, way.executed)
         compile_seconds += time.perf_counter() - begun
-        adapters.clear()
+        counting.clear()
         return rollouts.evaluate(
             make_adapter, options.played, planner.plan, planner.params,
             context=planner.specification.context, seed=seed, executed=way.executed,
@@ -482,7 +490,6 @@ def play(
         one = dataclasses.replace(search, iterations=1, fill="together", restarts=1)
         first_pass = int(episodes(one).successes.sum())
     found = episodes(search)
-    violations = [adapter.violations for adapter in adapters if hasattr(adapter, "violations")]
     good = found.lengths[found.successes]
     row = {
         "level": case.level,
@@ -497,7 +504,7 @@ def play(
         "successes": int(found.successes.sum()),
         "success": float(found.successes.mean()),
         "first_pass_successes": first_pass,
-        "violations": sum(violations) if violations else None,
+        "violations": sum(each.violations for each in counting) if case.adapter else None,
         "mean_length": float(found.lengths.mean()),
         "mean_success_length": float(good.mean()) if len(good) else None,
         "planner": {"kind": type(search).__name__, **dataclasses.asdict(search)},

@@ -19,36 +19,28 @@ from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
 from leapjax.agents.q_learning import apply_to_transition, make_transition_encoder
-from leapjax.agents.rewards import check_reward_scale
+from leapjax.agents.rewards import ValueSettings
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
-from leapjax.checks import LARGEST, check_types, check_within
+from leapjax.checks import LARGEST, check_within
 from leapjax.models.policy import Outputs
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class Settings(ValueSettings):
     """The options of BCQ alone. The defaults are the original's, except the target network's.
 
     Attributes:
         threshold: Smallest probability of an allowed action, as a share of the likeliest action's.
-        discount: Discount of rewards per step.
-        reward_scale: Divisor of rewards; `None` takes the largest discounted return of the data, in
-            absolute value, so that values lie in -1 .. 1.
-        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
         logit_penalty: Weight of the squares of the behaviour model's logits in the loss.
     """
 
     threshold: float = 0.3
-    discount: float = 0.99
-    reward_scale: float | None = 1.0
-    target_rate: float = 0.005
     logit_penalty: float = 0.01
 
     def __post_init__(self) -> None:
-        check_types(self)
-        check_reward_scale(self.reward_scale)
-        check_within(self, 0, 1, "threshold", "discount", "target_rate")
+        super().__post_init__()
+        check_within(self, 0, 1, "threshold")
         check_within(self, 0, LARGEST, "logit_penalty")
 
 

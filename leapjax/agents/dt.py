@@ -11,23 +11,12 @@ from jax.sharding import Mesh
 from leapjax.agents import returns
 from leapjax.agents.base import Method, Setup
 from leapjax.agents.imitation import make_imitator
-from leapjax.checks import check_types
 from leapjax.types import Agent
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """The options of Decision Transformer alone.
-
-    Attributes:
-        target_return: Return of an episode to aim for while acting; `None` for a high return of the
-            training data (`returns.QUANTILE`).
-    """
-
-    target_return: float | None = 1.0
-
-    def __post_init__(self) -> None:
-        check_types(self)
+class Settings(returns.ReturnSettings):
+    """The options of Decision Transformer."""
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

@@ -19,16 +19,16 @@ from leapjax.agents.base import Method, Setup
 from leapjax.agents.batch_loss import average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
-from leapjax.agents.rewards import check_reward_scale
+from leapjax.agents.rewards import ValueSettings
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
-from leapjax.checks import LARGEST, check_types, check_within
+from leapjax.checks import LARGEST, check_within
 from leapjax.data import windows
 from leapjax.models.policy import Outputs, PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class Settings(ValueSettings):
     """The options of IQL alone.
 
     The IQL paper uses this expectile for ant mazes, and this inverse temperature for locomotion.
@@ -39,23 +39,15 @@ class Settings:
         inverse_temperature: Factor of the advantages in the exponential weights of the cloned
             actions.
         largest_weight: Upper bound of those weights.
-        discount: Discount of rewards per step.
-        reward_scale: Divisor of rewards; `None` takes the largest discounted return of the data, in
-            absolute value, so that values lie in -1 .. 1.
-        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
     """
 
     expectile: float = 0.9
     inverse_temperature: float = 3.0
     largest_weight: float = 100.0
-    discount: float = 0.99
-    reward_scale: float | None = 1.0
-    target_rate: float = 0.005
 
     def __post_init__(self) -> None:
-        check_types(self)
-        check_reward_scale(self.reward_scale)
-        check_within(self, 0, 1, "expectile", "discount", "target_rate")
+        super().__post_init__()
+        check_within(self, 0, 1, "expectile")
         check_within(self, 0, LARGEST, "inverse_temperature", "largest_weight")
 
 

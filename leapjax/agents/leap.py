@@ -14,8 +14,8 @@ from leapjax.agents.base import Method, Setup
 from leapjax.agents.batch_loss import average_loss, make_window_encoder
 from leapjax.agents.batches import run_batches, window_batches
 from leapjax.agents.optimizer import make_optimizer
+from leapjax.agents.returns import ReturnSettings
 from leapjax.agents.update import make_init, make_update
-from leapjax.checks import check_types
 from leapjax.data import windows
 from leapjax.energy import pseudo_likelihood, symmetric
 from leapjax.errors import UserError
@@ -24,7 +24,7 @@ from leapjax.types import Agent, Context, Params, PyTree, Window, mask_token, pa
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class Settings(ReturnSettings):
     """The options of LEAP alone.
 
     Attributes:
@@ -34,23 +34,26 @@ class Settings:
             loss skips it.
         repeat_state: Show the whole state to every position (eq. 4). Otherwise later positions see
             the state without the agent's pose.
-        returns: Condition plans on the return to go, as Decision Transformer does.
-        target_return: Return of an episode to aim for while acting; `None` for a high return of the
-            training data. It needs `returns`.
+        returns: Condition plans on the return to go, as Decision Transformer does. Only then the
+            target return has an effect.
     """
 
     masking: str = "one"
     end: bool = True
     repeat_state: bool = True
     returns: bool = False
-    target_return: float | None = 1.0
 
     def __post_init__(self) -> None:
-        check_types(self)
+        super().__post_init__()
         if self.masking not in schedules.MASKINGS:
             raise ValueError(
                 f"unknown masking {self.masking!r}: expected one of {', '.join(schedules.MASKINGS)}"
             )
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether the network reads returns to go."""
+        return self.returns
 
 
 def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:

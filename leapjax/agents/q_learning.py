@@ -1,6 +1,5 @@
 """The agent that CQL, QR-DQN and REM share: it learns Q-values, and chooses the highest."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,36 +13,10 @@ from leapjax.agents.base import Setup
 from leapjax.agents.batch_loss import EncodeExamples, average_loss
 from leapjax.agents.batches import transition_batches
 from leapjax.agents.optimizer import make_optimizer
-from leapjax.agents.rewards import check_reward_scale
 from leapjax.agents.update import apply_to_context, follow_parameters, make_init, make_update
-from leapjax.checks import check_types, check_within
 from leapjax.data import windows
 from leapjax.models.policy import Outputs, PolicyModel
 from leapjax.types import Agent, Context, Params, PyTree, TransitionWindow
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """The options that CQL, QR-DQN and REM share.
-
-    The target network moves a little at every step. The originals copy the network to it instead,
-    every 8,000 steps (Agarwal et al.) or every 2,000 steps (d3rlpy).
-
-    Attributes:
-        discount: Discount of rewards per step.
-        reward_scale: Divisor of rewards; `None` takes the largest discounted return of the data, in
-            absolute value, so that values lie in -1 .. 1.
-        target_rate: How far the target network moves towards the network at each step, in 0 .. 1.
-    """
-
-    discount: float = 0.99
-    reward_scale: float | None = 1.0
-    target_rate: float = 0.005
-
-    def __post_init__(self) -> None:
-        check_types(self)
-        check_reward_scale(self.reward_scale)
-        check_within(self, 0, 1, "discount", "target_rate")
 
 
 class TransitionOutputs(NamedTuple):

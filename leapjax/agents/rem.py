@@ -14,12 +14,13 @@ from jax.sharding import Mesh
 from leapjax.agents import losses, q_learning
 from leapjax.agents.base import Method, Setup
 from leapjax.agents.q_learning import MakeTargets, TransitionOutputs
+from leapjax.agents.rewards import ValueSettings
 from leapjax.checks import check_at_least
 from leapjax.types import Agent
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings(q_learning.Settings):
+class Settings(ValueSettings):
     """The options of REM. The defaults are the original's, except the target network's.
 
     Attributes:

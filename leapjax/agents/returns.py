@@ -1,5 +1,6 @@
 """Returns to go, on which Decision Transformer and LEAP can be conditioned (Chen et al., 2021)."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from leapjax.agents.base import Setup
+from leapjax.checks import check_types
 from leapjax.errors import UserError
 from leapjax.types import Context, Demonstration
 
@@ -18,9 +20,29 @@ ComputeReturns = Callable[..., jax.Array | None]
 # network, or `None` if it has no such input. While acting, the second argument is `None`.
 
 
+@dataclasses.dataclass(frozen=True)
+class ReturnSettings:
+    """The options of every method that can be conditioned on returns.
+
+    Attributes:
+        target_return: Return of an episode to aim for while acting; `None` for a high return of the
+            training data.
+    """
+
+    target_return: float | None = 1.0
+
+    def __post_init__(self) -> None:
+        check_types(self)
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether the network reads returns to go."""
+        return True
+
+
 def aims_for_return(settings: Any) -> bool:
     """Returns whether a method with these settings is conditioned on returns."""
-    return hasattr(settings, "target_return") and getattr(settings, "returns", True)
+    return isinstance(settings, ReturnSettings) and settings.conditioned
 
 
 def lacks_target(settings: Any) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from leapjax.agents.rewards import ValueSettings
 from leapjax.types import Demonstration
 
 TOLERANCE = 0.1  # of the width of the range: a network errs a little
@@ -17,12 +18,13 @@ def judge_values(
     """Returns a warning if a method has learned values that rewards do not allow, else `None`.
 
     Args:
-        settings: settings of the method; methods without a `discount` learn no values.
+        settings: settings of the method.
         demonstrations: training data.
         means: the last mean metrics of training, of which "value" is the mean value.
     """
-    if not hasattr(settings, "discount") or "value" not in means or not demonstrations:
+    if not isinstance(settings, ValueSettings) or "value" not in means or not demonstrations:
         return None
+    assert settings.reward_scale is not None  # the data have given it
     limits = find_value_range(settings.discount, demonstrations)
     low, high = (limit / settings.reward_scale for limit in limits)
     slack = TOLERANCE * (high - low)

@@ -131,6 +131,16 @@ class GibbsConfig:
         """Whether there are several plans to compare."""
         return self.restarts > 1 or self.keep == "best"
 
+    @property
+    def plans_together(self) -> int:
+        """The plans of one context that the planner makes at a time."""
+        return self.restarts if self.enough is None else 1  # or else one restart after the other
+
+    @property
+    def needs_totals(self) -> bool:
+        """Whether the planner computes total energies."""
+        return self.score or (self.is_judged and self.judge == "energy")
+
 
 def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None:
     """Checks how a configuration fills plans.
@@ -178,6 +188,16 @@ class ShootingConfig:
         check_types(self)
         check_at_least(self, 1, "horizon", "candidates")
 
+    @property
+    def plans_together(self) -> int:
+        """The plans of one context that the planner makes at a time."""
+        return self.candidates
+
+    @property
+    def needs_totals(self) -> bool:
+        """Whether the planner computes total energies."""
+        return True
+
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropyConfig:
@@ -203,6 +223,16 @@ class CrossEntropyConfig:
         check_at_least(self, 1, "horizon", "iterations", "candidates", "elites")
         if self.elites > self.candidates:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
+
+    @property
+    def plans_together(self) -> int:
+        """The plans of one context that the planner makes at a time."""
+        return self.candidates
+
+    @property
+    def needs_totals(self) -> bool:
+        """Whether the planner computes total energies."""
+        return True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,12 +279,22 @@ class BeamConfig:
         """Passes at most: each chooses at least one action of every plan."""
         return self.horizon
 
+    @property
+    def plans_together(self) -> int:
+        """The plans of one context that the planner makes at a time."""
+        return self.beams
+
+    @property
+    def needs_totals(self) -> bool:
+        """Whether the planner computes total energies."""
+        return self.score or self.judge == "energy"
+
 
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
 
 
 def passes_vary(config: PlannerConfig) -> bool:
     """Returns whether some plans take fewer passes than others with the same configuration."""
-    if not isinstance(config, GibbsConfig | BeamConfig):
-        return False
-    return make_commitment(config).adapts or getattr(config, "enough", None) is not None
+    if isinstance(config, GibbsConfig):
+        return make_commitment(config).adapts or config.enough is not None
+    return isinstance(config, BeamConfig) and make_commitment(config).adapts

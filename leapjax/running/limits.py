@@ -6,13 +6,15 @@ from collections.abc import Sequence
 import jax
 
 from leapjax import checkpoints, pretrained
+from leapjax.agents import leap
+from leapjax.agents.returns import ReturnSettings
 from leapjax.checks import check_integer, check_number
 from leapjax.configuration import AnyConfig, choose_episode_seeds, make_domain, specify
 from leapjax.data import seeds, storage
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
-from leapjax.planners import GibbsConfig
+from leapjax.planners import BeamConfig, GibbsConfig
 from leapjax.planners.guard import SCORED_TOGETHER
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
@@ -81,7 +83,8 @@ def check(config: AnyConfig) -> None:
     check_memory(config, domain)
     # Making an agent is cheap, and raises an error for options that its method lacks.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
-    fill = getattr(config.planner, "fill", "together")
+    search = config.planner
+    fill = search.fill if isinstance(search, GibbsConfig | BeamConfig) else "together"
     if not agent.energy.accepts_mask and fill != "together":
         raise UserError(
             f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
@@ -110,7 +113,7 @@ def check_target_return(config: AnyConfig) -> None:
         UserError: names the missing option.
     """
     settings = config.method_settings
-    if getattr(settings, "returns", True):
+    if not isinstance(settings, ReturnSettings) or settings.conditioned:
         return
     default = find_preset(config.domain, config.level, config.method, config.preset).method_settings
     if settings.target_return != default.target_return:
@@ -145,8 +148,9 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         + min(config.episodes, MOST_OPEN) * context,
     }  # fmt: skip
     if training.steps and config.checkpoint is None:
-        masking = getattr(config.method_settings, "masking", "one")
-        copies = horizon if masking in COPYING else 1
+        settings = config.method_settings
+        copied = isinstance(settings, leap.Settings) and settings.masking in COPYING
+        copies = horizon if copied else 1
         together = min(training.batch, training.microbatch or training.batch)
         activations = together * copies * model.layers * layer
         needs["--batch, --context, --horizon"] = training.batch * context + activations
@@ -156,15 +160,13 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation
     # The planner makes plans in one batch, and scores restarts and candidates a few at a time, with
     # T passes each.
-    many = getattr(search, "beams", getattr(search, "candidates", getattr(search, "restarts", 1)))
-    if getattr(search, "enough", None) is not None:
-        many = 1  # one restart after the other
-    judged = getattr(search, "judge", "energy") == "energy" and getattr(search, "is_judged", True)
-    scored = judged or search.score
-    passes = max(many, min(many, SCORED_TOGETHER) * horizon if scored else 1)
+    many = search.plans_together
+    passes = max(many, min(many, SCORED_TOGETHER) * horizon if search.needs_totals else 1)
     plans = min(*choose_chunk_sizes(config), config.episodes)
-    choices = 4 * many * (search.iterations if isinstance(search, GibbsConfig) else 1)
-    drawn = getattr(search, "resampled", 1) * domain.num_actions + horizon
+    rounds, chosen = 1, 1  # positions are chosen in each round
+    if isinstance(search, GibbsConfig):
+        rounds, chosen = search.iterations, search.resampled
+    choices, drawn = 4 * many * rounds, chosen * domain.num_actions + horizon
     needs["--iterations, --restarts, --beams, --candidates, --horizon"] = plans * (
         passes * layer + choices * drawn
     )
