@@ -1,11 +1,11 @@
 """The noise of each method on BabyAI's validation levels: `python -m experiments.noise --help`.
 
-Trains a method, then plays with each temperature. One rule chooses the noise of every method: the
-temperature that succeeds most.
+Trains a method, then plays with each temperature.
 """
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from experiments.common.searches import change_planner
 from leapjax.configuration import AnyConfig
@@ -16,20 +16,27 @@ from leapjax.running.run import Experiment
 
 # In the units of a method's energy: nats, or Q-values. At 0 the likeliest action is taken.
 TEMPERATURES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, 8.0)
-OPTIONS = ("--validation", "--episodes", "500", "--no-pictures")
+EPISODES = 500
+OPTIONS = ("--validation", "--episodes", str(EPISODES), "--no-pictures")
+
+
+def draw_at(temperature: float, kind: type) -> dict[str, Any]:
+    """Returns the fields of a planner that draws actions at a temperature.
+
+    Beam search draws a single beam, as the other methods draw a single action.
+
+    Args:
+        temperature: temperature; 0 takes the likeliest actions.
+        kind: type of the planner's configuration.
+    """
+    beams = {"beams": 1} if temperature and issubclass(kind, BeamConfig) else {}
+    return {"temperature": temperature, **beams}
 
 
 def try_temperatures(config: AnyConfig) -> list[AnyConfig]:
-    """Returns a configuration for each other temperature.
-
-    Beam search draws a single beam at a temperature, as the other methods draw a single action.
-    """
-    planners = [
-        {"temperature": temperature}
-        | ({"beams": 1} if temperature and isinstance(config.planner, BeamConfig) else {})
-        for temperature in TEMPERATURES
-    ]
-    return change_planner(config, planners)
+    """Returns a configuration for each other temperature."""
+    kind = type(config.planner)
+    return change_planner(config, [draw_at(each, kind) for each in TEMPERATURES])
 
 
 EXPERIMENT = Experiment("noise", "babyai", searches=try_temperatures)

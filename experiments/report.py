@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common import figures
-from experiments.tables import analyses, atari, babyai, measured, puzzles, speed
+from experiments.tables import analyses, atari, babyai, measured, noise, puzzles, speed
 from experiments.tables.analyses import ANALYSES
 from experiments.tables.measured import MEASURED
 from leapjax.errors import UserError
@@ -27,7 +27,7 @@ DOCUMENTS = (
     "docs/search.md",
 )
 PUZZLES = ("stars", "sudoku", "satisfiability")  # experiments, named as their domains
-EXPERIMENTS = ("babyai", "atari", *PUZZLES, *ANALYSES)  # that have rows
+EXPERIMENTS = ("babyai", "noise", "atari", *PUZZLES, *ANALYSES)  # that have rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,6 +115,7 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
         ),
         "iterations": (babyai.compare_iterations, "babyai"),
         "methods": (babyai.compare_methods, "babyai"),
+        "noise": (noise.compare_temperatures, "noise"),
         "every-level": (
             functools.partial(babyai.list_levels, demonstrated=rows["demonstrator"]),
             "babyai",
@@ -169,8 +170,10 @@ def replace_section(text: str, name: str, section: str) -> str:
 
 def is_used(row: Row) -> bool:
     """Tells whether today's code makes such a row; any other row is stale."""
-    if row.get("experiment") in ANALYSES:
+    if row["experiment"] in ANALYSES:
         return analyses.is_used(row)
+    if row["experiment"] == "noise":
+        return noise.is_used(row)
     if row["domain"] in PUZZLES:
         return puzzles.is_used(row)
     return atari.is_used(row) if row["domain"] == "atari" else babyai.is_used(row)

@@ -69,7 +69,7 @@ def _format_cell(of: Analysis, rows: Sequence[Row], published: float | None) -> 
         cell += f", {compute_milliseconds(rows):.1f} ms"
     violations = sum(row["violations"] or 0 for row in rows)
     if violations:
-        cell += f", {violations / sum(row['episodes'] for row in rows):.2f} violations an episode"
+        cell += f", {violations / sum(row['episodes'] for row in rows):.2g} violations an episode"
     return cell
 
 

@@ -37,7 +37,8 @@ SETTINGS = {
 # The paper's methods, and random actions as the floor.
 COMPARED = ("random", "bc", "bcq", "iql", "dt", "plate", "mopo", "leap")
 BASELINES = tuple(method for method in COMPARED if method not in ("random", "leap"))
-# Noise for methods with preset `paper`, chosen on validation levels. It does not help LEAP.
+# Noise for methods with preset `paper`, chosen on validation levels (`experiments.tables.noise`).
+# It does not help BCQ and LEAP.
 NOISE = {
     **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
     "plate": {"beams": 1, "temperature": 4.0},
