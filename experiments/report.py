@@ -170,9 +170,9 @@ def replace_section(text: str, name: str, section: str) -> str:
 
 def is_used(row: Row) -> bool:
     """Tells whether today's code makes such a row; any other row is stale."""
-    if row["experiment"] in ANALYSES:
+    if row.get("experiment") in ANALYSES:
         return analyses.is_used(row)
-    if row["experiment"] == "noise":
+    if row.get("experiment") == "noise":
         return noise.is_used(row)
     if row["domain"] in PUZZLES:
         return puzzles.is_used(row)
