@@ -124,7 +124,7 @@ def test_augmentations_apply_last_to_first_with_separate_keys(data):
 )
 def test_the_loss_is_the_mean_cross_entropy_of_masked_actions(masking, end, data, monkeypatch):
     """Equation 1, one position at a time. Without an end action, PAD is only an input."""
-    setup = make_setup(model=EXACT)._replace(settings=leap.Settings(masking, end))
+    setup = make_setup(model=EXACT)._replace(settings=leap.Settings(masking=masking, end=end))
     agent, horizon = leap.make_agent(setup), setup.horizon
     compiled, step = make_tiny()
     params = (state := compiled.init(jax.random.key(0))).params
@@ -169,7 +169,7 @@ def test_the_loss_is_the_mean_cross_entropy_of_masked_actions(masking, end, data
 
 
 def test_without_an_end_action_no_plan_ends():
-    setup = make_setup()._replace(settings=leap.Settings("each", end=False))
+    setup = make_setup()._replace(settings=leap.Settings(masking="each", end=False))
     energy, params = leap.make_agent(setup).energy, make_tiny()[0].init(jax.random.key(0)).params
     memory = energy.encode(params, blank_context(toy.DOMAIN, 0))
     energies = energy.conditional(params, memory, np.full(4, toy.END + 1), np.arange(4))
