@@ -20,8 +20,8 @@ EPISODES = 500
 OPTIONS = ("--validation", "--episodes", str(EPISODES), "--no-pictures")
 
 
-def draw_at(temperature: float, kind: type) -> dict[str, Any]:
-    """Returns the fields of a planner that draws actions at a temperature.
+def make_noise(temperature: float, kind: type) -> dict[str, Any]:
+    """Makes the fields of a planner that draws actions at a temperature.
 
     Beam search draws a single beam, as the other methods draw a single action.
 
@@ -36,7 +36,7 @@ def draw_at(temperature: float, kind: type) -> dict[str, Any]:
 def try_temperatures(config: AnyConfig) -> list[AnyConfig]:
     """Returns a configuration for each other temperature."""
     kind = type(config.planner)
-    return change_planner(config, [draw_at(each, kind) for each in TEMPERATURES])
+    return change_planner(config, [make_noise(each, kind) for each in TEMPERATURES])
 
 
 EXPERIMENT = Experiment("noise", "babyai", searches=try_temperatures)

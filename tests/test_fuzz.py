@@ -15,6 +15,7 @@ import typing
 import warnings
 from pathlib import Path
 
+import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -200,6 +201,33 @@ def test_data_cannot_run_code(data_set, tmp_path):
     with pytest.raises(UserError, match="metadata.json has no action_space"):
         read_data_set(data_set, change)
     assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("message", "link", "options"),
+    [
+        # 8 TB of zeros: chunks that were never written take no room in the file.
+        ("claims 8000000", None, {"shape": (10**12,), "dtype": "i8", "chunks": (1000,)}),
+        ("is a link", h5py.ExternalLink("/etc/passwd", "/"), None),
+        ("is a link", h5py.SoftLink("/episode_1/actions"), None),
+        ("not an array of this file", None,
+         {"shape": (9,), "dtype": "i8", "external": [("/etc/passwd", 0, 72)]}),
+    ],
+)  # fmt: skip
+def test_links_and_unwritten_arrays_raise_an_error(data_set, message, link, options):
+    def change(folder):
+        with h5py.File(folder / "main_data.hdf5", "r+") as file:
+            del file["episode_0/actions"]
+            if options:
+                file.create_dataset("episode_0/actions", **options)
+            else:
+                file["episode_0/actions"] = link
+
+    def read():
+        with pytest.raises(UserError, match=message):
+            read_data_set(data_set, change)
+
+    try_read(read)
 
 
 def test_objects_among_weights_are_not_unpickled(tmp_path):

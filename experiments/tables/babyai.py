@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.noise import make_noise
 from experiments.paper import list_success
 from experiments.tables.cells import (
     collect_outcomes,
@@ -18,6 +19,7 @@ from experiments.tables.cells import (
 from experiments.tables.settings import Setting, select
 from leapjax import scores
 from leapjax.domains.babyai.levels import HELD_OUT, LEVELS, MIXTURES, find_level, list_played
+from leapjax.methods import find_method
 from leapjax.running.results import Row
 
 PAPER, OURS = Setting("paper"), Setting("leapjax")
@@ -40,8 +42,8 @@ BASELINES = tuple(method for method in COMPARED if method not in ("random", "lea
 # Noise for methods with preset `paper`, chosen on validation levels (`experiments.tables.noise`).
 # It does not help BCQ and LEAP.
 NOISE = {
-    **{method: {"temperature": 4.0} for method in ("bc", "iql", "dt", "mopo")},
-    "plate": {"beams": 1, "temperature": 4.0},
+    method: make_noise(4.0, find_method(method).planner)
+    for method in ("bc", "iql", "dt", "mopo", "plate")
 }
 NOISY = "preset `paper`, noise"
 BY_METHOD = {

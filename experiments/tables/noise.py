@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from experiments.noise import EPISODES, TEMPERATURES, draw_at
+from experiments.noise import EPISODES, TEMPERATURES, make_noise
 from experiments.tables.babyai import COMPARED
 from experiments.tables.cells import compute_mean_rate, make_table
 from experiments.tables.settings import Setting, select
@@ -14,7 +14,7 @@ METHODS = COMPARED[1:]  # random actions have no temperature
 PLAYED = {"validation": True, "episodes": EPISODES}
 SETTINGS = {
     (method, each): Setting("paper", method, PLAYED).searching(
-        **draw_at(each, find_method(method).planner)
+        **make_noise(each, find_method(method).planner)
     )
     for method in METHODS
     for each in TEMPERATURES

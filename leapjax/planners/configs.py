@@ -131,16 +131,6 @@ class GibbsConfig:
         """Whether there are several plans to compare."""
         return self.restarts > 1 or self.keep == "best"
 
-    @property
-    def plans_together(self) -> int:
-        """The plans of one context that the planner makes at a time."""
-        return self.restarts if self.enough is None else 1  # or else one restart after the other
-
-    @property
-    def needs_totals(self) -> bool:
-        """Whether the planner computes total energies."""
-        return self.score or (self.is_judged and self.judge == "energy")
-
 
 def check_fill(config: "GibbsConfig | BeamConfig", known: Sequence[str]) -> None:
     """Checks how a configuration fills plans.
@@ -188,16 +178,6 @@ class ShootingConfig:
         check_types(self)
         check_at_least(self, 1, "horizon", "candidates")
 
-    @property
-    def plans_together(self) -> int:
-        """The plans of one context that the planner makes at a time."""
-        return self.candidates
-
-    @property
-    def needs_totals(self) -> bool:
-        """Whether the planner computes total energies."""
-        return True
-
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropyConfig:
@@ -223,16 +203,6 @@ class CrossEntropyConfig:
         check_at_least(self, 1, "horizon", "iterations", "candidates", "elites")
         if self.elites > self.candidates:
             raise ValueError(f"{self.elites} elites out of {self.candidates} candidates")
-
-    @property
-    def plans_together(self) -> int:
-        """The plans of one context that the planner makes at a time."""
-        return self.candidates
-
-    @property
-    def needs_totals(self) -> bool:
-        """Whether the planner computes total energies."""
-        return True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,16 +249,6 @@ class BeamConfig:
         """Passes at most: each chooses at least one action of every plan."""
         return self.horizon
 
-    @property
-    def plans_together(self) -> int:
-        """The plans of one context that the planner makes at a time."""
-        return self.beams
-
-    @property
-    def needs_totals(self) -> bool:
-        """Whether the planner computes total energies."""
-        return self.score or self.judge == "energy"
-
 
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
 
@@ -298,3 +258,17 @@ def passes_vary(config: PlannerConfig) -> bool:
     if isinstance(config, GibbsConfig):
         return make_commitment(config).adapts or config.enough is not None
     return isinstance(config, BeamConfig) and make_commitment(config).adapts
+
+
+def count_plans(config: PlannerConfig) -> int:
+    """Returns the number of plans of one context that a planner makes at a time."""
+    if isinstance(config, GibbsConfig):
+        return config.restarts if config.enough is None else 1  # or else one after the other
+    return config.beams if isinstance(config, BeamConfig) else config.candidates
+
+
+def needs_totals(config: PlannerConfig) -> bool:
+    """Returns whether a planner computes total energies."""
+    if isinstance(config, GibbsConfig):
+        return config.score or (config.is_judged and config.judge == "energy")
+    return not isinstance(config, BeamConfig) or config.score or config.judge == "energy"

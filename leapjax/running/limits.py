@@ -15,6 +15,7 @@ from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
 from leapjax.planners import BeamConfig, GibbsConfig
+from leapjax.planners.configs import count_plans, needs_totals
 from leapjax.planners.guard import SCORED_TOGETHER
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
@@ -160,8 +161,8 @@ def check_memory(config: AnyConfig, domain: Domain) -> None:
         needs["--demos" if source is None else f"--{source.unit}"] = states * observation
     # The planner makes plans in one batch, and scores restarts and candidates a few at a time, with
     # T passes each.
-    many = search.plans_together
-    passes = max(many, min(many, SCORED_TOGETHER) * horizon if search.needs_totals else 1)
+    many = count_plans(search)
+    passes = max(many, min(many, SCORED_TOGETHER) * horizon if needs_totals(search) else 1)
     plans = min(*choose_chunk_sizes(config), config.episodes)
     rounds, chosen = 1, 1  # positions are chosen in each round
     if isinstance(search, GibbsConfig):
