@@ -6,7 +6,7 @@ from pathlib import Path
 
 from experiments import report
 from experiments.common import figures
-from experiments.tables import babyai, puzzles
+from experiments.tables import atari, babyai, puzzles
 from experiments.tables.cells import format_beside, format_rate
 from leapjax.configuration import hash_config, list_settings
 from leapjax.domains.babyai.levels import LEVELS
@@ -16,17 +16,18 @@ from tests.programs import with_options
 
 def row(
     level="GoToLocalS8N7", method="leap", name="leapjax", seed=0, rate=0.9, played=False,
-    mean_length=6.0, **options,
+    mean_length=6.0, domain="babyai", **options,
 ):  # fmt: skip
     """Makes the row of a run, or of its checkpoint played again, with the fields of tables."""
-    config = with_options(find_preset("babyai", level, method, name), options)
+    config = with_options(find_preset(domain, level, method, name), options)
     config = dataclasses.replace(config, checkpoint=Path("runs/name") if played else None)
     return {
-        "domain": "babyai", "level": level, "method": method, "preset": name, "seed": seed,
+        "domain": domain, "level": level, "method": method, "preset": name, "seed": seed,
         "first_episode_seed": config.test_seed, "episodes": config.episodes,
         "successes": round(rate * config.episodes), "mean_length": mean_length,
         "train_steps": 0 if played else config.training.steps,
         "hash": hash_config(config, seed),
+        "configuration": {"planner": dataclasses.asdict(config.planner)},
     }  # fmt: skip
 
 
@@ -182,3 +183,21 @@ def test_searches_are_compared_by_level_and_energy(tmp_path):
     }
     figures.draw_iterations(by_passes, tmp_path / "searches.png")
     assert (tmp_path / "searches.png").stat().st_size > 0
+
+
+def test_errors_come_from_games_and_seeds_and_of_greedy_play_from_seeds_alone():
+    def read_scores(column, method, *means):
+        found = [
+            row("Pong", method, seed=seed, domain="atari")
+            | {"mean_return": mean, "return_error": 1.2}
+            for seed, mean in enumerate(means)
+        ]
+        lines = read_table(atari.compare_scores(found, {}))
+        (score,) = (line[column] for line in lines if line[0] == "Pong" and "raw" in line[1])
+        return score
+
+    assert read_scores(2, "leap", 10.0) == "10.0 ± 1.2"
+    assert read_scores(2, "leap", 10.0, 10.0) == "10.0 ± 0.8"  # the games' error is the floor
+    assert read_scores(2, "leap", 10.0, 14.0) == "12.0 ± 2.0"  # of the seeds
+    assert read_scores(6, "cql", 10.0) == "10.0"  # greedy games differ by their no-ops only
+    assert read_scores(6, "cql", 10.0, 10.2) == "10.1 ± 0.1"

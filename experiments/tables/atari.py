@@ -103,17 +103,18 @@ def _compute_mean_score(rows: Sequence[Row]) -> tuple[float, float | None]:
     The error is the larger of two: from the spread of the seeds' means, and from the spread of the
     games alone. A few seeds may agree by chance, so the second is a floor.
 
-    The error is `None` at temperature 0. Without sticky actions, a greedy game depends only on its
-    no-ops modulo the frame skip, so at most four games differ. It is also `None` if a row has a
-    single game.
+    The games give no error at temperature 0: without sticky actions, a greedy game depends only on
+    its no-ops modulo the frame skip, so at most four games differ. A single game gives none either.
+    The error is `None` if neither the games nor several seeds give one.
     """
     means = np.array([row["mean_return"] for row in rows])
     errors = np.array([row.get("return_error") for row in rows], float)  # NaN for a single game
     greedy = any(row["configuration"]["planner"].get("temperature") == 0 for row in rows)
+    of_seeds = scores.standard_error(means)
     if greedy or np.isnan(errors).any():
-        return float(means.mean()), None
+        return float(means.mean()), of_seeds
     of_games = float(np.sqrt((errors**2).sum())) / len(rows)
-    return float(means.mean()), max(scores.standard_error(means) or 0.0, of_games)
+    return float(means.mean()), max(of_seeds or 0.0, of_games)
 
 
 def _format_with_error(mean: float, error: float | None) -> str:
