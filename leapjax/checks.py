@@ -4,6 +4,7 @@ No check wraps or truncates a number to make it fit. Only conversions to floats 
 """
 
 import dataclasses
+import functools
 import math
 import operator
 import typing
@@ -268,7 +269,7 @@ def check_types(config: Any, *unlimited: str, strategies: Sequence[str] = ()) ->
     Raises:
         UserError: a field has another type; names the field and its value.
     """
-    types_of = typing.get_type_hints(type(config))
+    types_of = _find_types(config.__class__)
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name in unlimited and isinstance(value, float) and value == math.inf:
@@ -278,6 +279,12 @@ def check_types(config: Any, *unlimited: str, strategies: Sequence[str] = ()) ->
         checked = _check_type(field.name, value, types_of[field.name])
         if checked is not value:
             object.__setattr__(config, field.name, checked)
+
+
+@functools.cache  # the tables of documents make thousands of configurations
+def _find_types(kind: type) -> dict[str, Any]:
+    """Finds the declared types of a class's fields."""
+    return typing.get_type_hints(kind)
 
 
 def _check_type(name: str, value: Any, kind: Any) -> Any:

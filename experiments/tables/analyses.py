@@ -44,8 +44,10 @@ def compare_ways(
         if cases and not case.name.startswith(tuple(cases)):
             continue
         for way in case.ways:
+            if ways and way.name not in ways:
+                continue
             found = [select_rows(of, rows, case, way, preset) for preset in PRESETS]
-            if any(found) and (not ways or way.name in ways):
+            if any(found):
                 planner = way.name
                 if not way.name.startswith(way.method):
                     planner = f"{way.method}: {way.name}"
