@@ -10,9 +10,10 @@ import pytest
 from experiments import babyai
 from leapjax import training
 from leapjax.domains.babyai import demonstrations, levels
+from leapjax.files import lock_folder
 from leapjax.types import Demonstration
 from tests import OURS, parameters
-from tests.programs import TOY_RUN
+from tests.programs import TOY_RUN, find_shared_folder
 
 # Tracing makes many objects, few of them garbage, and JAX also cleans up at each collection.
 gc.set_threshold(100_000, 20, 20)
@@ -60,10 +61,11 @@ def local_demonstrations() -> list[Demonstration]:
 @pytest.fixture(scope="session")
 def toy_run(tmp_path_factory) -> Path:
     """The folder of a run of four steps; tests must not change it."""
-    folder = tmp_path_factory.mktemp("toy")
-    with pytest.MonkeyPatch.context() as patch:
+    folder = find_shared_folder(tmp_path_factory) / "toy"
+    with lock_folder(folder, wait=True), pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
-        assert babyai.main(TOY_RUN) == 0
+        if not (folder / "runs" / "babyai.jsonl").exists():
+            assert babyai.main(TOY_RUN) == 0
     (run,) = (path for path in (folder / "runs").iterdir() if path.is_dir())
     return run

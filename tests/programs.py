@@ -156,12 +156,15 @@ class Place:
             assert row[name] == other[name]
 
 
+def find_shared_folder(tmp_path_factory) -> Path:
+    """Returns a folder that the workers of a test session share."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
 def place_with_a_run(tmp_path_factory):
     """Finishes a run on two devices, once per test session, and returns its place."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    place = Place(folder / "programs")
+    place = Place(find_shared_folder(tmp_path_factory) / "programs")
     with lock_folder(place.folder, wait=True):
         if not place.rows("whole"):
             place.finish(place.start("whole"))

@@ -16,6 +16,7 @@ from leapjax.domains.babyai.observations import Observation
 from leapjax.domains.babyai.settings import Settings
 from leapjax.types import Context, pad_token
 from tests.parameters import random_like
+from tests.programs import only_long
 from tests.quick import quick_jit
 
 SIDE = 6
@@ -174,7 +175,7 @@ def test_group_norm_equals_flax(shape):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, theirs)
 
 
-@pytest.mark.parametrize("recall", [False, True])
+@pytest.mark.parametrize("recall", [pytest.param(False, marks=only_long), True])
 def test_padding_of_grid_and_instruction_changes_no_token(recall):
     """Checks every direction of the agent, in a level that is not square."""
     settings = Settings(fields=4, sweeps=12, word_heads=2, memory=recall, channels=8)

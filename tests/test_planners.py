@@ -28,6 +28,7 @@ from tests.enumerable import (
     plan_counts,
     random_table,
 )
+from tests.programs import only_long
 from tests.quick import many_plans, quick_jit
 
 HORIZON, ACTIONS = 3, 3
@@ -191,7 +192,13 @@ SAMPLERS = {
 }
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+LIKE_OTHERS = ("sequential gibbs", "margin fill", "best restart", "two beams by certainty")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[only_long] * (name in LIKE_OTHERS)) for name in SAMPLERS],
+)
 def test_plans_are_drawn_from_the_exact_distribution(name):
     config, exact, wrong, energy, params, context = SAMPLERS[name]
     counts = plan_counts(plan_all(energy, config, params, context).actions, ACTIONS)

@@ -21,7 +21,8 @@ from tests.quick import quick_jit
 HORIZON = 4
 POSITIONS = np.arange(HORIZON)
 EACH_ARCHITECTURE = pytest.mark.parametrize(
-    ("architecture", "past"), [("leapjax", 0), ("leapjax", 1), ("paper", 2)]
+    ("architecture", "past"),
+    [pytest.param("leapjax", 0, marks=only_long), ("leapjax", 1), ("paper", 2)],
 )
 
 

@@ -35,6 +35,7 @@ from tests.enumerable import (
     plan_counts,
     random_table,
 )
+from tests.programs import only_long
 from tests.quick import many_plans, quick_jit
 
 HORIZON, ACTIONS = 3, 3
@@ -272,8 +273,13 @@ def test_a_turned_energy_equals_the_energy_of_the_renamed_plan():
         assert_close(TURNED.total((), memory, complete), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("enough", [None, 0.5])
-@pytest.mark.parametrize("judge", ["energy", "halves"])
+@pytest.mark.parametrize(
+    ("judge", "enough"),
+    [
+        ("energy", None), ("halves", 0.5),
+        pytest.param("energy", 0.5, marks=only_long), pytest.param("halves", None, marks=only_long),
+    ],
+)  # fmt: skip
 def test_restarts_turn_the_context(judge, enough):
     context = jnp.array([2, 0, 1])  # without turns, the energy chooses 0 at position 0
     options = {"fill": "confident", "judge": judge, "score": True}
