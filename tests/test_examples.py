@@ -43,7 +43,7 @@ def read_code_cells(name):
 def test_example_runs(name, arguments, pattern, monkeypatch, capsys):
     if name == "pure_environment":
         pytest.importorskip("jumanji")
-    if name in ("add_a_constraint", "colour_a_graph") and not LONG:
+    if name in ("add_a_constraint", "colour_a_graph", "variant_of_a_level") and not LONG:
         pytest.skip("make test-long runs it")
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
