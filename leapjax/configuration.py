@@ -1,7 +1,6 @@
 """The configuration of a run, and the hash that names it."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import typing
@@ -153,19 +152,13 @@ def hash_config(config: AnyConfig, seed: int) -> str:
     trains and a run that evaluates a checkpoint have different hashes.
     """
     names = {"domain": config.domain, "level": config.level, "method": config.method}
-    defaults = _list_defaults(make_config(**names))
+    defaults = list_settings(make_config(**names), seed=-1)
     values = list_settings(config, seed)
     values["training"] = pretrained.drop_unnamed(values["training"])
     settings = serialization.find_differences(values, defaults)
     again = {"evaluation": True} if config.checkpoint is not None else {}
     text = json.dumps({**names, **settings, **again}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-@functools.cache  # the tables of documents hash thousands of configurations
-def _list_defaults(default: AnyConfig) -> Mapping[str, Any]:
-    """Returns the settings of a default configuration; callers must not change them."""
-    return list_settings(default, seed=-1)
 
 
 def make_domain(config: AnyConfig) -> Domain:
