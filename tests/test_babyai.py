@@ -265,6 +265,9 @@ def test_search_settings_are_compared_on_validation_levels(workplace, tmp_path, 
 
 def test_noise_plays_validation_levels_at_every_temperature(workplace, tmp_path, monkeypatch):
     """PlaTe uses a single beam at temperatures above 0."""
+    (plate,) = parse("babyai", ["--method", "plate", "--preset", "paper"])
+    beams = {each.planner.temperature: each.planner.beams for each in noise.try_temperatures(plate)}
+    assert set(beams.values()) == {1} and set(beams) == {*noise.TEMPERATURES} - {0.0}
     temperatures = (0.0, 0.5) if LONG else (0.5,)  # each compiles a program
     monkeypatch.setattr(noise, "TEMPERATURES", temperatures)
     folder = str(tmp_path)
@@ -274,6 +277,3 @@ def test_noise_plays_validation_levels_at_every_temperature(workplace, tmp_path,
     tried = [row["configuration"]["planner"]["temperature"] for row in rows]
     assert sorted(tried) == sorted(noise.TEMPERATURES)
     assert all(row["validation"] for row in rows)
-    (plate,) = parse("babyai", ["--method", "plate", "--preset", "paper"])
-    beams = {each.planner.temperature: each.planner.beams for each in noise.try_temperatures(plate)}
-    assert set(beams.values()) == {1} and set(beams) == {*noise.TEMPERATURES} - {0.0}

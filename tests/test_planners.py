@@ -192,6 +192,7 @@ SAMPLERS = {
 }
 
 
+# The other samplers imply these.
 LIKE_OTHERS = ("sequential gibbs", "margin fill", "best restart", "two beams by certainty")
 
 
