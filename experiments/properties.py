@@ -263,7 +263,7 @@ def _make_explorers(
         Way(each, minimise=whole, search=refine_plan, executed=1),
     ]
     ways += [Way(f"{method}, exploring", method, single) for method in ("dt", "iql")]
-    return [way._replace(remembers=True, explores=True) for way in ways]
+    return [way._replace(remembers=True) for way in ways]
 
 
 def _make_noisier(minimise: Minimise, temperature: float) -> list[Way]:
@@ -310,7 +310,7 @@ def _make_constraints(name: str, model: Model, level: str) -> Case:
             *_make_explorers("whole plan", never, both, fill_left_to_right),
             Way(
                 "whole plan, exploring, beam search", minimise=penalise_revisits(never),
-                search=search_beams, executed=3, remembers=True, explores=True,
+                search=search_beams, executed=3, remembers=True,
             ),
         ],
         WatchedTurns,
@@ -409,7 +409,7 @@ CASES = (
             Way(
                 "sum, exploring, replanned after each action, not gone over",
                 minimise=penalise_revisits(halves), search=fill_left_to_right, executed=1,
-                remembers=True, explores=True,
+                remembers=True,
             ),
         ],
     ),

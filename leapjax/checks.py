@@ -152,15 +152,13 @@ def check_counts(name: str, values: Sequence[Any], least: int = 0) -> np.ndarray
     )
 
 
-def check_numbers(
-    name: str, values: Sequence[Any], least: float = -LARGEST, most: float = LARGEST
-) -> list[float]:
+def check_numbers(name: str, values: Sequence[Any], least: float = -LARGEST) -> list[float]:
     """Returns finite Python floats; see `check_number`.
 
     Raises:
         UserError: the values are not a sequence, or `check_number` refuses a value.
     """
-    return [check_number(name, value, least, most) for value in _list_items(name, values)]
+    return [check_number(name, value, least) for value in _list_items(name, values)]
 
 
 def check_indices(name: str, values: Sequence[Any], count: int) -> tuple[int, ...]:

@@ -73,7 +73,8 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
     """The energy of a model that chooses actions from left to right.
 
     `total` is the negative log-likelihood of the plan. `conditional` is one term of it: the energy
-    of an action given the actions before it. `beam_search` is the planner for it.
+    of an action given the actions before it, so only later actions may be MASK. `beam_search` is
+    the planner for it.
 
     Args:
         encode: (params, context) -> memory.
@@ -98,7 +99,8 @@ def autoregressive(encode: EncodeFn, logits: LogitsFn, num_actions: int) -> Ener
         energy = jnp.take_along_axis(energies, chosen, axis=1).sum()
         return _infinite_if_incomplete(_check_total(energy), actions, num_actions)
 
-    return Energy(encode, conditional, total, check_num_actions(num_actions))
+    num_actions = check_num_actions(num_actions)
+    return Energy(encode, conditional, total, num_actions, accepts_mask=False, left_to_right=True)
 
 
 def from_total(encode: EncodeFn, total: TotalFn, num_actions: int) -> Energy:
@@ -335,11 +337,12 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
         return tuple(energy.turn(p, key, own_memory) for energy, p, own_memory in parts)
 
     accepts_mask = all(energies[i].accepts_mask for i in active)
+    left_to_right = all(energies[i].accepts_mask or energies[i].left_to_right for i in active)
     free = all(energy.violation is no_violation for energy in energies)
     still = all(energy.turn is no_turn for energy in energies)
     return Energy(
         encode, conditional, total, num_actions, accepts_mask,
-        no_violation if free else violation, no_turn if still else turn,
+        no_violation if free else violation, no_turn if still else turn, left_to_right,
     )  # fmt: skip
 
 

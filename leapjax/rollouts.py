@@ -111,14 +111,14 @@ class History:
         action = check_integer(
             f"the action taken at {self.where}", action, 0, self._num_actions - 1
         )
+        number = _read_number("reward", reward, self.where)
         if self._length:
             self._past = [*self._past, self.current][-self._length :]
             self._actions = [*self._actions, action][-self._length :]
-            self._rewards = [*self._rewards, reward][-self._length :]
+            self._rewards = [*self._rewards, number][-self._length :]
         self.current = self._checked(observation)
-        number = _read_number("reward", reward, self.where)
-        self.return_so_far += reward
-        for name, value in (("reward", number), ("return", float(self.return_so_far))):
+        self.return_so_far += number
+        for name, value in (("reward", number), ("return", self.return_so_far)):
             if not -LARGEST <= value <= LARGEST:
                 raise UserError(
                     f"the environment gave a {name} of {value} at {self.where}: expected a finite "

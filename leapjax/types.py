@@ -171,6 +171,8 @@ class Energy(NamedTuple):
         total: (params, memory, actions `[T]`) -> `[]`, the energy of a complete plan.
         num_actions: A, the end action included.
         accepts_mask: whether actions may be MASK; if not, planning starts from uniform actions.
+        left_to_right: whether actions may be MASK from the queried position on, as if actions were
+            chosen from left to right; `accepts_mask` implies it.
         violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
             positive; +inf for a plan that is forbidden. For a plan that holds MASK: positive only
             if every way to complete it breaks a constraint.
@@ -185,6 +187,7 @@ class Energy(NamedTuple):
     accepts_mask: bool = True
     violation: Callable[[Params, PyTree, jax.Array], jax.Array] = no_violation
     turn: Callable[[Params, jax.Array, PyTree], PyTree] = no_turn
+    left_to_right: bool = False
 
 
 def mask_token(num_actions: int) -> int:

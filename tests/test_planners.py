@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from leapjax.batching import NotANumber, check_fit, compile_planner, plan_keys, split_batch
-from leapjax.energy import constrain, from_total, view
+from leapjax.energy import autoregressive, compose, constrain, from_total, view
 from leapjax.planners import (
     FILLS,
     BeamConfig,
@@ -643,6 +643,44 @@ def test_changed_parameters_or_trees_are_placed_again():
     check((written, None), second)
 
 
+# Energies that take MASK at later positions only.
+
+
+def _read_left(params, memory, tokens, positions):
+    """Scores actions given earlier ones; NaN if an earlier one is MASK."""
+
+    def score(position):
+        earlier = jnp.arange(HORIZON) < position
+        known = jnp.where(earlier, tokens, ACTIONS)
+        scores = -ENUMERABLE.conditional(params, memory, known, position[None])[0]
+        return jnp.where(jnp.any(earlier & (tokens == ACTIONS)), jnp.nan, scores)
+
+    return jax.vmap(score)(positions)
+
+
+LEFT_TO_RIGHT = autoregressive(ENUMERABLE.encode, _read_left, ACTIONS)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        BeamConfig(HORIZON, len(PLANS)),
+        BeamConfig(HORIZON, 2, temperature=1.0, score=True),
+        GibbsConfig(HORIZON, 5, restarts=2),
+        ShootingConfig(HORIZON),
+        CrossEntropyConfig(HORIZON),
+    ],
+)
+def test_planners_mask_only_later_actions_of_a_left_to_right_energy(config):
+    plans = plan_all(LEFT_TO_RIGHT, config, chains=20)
+    assert plans.valid.all() and (plans.actions < ACTIONS).all()
+    if config == BeamConfig(HORIZON, len(PLANS)):
+        assert_equal(plans.actions[0], PLANS[joint_energies(PLANS).argmin()])
+    both = compose([LEFT_TO_RIGHT, ENUMERABLE])
+    assert plan_all(both, config, (TABLE, TABLE), chains=20).valid.all()
+    assert not compose([both, FROM_TOTAL]).left_to_right
+
+
 # Energies that are NaN or -inf. Parameters: a table, and the value of undefined energies.
 
 UNDEFINED = ENUMERABLE._replace(
@@ -657,22 +695,28 @@ def _undefined_at_first(params, memory, actions, positions):
     return jnp.where(jnp.all(actions == ACTIONS), energies.at[0, 1].set(memory[1]), energies)
 
 
+UNDEFINED_AT_FIRST = UNDEFINED._replace(
+    conditional=_undefined_at_first,
+    total=lambda params, memory, actions: ENUMERABLE.total(params, memory[0], actions),
+)
+
+
 @pytest.mark.parametrize(
-    "config",
+    ("energy", "config"),
     [
-        GibbsConfig(HORIZON, 3),
-        GibbsConfig(HORIZON, 3, score=True),
-        GibbsConfig(HORIZON, 3, score_trace=True),
-        GibbsConfig(HORIZON, 3, restarts=2),
-        ShootingConfig(HORIZON),
-        CrossEntropyConfig(HORIZON),
-        BeamConfig(HORIZON, score=True),
+        (UNDEFINED, GibbsConfig(HORIZON, 3, score=True)),
+        (UNDEFINED, GibbsConfig(HORIZON, 3, score_trace=True)),
+        (UNDEFINED, GibbsConfig(HORIZON, 3, restarts=2)),
+        (UNDEFINED, ShootingConfig(HORIZON)),
+        (UNDEFINED, CrossEntropyConfig(HORIZON)),
+        (UNDEFINED, BeamConfig(HORIZON, score=True)),
+        (UNDEFINED_AT_FIRST, GibbsConfig(HORIZON, 3)),
+        (UNDEFINED_AT_FIRST, ShootingConfig(HORIZON)),
+        (UNDEFINED_AT_FIRST, CrossEntropyConfig(HORIZON)),
+        (UNDEFINED_AT_FIRST, BeamConfig(HORIZON)),
     ],
 )
-def test_plans_with_undefined_energies_are_invalid(config):
-    energy = UNDEFINED
-    if config == GibbsConfig(HORIZON, 3):  # which computes no total
-        energy = UNDEFINED._replace(conditional=_undefined_at_first)
+def test_plans_with_undefined_energies_are_invalid(energy, config):
     for value, valid in ((np.nan, False), (-np.inf, False), (1.0, True)):
         plan = plan_all(energy, config, (TABLE, np.float32(value)), chains=2)
         assert (plan.valid == valid).all()
@@ -742,6 +786,16 @@ WRONG = [
     (lambda: compile_batched(GIBBS).compile(TABLE, CONTEXTS, 0), "batch must be at least 1"),
     (lambda: plan_all(FROM_TOTAL, _gibbs(fill="margin")), "fill 'margin' .* use fill 'together'"),
     (lambda: plan_all(FROM_TOTAL, BeamConfig(HORIZON)), "accepts_mask is False"),
+    *(
+        (lambda c=config: plan_all(LEFT_TO_RIGHT, c), "from left to right|accepts_mask is False")
+        for config in (
+            _gibbs(fill="sequential"),
+            _gibbs(restarts=2, judge="halves"),
+            BeamConfig(HORIZON, fill="confident"),
+            BeamConfig(HORIZON, certainty=0.9),
+            BeamConfig(HORIZON, judge="halves"),
+        )
+    ),
     (lambda: bind(ENUMERABLE, {"horizon": 3}), "no planner takes a dict"),
     (lambda: GibbsConfig(0), "horizon must be at least 1, got 0"),
     (lambda: GibbsConfig(3, resampled=4), "resampled is 4, .* the horizon 3"),

@@ -22,7 +22,7 @@ from leapjax import (
 )
 from leapjax.energy import symmetric
 from leapjax.errors import UserError
-from leapjax.planners import FILLS, bind
+from leapjax.planners import FILLS, CrossEntropyConfig, ShootingConfig, bind
 from leapjax.planners.judges import SPLITS, sum_halves
 from leapjax.planners.positions import Commitment, choose_open, most_certain
 from leapjax.types import Turned, mask_token
@@ -182,6 +182,8 @@ def test_passes_count_every_conditional_and_every_total():
         (GibbsConfig(HORIZON, 7, restarts=4, judge="halves"), 4 * (7 + 2 * SPLITS)),
         (BeamConfig(HORIZON, 4, judge="energy", score=True), 8 * HORIZON),
         (BeamConfig(HORIZON, 4, judge="halves"), 4 * HORIZON + 4 * 2 * SPLITS),
+        (ShootingConfig(HORIZON, 5), 1 + 5 * HORIZON),
+        (CrossEntropyConfig(HORIZON, 2, 5), 1 + 2 * 5 * HORIZON),
     ):
         assert plan_for(config, params=table).passes == expected, config
 
@@ -220,6 +222,21 @@ def test_judge_halves_forbids_actions_that_the_energy_forbids():
     for plan, expected in (([0, 1, 0], SPLITS * 3 * np.log(2)), ([0, 2, 0], np.inf)):
         score = sum_halves(forbidden, None, None, jax.random.key(0), jnp.array(plan))
         assert_close(score, expected, rtol=1e-5)
+
+
+def test_judge_halves_never_keeps_an_unfinished_plan():
+    """The best of a trace is complete, although the last action, which MASK follows, is cheap."""
+
+    def conditional(params, memory, actions, positions):
+        open_ = (actions == 3).sum()  # every action costs more when fewer are open
+        return jnp.tile(jnp.array([1.0, 1.0, -8.0]) * open_, (positions.shape[0], 1))
+
+    energy = from_total(lambda params, context: (), lambda *inputs: 0.0, 3)
+    energy = energy._replace(conditional=conditional, accepts_mask=True)
+    config = GibbsConfig(HORIZON, HORIZON, fill="confident", keep="best", judge="halves")
+    assert (plan_for(config, energy, chains=20).actions < 3).all()
+    unfinished = jnp.array([3, 0, 3])
+    assert np.isposinf(sum_halves(energy, None, (), jax.random.key(0), unfinished))
 
 
 def mislead():

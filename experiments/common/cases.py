@@ -80,7 +80,6 @@ class Way(NamedTuple):
         executed: actions before replanning; `None` executes whole plans.
         paper: the paper's success, in percent.
         remembers: whether penalties see the whole episode; models still see their K steps.
-        explores: whether revisits cost, unlike in the paper.
     """
 
     name: str
@@ -90,7 +89,6 @@ class Way(NamedTuple):
     executed: int | None = None
     paper: float | None = None
     remembers: bool = False
-    explores: bool = False
 
 
 def draw_at(temperature: float) -> Callable[[Any], PlannerConfig]:
@@ -487,7 +485,7 @@ def play(
 
     first_pass = None
     if isinstance(search, GibbsConfig) and search.horizon > 1:
-        one = dataclasses.replace(search, iterations=1, fill="together", restarts=1)
+        one = GibbsConfig(search.horizon, 1, temperature=search.temperature)
         first_pass = int(episodes(one).successes.sum())
     found = episodes(search)
     good = found.lengths[found.successes]

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from leapjax.planners.configs import BeamConfig, find_selection, make_commitment
+from leapjax.planners.configs import BeamConfig, check_masks, find_selection, make_commitment
 from leapjax.planners.guard import guard_shapes, is_undefined, map_few, score_open
-from leapjax.planners.judges import find_judge
+from leapjax.planners.judges import JUDGES
 from leapjax.planners.positions import choose_open
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
 
@@ -48,15 +48,11 @@ def beam_search(
     kept only if too few others are left. The trace holds the first beam after every pass.
 
     Raises:
-        ValueError: the energy does not accept MASK.
+        UserError: the energy does not accept MASK where beams of this configuration leave it.
     """
-    if not energy.accepts_mask:
-        raise ValueError(
-            "beam search begins plans that it ends later, and this energy scores complete plans "
-            "only (accepts_mask is False): use another planner"
-        )
-    judge = None if config.judge == "sum" else find_judge(config.judge, energy)
     energy = guard_shapes(energy)
+    check_masks(energy, config)
+    judge = None if config.judge == "sum" else JUDGES[config.judge]
     actions, width, horizon = energy.num_actions, config.beams, config.horizon
     mask = mask_token(actions)
     select, commitment = find_selection(config.fill), make_commitment(config)

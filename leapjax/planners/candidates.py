@@ -1,5 +1,7 @@
 """Planners over many complete plans: random shooting and the cross-entropy method."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -8,23 +10,38 @@ from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 
-def _find_choices(energy: Energy, params: Params, memory: PyTree, horizon: int) -> jax.Array:
-    """Finds the possible actions at every position: logits `[T, A]`, 0 or -inf.
+class _Choices(NamedTuple):
+    """The possible actions at every position.
+
+    Attributes:
+        logits: `[T, A]`, 0 for a possible action, -inf for another.
+        valid: `[]` bool: every energy was defined.
+        passes: number of conditionals that were computed.
+    """
+
+    logits: jax.Array
+    valid: jax.Array
+    passes: int
+
+
+def _find_choices(energy: Energy, params: Params, memory: PyTree, horizon: int) -> _Choices:
+    """Finds the possible actions at every position.
 
     An action is impossible if its energy is infinite while all positions are MASK: no later choice
     changes that. An example is the end action at the first position. If the energy does not accept
     MASK, every action counts as possible.
     """
     if not energy.accepts_mask:
-        return jnp.zeros((horizon, energy.num_actions))
+        return _Choices(jnp.zeros((horizon, energy.num_actions)), jnp.array(True), 0)
     blank = jnp.full((horizon,), mask_token(energy.num_actions), jnp.int32)
     energies = energy.conditional(params, memory, blank, jnp.arange(horizon))
-    return jnp.where(jnp.isposinf(energies), -jnp.inf, 0.0)
+    logits = jnp.where(jnp.isposinf(energies), -jnp.inf, 0.0)
+    return _Choices(logits, ~jnp.any(is_undefined(energies)), 1)
 
 
-def _draw_plans(key: jax.Array, choices: jax.Array, count: int) -> jax.Array:
-    """Draws plans `[C, T]` of uniform possible actions, see `_find_choices`."""
-    plans = jax.random.categorical(key, choices, shape=(count, choices.shape[0]))
+def _draw_plans(key: jax.Array, logits: jax.Array, count: int) -> jax.Array:
+    """Draws plans `[C, T]` of uniform possible actions, see `_Choices`."""
+    plans = jax.random.categorical(key, logits, shape=(count, logits.shape[0]))
     return plans.astype(jnp.int32)
 
 
@@ -34,15 +51,15 @@ def random_shooting(
     """Draws possible plans at random, and returns the plan of least energy (paper, ablation)."""
     energy = guard_shapes(energy)
     choices = _find_choices(energy, params, memory, config.horizon)
-    plans = _draw_plans(key, choices, config.candidates)
+    plans = _draw_plans(key, choices.logits, config.candidates)
     energies = compute_totals(energy, params, memory, plans)
     best = jnp.argmin(energies)
     plan = Plan(
         plans[best],
         plans[best][None],
         energy.violation(params, memory, plans[best]) <= 0,
-        ~jnp.any(is_undefined(energies)),
-        jnp.asarray(plans.size, jnp.int32),
+        choices.valid & ~jnp.any(is_undefined(energies)),
+        jnp.asarray(choices.passes + plans.size, jnp.int32),
     )
     return plan._replace(energy=energies[best]) if config.score else plan
 
@@ -72,8 +89,8 @@ def cross_entropy_method(
         where = jax.random.randint(place_key, (count,), 0, horizon)
         rows = jnp.arange(count)
         # Draw another action. Without a possible one, the lowest finite logit keeps the same.
-        lowest = jnp.finfo(choices.dtype).min
-        others = choices[where].at[rows, children[rows, where]].set(lowest)
+        lowest = jnp.finfo(choices.logits.dtype).min
+        others = choices.logits[where].at[rows, children[rows, where]].set(lowest)
         changed = jax.random.categorical(action_key, others).astype(jnp.int32)
         children = children.at[rows, where].set(changed)
         children = children.at[: config.elites].set(parents)
@@ -81,7 +98,7 @@ def cross_entropy_method(
         return (children, energies), (children[jnp.argmin(energies)], is_undefined(energies).any())
 
     first_key, loop_key = jax.random.split(key)
-    plans = _draw_plans(first_key, choices, count)
+    plans = _draw_plans(first_key, choices.logits, count)
     energies = score(plans)
     first, first_invalid = plans[jnp.argmin(energies)], is_undefined(energies).any()
     keys = jax.random.split(loop_key, config.iterations)[1:]
@@ -91,7 +108,7 @@ def cross_entropy_method(
         plans[best],
         jnp.concatenate([first[None], later]),
         energy.violation(params, memory, plans[best]) <= 0,
-        ~(first_invalid | invalid.any()),
-        jnp.asarray(config.iterations * count * horizon, jnp.int32),
+        choices.valid & ~(first_invalid | invalid.any()),
+        jnp.asarray(choices.passes + config.iterations * count * horizon, jnp.int32),
     )
     return plan._replace(energy=energies[best]) if config.score else plan

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from leapjax.checks import check_at_least, check_number, check_types
+from leapjax.errors import UserError
 from leapjax.planners.judges import JUDGES
 from leapjax.planners.positions import SELECTIONS, Commitment, Select
+from leapjax.types import Energy
 
 # The files and command lines that hold a configuration name a strategy; programs may pass a
 # function of their own.
@@ -53,7 +55,8 @@ class GibbsConfig:
             "confident" takes positions with the likeliest actions first, "margin" positions whose
             likeliest action leads the second by most. "sequential" goes from left to right, and
             "random" in random order. A program may pass a function (energies `[T, A]`, key) ->
-            ranks `[T]`; the highest rank comes first.
+            ranks `[T]`; the highest rank comes first. Rows of filled positions hold no energies
+            of theirs, so rank each position by its own row.
         order: Which P positions every later iteration resamples. "random" draws them, "sequential"
             goes from left to right, and "uncertain" takes positions that were least certain when
             they were chosen. It resamples each once before it resamples any again.
@@ -251,6 +254,34 @@ class BeamConfig:
 
 
 PlannerConfig = GibbsConfig | ShootingConfig | CrossEntropyConfig | BeamConfig
+
+
+def check_masks(energy: Energy, config: PlannerConfig) -> None:
+    """Checks that an energy accepts MASK where a planner puts it.
+
+    Raises:
+        UserError: it does not; names the field of the configuration to change.
+    """
+    if energy.accepts_mask or not isinstance(config, GibbsConfig | BeamConfig):
+        return
+    refused = "and this energy does not accept it (accepts_mask is False)"
+    ordered = config.fill == "sequential" and not make_commitment(config).adapts
+    if isinstance(config, GibbsConfig) and config.fill != "together":
+        raise UserError(
+            f"fill {config.fill!r} leaves MASK in a plan, {refused}: use fill 'together'", "fill"
+        )
+    if isinstance(config, BeamConfig) and not energy.left_to_right:
+        raise UserError(f"beam search leaves MASK in a plan, {refused}: use another planner")
+    if isinstance(config, BeamConfig) and not ordered:
+        raise UserError(
+            "this energy reads a plan from left to right: use fill 'sequential', without certainty "
+            "and entropy_bound",
+            "fill",
+        )
+    if config.judge in JUDGES and JUDGES[config.judge].masks:
+        raise UserError(
+            f"judge {config.judge!r} masks actions, {refused}: use judge 'energy'", "judge"
+        )
 
 
 def passes_vary(config: PlannerConfig) -> bool:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from leapjax.planners.configs import GibbsConfig, find_selection, make_commitment
+from leapjax.planners.configs import GibbsConfig, check_masks, find_selection, make_commitment
 from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
 from leapjax.planners.positions import choose_open, compute_probabilities
 from leapjax.planners.restarts import Chain, find_best_chain, turns_contexts
@@ -27,15 +27,11 @@ def gibbs(
     actions drawn before. At temperature 0 it is a search.
 
     Raises:
-        ValueError: the plan should be filled position by position, and the energy does not accept
-            MASK.
+        UserError: the plan should be filled position by position or judged by halves, and the
+            energy does not accept MASK.
     """
-    if config.fill != "together" and not energy.accepts_mask:
-        raise ValueError(
-            f"fill {config.fill!r} chooses actions while others are MASK, and this energy scores "
-            "complete plans only (accepts_mask is False): use fill 'together'"
-        )
     energy = guard_shapes(energy)
+    check_masks(energy, config)
 
     def run(key: jax.Array, memory: PyTree) -> Chain:
         return _run_chain(energy, params, memory, key, config)

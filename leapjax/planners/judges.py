@@ -42,7 +42,7 @@ def sum_halves(
     A random half of the plan is masked and its actions are scored in one pass, then those of the
     other half. `SPLITS` random splits are summed. A pseudo-likelihood has all other actions in
     view, and wrong actions confirm each other; here they are rarely all in view. The sum is in
-    nats, and +inf if an action is forbidden.
+    nats, and +inf if an action is forbidden or MASK.
     """
     positions = jnp.arange(plan.shape[0])
     keys = jax.random.split(key, SPLITS)
@@ -56,25 +56,11 @@ def sum_halves(
         costs = -jax.nn.log_softmax(-energies)[positions, plan]
         return jnp.where(hidden, jnp.where(forbidden, jnp.inf, costs), 0).sum()
 
-    return jax.vmap(score)(jnp.concatenate([halves == 0, halves == 1])).sum()
+    sums = jax.vmap(score)(jnp.concatenate([halves == 0, halves == 1]))
+    return jnp.where(jnp.all(plan < energy.num_actions), sums.sum(), jnp.inf)
 
 
 JUDGES: Mapping[str, Judge] = {
     "energy": Judge(sum_energies, lambda horizon: horizon),
     "halves": Judge(sum_halves, lambda horizon: 2 * SPLITS, masks=True),
 }
-
-
-def find_judge(name: str, energy: Energy) -> Judge:
-    """Returns the judge of a name.
-
-    Raises:
-        ValueError: the judge masks actions, and the energy does not accept MASK.
-    """
-    judge = JUDGES[name]
-    if judge.masks and not energy.accepts_mask:
-        raise ValueError(
-            f"judge {name!r} masks actions, and this energy scores complete plans only "
-            "(accepts_mask is False): use judge 'energy'"
-        )
-    return judge

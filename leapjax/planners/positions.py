@@ -6,7 +6,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-Select = Callable[[jax.Array, jax.Array], jax.Array]  # (energies [T, A], key) -> ranks [T]
+Select = Callable[[jax.Array, jax.Array], jax.Array]
+# (energies [T, A] of every action, key) -> ranks [T]. Rows of filled positions hold energies of
+# another position, so a rank depends on its own row only.
 
 
 def most_certain(energies: jax.Array, key: jax.Array) -> jax.Array:
@@ -62,7 +64,7 @@ class Commitment(NamedTuple):
     Attributes:
         least: number of positions that every pass fills, while so many are open.
         certainty: a pass also fills each next position whose likeliest action has at least this
-            probability; above 1: no further position.
+            probability; 1: no further position.
         entropy: a pass also fills each next position, as long as their entropies without the
             largest add up to at most this, in nats (EB-Sampler, Ben-Hamu et al., arXiv 2505.24857).
             It bounds the dependence between actions that a pass chooses independently.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from leapjax.planners.configs import GibbsConfig
 from leapjax.planners.guard import is_undefined, map_few
-from leapjax.planners.judges import find_judge
+from leapjax.planners.judges import JUDGES
 from leapjax.types import Energy, Params, PyTree, no_turn
 
 
@@ -44,11 +44,8 @@ def find_best_chain(
 
     If the energy knows symmetries, each restart sees the context turned by its own; the judge sees
     what the restart saw.
-
-    Raises:
-        ValueError: the judge masks actions, and the energy does not accept MASK.
     """
-    judge = find_judge(config.judge, energy)
+    judge = JUDGES[config.judge]
     turns, kept = turns_contexts(energy, config), config.returnable
     judge_key = jax.random.fold_in(key, 1)
 

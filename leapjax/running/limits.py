@@ -14,8 +14,8 @@ from leapjax.data import seeds, storage
 from leapjax.domain import Domain
 from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
-from leapjax.planners import BeamConfig, GibbsConfig
-from leapjax.planners.configs import count_plans, needs_totals
+from leapjax.planners import GibbsConfig
+from leapjax.planners.configs import check_masks, count_plans, needs_totals
 from leapjax.planners.guard import SCORED_TOGETHER
 from leapjax.presets import find_preset
 from leapjax.rollouts import MOST_OPEN
@@ -84,13 +84,7 @@ def check(config: AnyConfig) -> None:
     check_memory(config, domain)
     # Making an agent is cheap, and raises an error for options that its method lacks.
     agent = pretrained.make_agent(specify(config, config.seeds[0], domain), domain)
-    search = config.planner
-    fill = search.fill if isinstance(search, GibbsConfig | BeamConfig) else "together"
-    if not agent.energy.accepts_mask and fill != "together":
-        raise UserError(
-            f"--fill {fill}: --method {config.method} judges complete plans only, so all actions "
-            "begin at once (--fill together)"
-        )
+    check_masks(agent.energy, config.planner)
 
 
 def check_seeds(training: Sequence[int]) -> None:
