@@ -14,7 +14,7 @@ from leapjax.agents.batches import join_demonstrations
 from leapjax.agents.measured import measure_settings
 from leapjax.agents.value_range import judge_values
 from leapjax.batching import compile_planner
-from leapjax.checks import check_integer, check_kind, check_seed
+from leapjax.checks import check_integer, check_kind
 from leapjax.data import storage, windows
 from leapjax.domain import (
     Domain,
@@ -87,7 +87,7 @@ def fit(
             `leapjax.make_domain("gymnasium", "CartPole-v1")`.
         method: a name in `leapjax.methods.METHODS`.
         steps: number of training steps; `None` for `training.steps`.
-        seed: seed of parameters, batches and noise.
+        seed: seed of parameters, batches and noise, in 0 .. 2^31 - 1.
         horizon: T, number of planned actions; `None` for `planner.horizon`.
         context: K, number of past steps that the network sees.
         model: size of the network.
@@ -103,7 +103,7 @@ def fit(
         NonFiniteLoss: see `leapjax.training.train`.
     """
     check_kind(domain, Domain)
-    chosen, seed = find_method(method), check_seed(seed)
+    chosen, seed = find_method(method), check_integer("seed", seed)
     name, domain_settings = domain.made_from or (None, None)
     kinds = (ModelConfig, TrainingConfig, chosen.planner, chosen.settings)
     for given, kind in zip((model, training, planner, settings), kinds, strict=True):

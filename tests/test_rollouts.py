@@ -1,6 +1,7 @@
 import functools
 import math
 import types
+from decimal import Decimal
 from typing import ClassVar
 
 import gymnasium as gym
@@ -160,6 +161,15 @@ def test_history_returns_the_last_steps_of_an_episode(length):
             expected = [*blank, *all_of[:now]][now:]
             assert_equal(found, np.array(expected).reshape(found.shape))
             assert found.dtype == kind and len(found) == length
+
+
+@pytest.mark.parametrize("reward", [np.float16(0.1), Decimal("0.1"), np.array(0.1)])
+def test_history_sums_rewards_of_any_type_in_double_precision(reward):
+    history = History(np.zeros(1), 1, NUM_ACTIONS)
+    for _ in range(1000):
+        history.advance(0, np.zeros(1), reward)
+    assert history.return_so_far == pytest.approx(1000 * float(reward), abs=1e-9)
+    assert history.context().rewards == np.float32(reward)
 
 
 @pytest.mark.parametrize(("steps", "executed"), [(1, None), (2, 3), (HORIZON, 3), (HORIZON, 1)])
