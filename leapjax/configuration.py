@@ -100,7 +100,7 @@ class Config(Generic[M, D, P]):
 
 AnyConfig = Config[Any, Any, Any]  # of any method, domain and planner
 
-# Fields on which a result does not depend, or which its name and row hold separately.
+# Fields on which a result does not depend, or which its row holds separately.
 _NOT_HASHED = (
     "seeds", "checkpoint", "pretrained", "record", "force", "runs", "pictures",
     "checkpoint_seconds", "cluster", "loggers",

@@ -158,6 +158,9 @@ def test_recording_skips_recorded_runs_unless_forced(workplace, capsys):
     assert babyai.main(arguments) == 0
     assert "recorded already" in capsys.readouterr().out
     assert path.read_text() == first
+    path.write_text(first.replace('"checkpoint": null', '"checkpoint": "other"'))
+    assert babyai.main(arguments) == 2  # a row of another network
+    assert "is of the checkpoint other" in capsys.readouterr().err
     assert babyai.main([*arguments, "--force"]) == 0
     assert len(results.read(path)) == 1
     shutil.rmtree(workplace / "results")

@@ -132,3 +132,14 @@ def test_tables_end_with_the_mean_over_seeds():
     assert columns["seed"] == ["0", "1", "0", "1", "2", "mean of 2", "mean of 2"]
     low, high = scores.interval_over_seeds([5, 7], [10, 10])
     assert columns["success [95%]"][-2] == f"60.0% [{low:.1%}, {high:.1%}]"
+
+
+def test_searches_of_one_seed_are_told_apart_and_not_averaged():
+    planners = [{"iterations": 5, "fill": "confident"}]
+    planners += [{**planners[0], "certainty": 0.9}, {**planners[0], "restarts": 16}]
+    rows = [make_row(0, configuration={"planner": each, "seed": 0}) for each in planners]
+    table = results.make_success_table(rows)
+    columns = {column.header: list(column.cells) for column in table.columns}
+    assert columns["seed"] == ["0", "0", "0"]
+    common = "N = 5, confident"
+    assert columns["planner"] == [common, f"{common}, certainty 0.9", f"{common}, restarts 16"]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from leapjax.configuration import AnyConfig, change, make_domain
 from leapjax.planners import GibbsConfig
+from leapjax.planners.judges import JUDGES
 from leapjax.presets.puzzles import TURNED
 
 
@@ -24,10 +25,17 @@ class Search(NamedTuple):
 
     @property
     def cost(self) -> str:
-        """All passes of the model, restarts included: "1", "T", "n T" or, at most, "≤ n T"."""
-        passes = self.passes * self.options.get("restarts", 1)
-        most = "≤ " * bool({"certainty", "entropy_bound"} & {*self.options})
-        return most + {0: "1", 1: "T"}.get(passes, f"{passes} T")
+        """All passes of the model: "1", "T", "2 T", with restarts and their judge "16 (T + 6)".
+
+        A mark "≤" says that plans may take fewer.
+        """
+        cost = {0: "1", 1: "T"}.get(self.passes, f"{self.passes} T")
+        if "restarts" in self.options:
+            judge = self.options.get("judge", "energy")
+            # Only rules are judged by their energy here, which takes one pass.
+            judged = 1 if judge == "energy" else JUDGES[judge].count_passes(0)
+            cost = f"{self.options['restarts']} ({cost} + {judged})"
+        return "≤ " * bool({"certainty", "entropy_bound"} & {*self.options}) + cost
 
     def of(self, horizon: int) -> dict[str, Any]:
         """Returns the fields of `GibbsConfig` for plans of `horizon` actions."""

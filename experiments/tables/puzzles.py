@@ -26,8 +26,8 @@ PAYS_ON = (
 PAYING = (
     ("all at once", "1"), ("left to right", "T"), ("in random order", "T"),
     ("Gibbs sampling, random order", "2 T"), ("most certain first", "T"),
-    ("all that are certain", "≤ T"), ("restarts on turned puzzles", "≤ 16 T"),
-    ("most certain first, best of 16", "16 T"),
+    ("all that are certain", "≤ T"), ("restarts on turned puzzles", "≤ 16 (T + 6)"),
+    ("most certain first, best of 16", "16 (T + 1)"),
 )  # fmt: skip
 HARD = "Sudoku9x31-42"  # level in training; its planners also play boards of a file
 TRAINED = ("demos", "model", "training", "method_settings")  # settings of a planner

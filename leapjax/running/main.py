@@ -66,6 +66,12 @@ def finish(
     # Always read: a damaged file raises here, before hours of work.
     known = processes.run_on_first(lambda: results.find(rows, name))
     if config.record and not config.force and known is not None:
+        checkpoint = config.checkpoint and config.checkpoint.name
+        if known.get("checkpoint", checkpoint) != checkpoint:
+            raise UserError(
+                f"the recorded row is of the checkpoint {known['checkpoint']}, not of "
+                f"{checkpoint}: --force replaces it"
+            )
         console.print(f"{config.level}, seed {seed}: recorded already (--force runs it again)")
         return known
     with open_run(experiment, config, seed, console, interruption) as run:

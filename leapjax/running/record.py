@@ -74,6 +74,7 @@ def make_row(run: Run, planner: Pretrained, episodes: Episodes) -> results.Row:
         "horizon": config.planner.horizon,
         "iterations": config.planner.iterations,
         "executed": config.executed or config.planner.horizon,
+        "checkpoint": config.checkpoint and config.checkpoint.name,
         "train_steps": 0 if config.checkpoint else config.training.steps,
         **{f"{part}_seconds": round(value, 3) for part, value in run.seconds.items()},
         "plans": episodes.plans,

@@ -1,12 +1,14 @@
 """Reads and writes result rows: JSON lines, one file for each experiment."""
 
 import contextlib
+import dataclasses
 import datetime
 import json
 import math
 import platform
 import statistics
 import subprocess
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -20,6 +22,7 @@ from leapjax import compilation, scores
 from leapjax.checks import LARGEST_SEED
 from leapjax.errors import UserError, first_line
 from leapjax.files import lock_folder, read_text, write_text, write_whole
+from leapjax.planners import PlannerConfig
 from leapjax.rollouts import Episodes
 from leapjax.running import jax_setup
 from leapjax.running.schema import (
@@ -61,6 +64,7 @@ ROW: dict[str, Schema] = {
     "demos_seconds": Absent(AMOUNT),
     "mean_return": Absent(float),
     "paper_success": Absent(Nullable(Number(0, 100))),
+    "checkpoint": Absent(Nullable(str)),
     "configuration": Absent({"planner": Absent(dict)}),
 }
 # Rows of an experiment, and of an analysis, with the fields that tables read.
@@ -347,12 +351,21 @@ def _find_number(row: Row, name: str) -> float | None:
 
 
 def name_planner(row: Row) -> str:
-    """Returns a short name of the planner of a row."""
+    """Returns a short name of the planner of a row: its settings that are not the usual ones."""
     configuration = row.get("configuration", {})
     planner, rules = configuration.get("planner", {}), configuration.get("rules", 0)
+    # A row does not say what kind of planner it is of, so the default of any kind is usual.
+    kinds = [dataclasses.asdict(kind()) for kind in typing.get_args(PlannerConfig)]
+    shown = ("iterations", "fill", "horizon", "score", "score_trace")  # "fill" first; or of no use
+    others = [
+        f"{name.replace('_', ' ')} {value}"
+        for name, value in planner.items()
+        if name not in shown and all(value != kind.get(name, kind) for kind in kinds)
+    ]
     parts = {
         f"N = {planner.get('iterations')}": "iterations" in planner,
         str(planner.get("fill")): planner.get("fill", "together") != "together",
+        **dict.fromkeys(others, True),
         f"rules {rules}": bool(rules),
         f"learned {row['level']}": row.get("played", row["level"]) != row["level"],
     }
@@ -389,7 +402,12 @@ def make_success_table(rows: Sequence[Row]) -> Table:
         length = f"{row['mean_length']:.1f}"
         result.add_row(*named(row), str(row["seed"]), *said, length, published(row))
     result.add_section()
-    for group in group_seeds(rows, named):
+
+    def identify(row: Row) -> tuple[str, ...]:
+        same = {**row.get("configuration", {}), "seed": None}
+        return *named(row), json.dumps(same, sort_keys=True)
+
+    for group in group_seeds(rows, identify):
         said = (measure(group) for _, measure in measures.values())
         length = f"{statistics.fmean(row['mean_length'] for row in group):.1f}"
         seeds = f"mean of {len(group)}"
