@@ -139,8 +139,8 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
             functools.partial(
                 analyses.compare_ways,
                 properties,
-                ways=analyses.AS_THE_PAPER,
-                cases=analyses.OF_THE_PAPER,
+                ways=analyses.WITHOUT_REVISITS,
+                cases=analyses.CONSTRAINED,
             ),
             "properties",
         ),

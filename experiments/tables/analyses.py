@@ -12,10 +12,23 @@ ANALYSES = {
     for program in (properties, stochastic, suboptimal, ablation)
 }
 PRESETS = ("paper", "leapjax")
-# One way for each method: LEAP executes whole plans, DT and IQL choose single actions. Below each
-# sum stands one part of it.
-AS_THE_PAPER = ("whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql")
-OF_THE_PAPER = ("adaptation", "generalization", "composition")
+# LEAP executes whole plans, DT and IQL choose single actions; each at two temperatures where noise
+# matters. Below each sum stands one part of it.
+NOISY = (
+    "leap, with noise", "sum, with more noise", "dt, with noise", "dt, with more noise",
+    "iql, with noise", "iql, with more noise",
+)  # fmt: skip
+WITHOUT_REVISITS = (
+    *("whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql"),
+    *NOISY,
+)
+CONSTRAINED = (
+    "adaptation",
+    "generalization",
+    "composition",
+    "constraints-room",
+    "constraints-maze",
+)
 EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))
 ERRANDS = ("constraints-errand", "constraints-detour")
 
