@@ -1,12 +1,95 @@
-"""Names of levels that do not exist raise an error that helps to correct them."""
+"""What holds for every puzzle: names of levels, augmented windows, and encoders."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from leapjax.configuration import make_domain, specify
+from leapjax.data import windows
+from leapjax.domain import blank_context
 from leapjax.domains.puzzles.countdown import problems
 from leapjax.domains.puzzles.satisfiability import formulas
 from leapjax.domains.puzzles.stars import graphs
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.errors import UserError
+from leapjax.presets import find_preset
+from leapjax.pretrained import make_agent
+from leapjax.types import pad_token
+from tests.parameters import random_parameters
+from tests.programs import only_long
+
+LEVELS = pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        ("stars", "Star2x3"), ("sudoku", "Sudoku4x6"), ("countdown", "Countdown3"),
+        ("satisfiability", "Nae4x6"),
+    ],
+)  # fmt: skip
+
+
+@LEVELS
+@pytest.mark.parametrize("cut", [windows.window, windows.unrolled_window])
+def test_augmented_windows_follow_the_rules_of_the_puzzle(name, level, cut):
+    """Every action of a window leads from its state to the next, also in the plan's future."""
+    domain, past, horizon = make_domain(find_preset(name, level, "leap", "leapjax")), 2, 4
+    data = domain.demonstrations.collect(2, 0, lambda done: None).demonstrations
+    steps = jax.tree.map(jnp.asarray, windows.concatenate(data, domain.augmentations.extras))
+    end, count = domain.num_actions - 1, len(data[0].actions)
+    (augment,) = domain.augmentations.functions
+    change = jax.jit(lambda key, step: augment(key, cut(steps, step, past, horizon, end)))
+    adapter = domain.make_adapter()
+    adapter.reset(0)
+    for step in {0, 1, count // 2, count - 2, count - 1}:
+        window = jax.device_get(change(jax.random.key(step), count + step))
+        context = window.context
+        now = len(context.actions)
+        states = [jax.tree.map(lambda x, j=j: x[j], context.past) for j in range(now)]
+        states.append(context.observation)
+        if name == "sudoku":  # its adapter compares digits with the solution
+            adapter.solution = boards.find_solutions(context.observation.digits)[0] - 1
+        taken = [*context.actions[:past], *window.actions]
+        assert [*context.actions] == taken[:now]
+        for place in range(now):
+            if taken[place] == pad_token(domain.num_actions):
+                assert place < past - step
+                continue
+            after = states[place]
+            if taken[place] != end:
+                after, _ = adapter.move(states[place], int(taken[place]))
+            jax.tree.map(np.testing.assert_array_equal, after, states[place + 1])
+
+
+@pytest.mark.parametrize("method", ["leap", "classifier", "plate", "bc"])
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        ("sudoku", "Sudoku4x6"),
+        pytest.param("stars", "Star2x3", marks=only_long),
+        pytest.param("countdown", "Countdown3", marks=only_long),
+        pytest.param("satisfiability", "Nae4x6", marks=only_long),
+    ],
+)
+def test_every_method_sees_the_puzzle(name, level, method):
+    config = find_preset(name, level, method, "leapjax")
+    small = dataclasses.replace(config.model, width=16)
+    config = dataclasses.replace(config, model=small, context=0)
+    domain = make_domain(config)
+    agent = make_agent(specify(config, 0, domain), domain)
+    params, adapter = random_parameters(agent), domain.make_adapter()
+    contexts = (
+        blank_context(domain, 0)._replace(observation=adapter.reset(seed)) for seed in (1, 2)
+    )
+    actions, positions = jnp.zeros(config.planner.horizon, jnp.int32), jnp.zeros(1, jnp.int32)
+    score = jax.jit(
+        lambda context: agent.energy.conditional(
+            params, agent.energy.encode(params, context), actions, positions
+        )
+    )
+    first, second = map(score, contexts)
+    assert not np.allclose(first[:, :-1], second[:, :-1], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def context_at(cell, digits):
 
 
 def test_plan_positions_encode_the_cells_they_fill():
-    module, digits = BoardTokens(4, width=8, whole=False), np.arange(16) % 5
+    module, digits = BoardTokens(4, width=8), np.arange(16) % 5
     params = random_like(jax.eval_shape(module.init, jax.random.key(0), context_at(0, digits)))
     encode = functools.partial(module.apply, params, horizon=16, method="encode_positions")
     places = jax.jit(
@@ -197,7 +197,7 @@ def test_plan_positions_encode_the_cells_they_fill():
 @pytest.mark.parametrize("cell", [0, 6])
 def test_attention_heads_see_rows_columns_boxes_or_the_whole_plan(cell):
     config, everywhere = ModelConfig(layers=1, heads=4, width=16), np.arange(16)
-    module = build_masked_model(config, Sizes(5, 0, 16, 16), BoardTokens(4, 16, whole=True))
+    module = build_masked_model(config, Sizes(5, 0, 16, 16), BoardTokens(4, 16))
     board = boards.Board(everywhere.astype(np.int32) % 5, np.int32(cell))
     context = context_at(cell, board.digits)._replace(observation=board)
 

@@ -51,6 +51,14 @@ class Encoder(nn.Module):
         del context, horizon
         return None
 
+    def for_plans(self, horizon: int) -> "Encoder":
+        """Returns this encoder for a network that calls `encode_positions` for T actions.
+
+        Its context may leave out what the positions show. By default it returns itself.
+        """
+        del horizon
+        return self
+
     def group_positions(self, context: Context, horizon: int) -> jax.Array | None:
         """Returns which positions of a plan belong together: booleans `[G, T, T]`.
 

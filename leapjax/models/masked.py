@@ -37,4 +37,4 @@ def build_masked_model(
     encoder = encoder if repeat_state else encoder.add_later_state()
     if config.architecture == "paper":
         return PaperModel(config, sizes, encoder, conditioned)
-    return PrefixModel(config, sizes, encoder, conditioned)
+    return PrefixModel(config, sizes, encoder.for_plans(sizes.horizon), conditioned)

@@ -78,37 +78,38 @@ def repeat(puzzle: PyTree, demonstration: Demonstration) -> PyTree:
 
 def rewrite(
     window: Window,
-    place: jax.Array,
+    find_place: Callable[[PyTree], jax.Array],
     solution: jax.Array,
     observe: Callable[[jax.Array], PyTree],
     end: int,
 ) -> Window:
-    """Makes the window of another puzzle at the same place of its solution.
+    """Makes the window of another puzzle at the same places of its solution.
 
     Args:
-        window: window to change.
-        place: `[]` number of actions that the solution has before the window.
+        window: window to change; its context may go on to the plan's last state, see
+            `leapjax.data.windows.unrolled_window`.
+        find_place: (observation) -> `[]` number of actions that the solution has before it.
         solution: `[n]` all actions of the new puzzle's solution.
         observe: (place) -> observation of the new puzzle after so many actions.
         end: the end action.
     """
-    length = solution.shape[0]
-    earlier = place + jnp.arange(-window.context.actions.shape[0], 0)
-    ahead = place + jnp.arange(window.actions.shape[0])
+    context, pad = window.context, pad_token(end + 1)
+    earlier, known = find_place(context.past), context.actions != pad  # [K]
 
-    def read(places: jax.Array, otherwise: int) -> jax.Array:
-        inside = (places >= 0) & (places < length)
-        return jnp.where(inside, solution[jnp.clip(places, 0, length - 1)], otherwise)
+    def read(places: jax.Array) -> jax.Array:
+        inside = places < solution.shape[0]
+        return jnp.where(inside, solution[jnp.where(inside, places, 0)], end)
 
-    def observe_past(place: jax.Array) -> PyTree:
-        return jax.tree.map(lambda leaf: jnp.where(place < 0, 0, leaf), observe(place))
+    def observe_past(place: jax.Array, known: jax.Array) -> PyTree:
+        return jax.tree.map(lambda leaf: jnp.where(known, leaf, 0), observe(place))
 
-    context = window.context._replace(
-        observation=observe(place),
-        past=jax.vmap(observe_past)(earlier),
-        actions=read(earlier, pad_token(end + 1)),
+    ahead = context.step + jnp.arange(window.actions.shape[0])  # an action a step
+    context = context._replace(
+        observation=observe(find_place(context.observation)),
+        past=jax.vmap(observe_past)(earlier, known),
+        actions=jnp.where(known, read(earlier), pad),
     )
-    return window._replace(context=context, actions=read(ahead, end))
+    return window._replace(context=context, actions=read(ahead))
 
 
 def turn_whole(

@@ -306,4 +306,4 @@ def reorder(key: jax.Array, window: Window) -> Window:
         written = jnp.where(jnp.arange(len(solution)) < place, solution, OPEN)
         return problem._replace(written=written, place=place)
 
-    return rewrite(window, problem.place, solution, observe, END)
+    return rewrite(window, lambda state: state.place, solution, observe, END)

@@ -174,7 +174,7 @@ def rename(key: jax.Array, window: Window) -> Window:
         known = jnp.arange(count) < variable
         return Formula(literals, jnp.where(known, solution, OPEN), variable)
 
-    return rewrite(window, formula.variable, solution, observe, end=2)
+    return rewrite(window, lambda state: state.variable, solution, observe, end=2)
 
 
 def turn(key: jax.Array, context: Context, horizon: int) -> Turned:

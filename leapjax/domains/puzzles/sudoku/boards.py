@@ -373,7 +373,7 @@ def transform(key: jax.Array, window: Window, side: int) -> Window:
     def observe(cell: jax.Array) -> Board:
         return Board(jnp.where(jnp.arange(side**2) < cell, solution, clues), cell)
 
-    return rewrite(window, window.context.observation.cell, solution - 1, observe, end=side)
+    return rewrite(window, lambda board: board.cell, solution - 1, observe, end=side)
 
 
 def turn(key: jax.Array, context: Context, side: int, horizon: int) -> Turned:

@@ -45,17 +45,17 @@ class BoardTokens(Encoder):
 
     `encode_positions` gives each action of a plan its cell, so the network need not learn for each
     position which cells share its row, column or box. A plan of the whole board then shows every
-    cell and its digit, so its context leaves the tokens of cells out.
+    cell and its digit, so `for_plans` leaves the tokens of cells out.
 
     Attributes:
         side: of the board, in cells.
         width: D, of a token.
-        whole: whether plans have an action for each cell.
+        whole: whether plans show every cell.
     """
 
     side: int
     width: int
-    whole: bool
+    whole: bool = False
 
     def setup(self) -> None:  # noqa: D102
         self.row = embed(self.side, self.width)
@@ -68,6 +68,9 @@ class BoardTokens(Encoder):
         """Tokens `[1, D]` for whole plans, otherwise `[cells + 1, D]`."""
         here = self.task(jnp.zeros(1, jnp.int32)) + self._groups(context.observation.cell[None])
         return here if self.whole else jnp.concatenate([self._cells(context), here])
+
+    def for_plans(self, horizon: int) -> Encoder:  # noqa: D102
+        return self.clone(whole=horizon >= self.side**2)
 
     def encode_positions(self, context: Context, horizon: int) -> jax.Array:
         """Encodes the cells that a plan fills, with their content: `[T, D]`.
@@ -111,7 +114,7 @@ def make(name: str, settings: Settings) -> Domain:
     transform = functools.partial(boards.transform, side=side)
 
     def tokens(model: ModelConfig, sizes: Sizes) -> Encoder:
-        return BoardTokens(side, model.width, whole=sizes.horizon >= level.cells)
+        return BoardTokens(side, model.width)
 
     return Domain(
         level=name,
