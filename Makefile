@@ -21,10 +21,10 @@ test-long: .venv/test
 
 # The core's tests with the newest versions of all dependencies where .venv has the lowest, and
 # with the lowest where it has the newest: on a Python that this machine may have.
-CORE := energy planners batching pure rollouts models transformer training pretrained published \
+CORE := energy planners pure rollouts models transformer training pretrained published \
 	storage gymnasium babyai atari observations
 test-other-end: .venv/test
-	tests/other_end.sh $(wildcard $(CORE:%=tests/test_%.py)) $(ARGS)
+	tests/other_end.sh $(CORE:%=tests/test_%.py) $(ARGS)
 
 lint: .venv/develop
 	$(BIN)/ruff check .

@@ -36,7 +36,7 @@ def use_disk_cache() -> None:
         return
     try:
         folder = Path(choice) if choice else files.find_cache_folder() / "xla" / name_processor()
-        files.make_private(folder.absolute())
+        folder = files.make_private(folder.absolute())
     except UserError as error:  # JAX would print a traceback for every program
         _say_once(f"compiled programs are not kept: {error}")
         return

@@ -86,12 +86,17 @@ def read_sizes(path: Path) -> dict[str, int]:
     """Returns the unpacked bytes of each array in a NumPy archive, without unpacking it.
 
     Raises:
-        Exception: the archive is damaged (zipfile raises many kinds).
+        Exception: the archive is damaged (zipfile raises many kinds), or holds other things than
+            arrays, or two of one name.
     """
     _check_regular(path)
     with zipfile.ZipFile(path) as archive:
         # Readers of the archive stop at the size that it claims for an array.
-        return {each.filename.removesuffix(".npy"): each.file_size for each in archive.infolist()}
+        found = [(each.filename, each.file_size) for each in archive.infolist()]
+    sizes = {name.removesuffix(".npy"): size for name, size in found if name.endswith(".npy")}
+    if len(sizes) < len(found):  # NumPy would read another entry than the one measured here
+        raise ValueError("it holds two arrays of one name, or an entry that is no array")
+    return sizes
 
 
 def write_text(path: Path, text: str) -> None:
@@ -144,10 +149,13 @@ def find_cache_folder() -> Path:
         raise UserError("this user has no home folder: name a folder in XDG_CACHE_HOME") from None
 
 
-def make_private(folder: Path) -> None:
+def make_private(folder: Path) -> Path:
     """Makes a folder to which only this user can write, or checks an existing folder.
 
     Otherwise another user could choose the files that this process reads from it.
+
+    Returns:
+        The absolute path without links: others may be able to replace a link.
 
     Raises:
         UserError: the folder cannot be made, or others can write to it or replace it.
@@ -159,6 +167,7 @@ def make_private(folder: Path) -> None:
         _check_private(where, sticky=False)
         for parent in where.parents:
             _check_private(parent, sticky=True)
+        return where
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
 

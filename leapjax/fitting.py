@@ -122,6 +122,14 @@ def fit(
         mesh = sharding.make_mesh(training.batch // training.consecutive, jax.local_devices())
     except ValueError as error:  # a dataclass refuses a value
         raise UserError(str(error)) from None
+    context = asked.get("context", config.context)
+    for field, number in (("horizon", planner.horizon), ("context", context)):
+        if number > domain.max_steps:
+            raise UserError(
+                f"{field} is {number}, longer than any episode of {domain.level}: at most "
+                f"{domain.max_steps} steps",
+                field,
+            )
     data = _read(demonstrations, domain, seed)
     if not data and training.steps:
         raise UserError("no demonstrations: expected at least one to learn from")
@@ -131,7 +139,6 @@ def fit(
     name_of_data = demonstrations if isinstance(demonstrations, str) else None
     statistics = measure_statistics(domain, data) if data else ()
     domain = apply_statistics(domain, statistics)
-    context = asked.get("context", config.context)
     specification = Specification(
         name or "", domain.level, method, context, model, training, planner,
         settings, domain_settings, find_signature(domain, model.architecture),

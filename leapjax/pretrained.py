@@ -107,6 +107,7 @@ class Pretrained:
         params: parameters of the energy.
         plan: the compiled planner: `(params, keys, contexts) -> Plan`.
         domain: level that it plays; `domain.make_adapter()` makes an environment.
+        step: training step of the parameters; `None` if training has ended.
     """
 
     specification: Specification
@@ -114,6 +115,7 @@ class Pretrained:
     params: Params
     plan: CompiledPlanner
     domain: Domain
+    step: int | None = None
 
     def __call__(self, keys: Array, contexts: Context) -> Plan:
         """Plans for B contexts (see `leapjax.rollouts.stack_contexts`)."""
@@ -185,7 +187,7 @@ class Pretrained:
             folder / CHECKPOINTS,
             self.params,
             describe_identity(specification),
-            specification.training.steps,
+            specification.training.steps if self.step is None else self.step,
         )
         save_specification(folder, specification)
 
@@ -195,7 +197,7 @@ class Pretrained:
         data = f"{origin.demos} demonstrations"
         data += f" of {origin.demonstrations}" if origin.demonstrations else ""
         return "\n".join([
-            f"Pretrained: {known.method} on {known.level}, trained on {data}, preset "
+            f"Pretrained: {known.method} on {self.domain.level}, trained on {data}, preset "
             f"{origin.preset}, seed {origin.seed}",
             f"  network: {model.architecture}, {model.layers} layers of width {model.width}, "
             f"{sum(leaf.size for leaf in leaves):,} parameters",
@@ -481,6 +483,7 @@ def load(
         domain = other._replace(max_steps=domain.max_steps)
     agent = make_agent(specification, domain)
     like = _trace_parameters(agent, specification, saved, folder)
+    step = None
     if (folder / WEIGHTS).exists():
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
@@ -493,10 +496,8 @@ def load(
             warnings.warn(
                 f"{folder} ends at step {step} of {specification.training.steps}", stacklevel=2
             )
-    specification = dataclasses.replace(
-        specification, planner=planner or specification.planner, level=level or specification.level
-    )
+    specification = dataclasses.replace(specification, planner=planner or specification.planner)
     plan = compile_planner(
         agent.energy, specification.planner, chunk_sizes, encode_next=agent.encode_next
     )
-    return Pretrained(specification, agent.energy, params, plan, domain)
+    return Pretrained(specification, agent.energy, params, plan, domain, step)

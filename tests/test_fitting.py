@@ -111,6 +111,8 @@ def test_planner_of_an_unregistered_domain_cannot_be_saved(monkeypatch, tmp_path
         (list, {"steps": -1}, "steps must be at least 0"),
         (list, {"seed": 2**31}, "seed must be at most 2147483647"),
         (list, {"settings": SMALL}, "expected Settings, got ModelConfig"),
+        (list, {"horizon": 9, "planner": leap.GibbsConfig(9, 9)}, "horizon is 9, longer than any"),
+        (list, {"context": 99}, "context is 99, longer than any"),
         (list, {"horizon": 9}, "it needs 9 iterations"),
         (list, {"method": "bc", "planner": leap.GibbsConfig(2)}, "horizon is 1"),
     ],

@@ -196,9 +196,16 @@ def test_damaged_checkpoint_is_set_aside_and_the_previous_checkpoint_restored(tm
     assert (tmp_path / "3.damaged").is_dir()
 
 
-def test_temporarily_unreadable_checkpoint_is_not_treated_as_damaged(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EMFILE, "Too many open files"),
+        ValueError("RESOURCE_EXHAUSTED: Too many open files [os_error_code='24']"),  # TensorStore
+    ],
+)
+def test_temporarily_unreadable_checkpoint_is_not_treated_as_damaged(tmp_path, monkeypatch, error):
     def fail_to_open(*arguments, **more):
-        raise OSError(errno.EMFILE, "Too many open files")
+        raise error
 
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     checkpoints.save(make_state(1))

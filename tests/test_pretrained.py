@@ -41,14 +41,18 @@ def test_target_return_of_a_loaded_planner_changes_its_energies(tmp_path):
         pretrained.load(folder, target_return=float("nan"))
 
 
-def test_specification_of_a_loaded_planner_holds_its_search_and_level(tmp_path):
+def test_a_planner_loaded_for_another_level_can_be_saved(tmp_path):
     folder = untrained_run(tmp_path, "--level", "GoToLocalS7N1", "--architecture", "paper")
     trained = pretrained.load(folder).specification
     search = dataclasses.replace(trained.planner, iterations=77, fill="confident")
     planner = pretrained.load(folder, search, level="GoToObjMazeS4R2")
     chosen = planner.specification
-    assert (chosen.planner, chosen.level) == (search, "GoToObjMazeS4R2")
-    assert dataclasses.replace(chosen, planner=trained.planner, level=trained.level) == trained
+    assert (chosen.planner, planner.domain.level) == (search, "GoToObjMazeS4R2")
+    assert "leap on GoToObjMazeS4R2, trained" in repr(planner)
+    assert dataclasses.replace(chosen, planner=trained.planner) == trained
+    planner.save(tmp_path / "saved")
+    again = pretrained.load(tmp_path / "saved", level="GoToObjMazeS4R2")
+    jax.tree.map(np.testing.assert_array_equal, again.params, planner.params)
     # The network keeps the number of episode steps of its training level.
     blank = blank_context(planner.domain, 0)
     assert jax.eval_shape(planner.energy.encode, planner.params, blank)

@@ -278,7 +278,7 @@ def test_folder_that_others_can_write_to_raises_an_error(workplace):
     files.make_private(made)
     assert made.stat().st_mode & 0o777 == made.parent.stat().st_mode & 0o777 == 0o700
     (workplace / "link").symlink_to(made)
-    files.make_private(workplace / "link")
+    assert files.make_private(workplace / "link") == made.resolve()  # others may change the link
     for folder in (made, made.parent):
         folder.chmod(0o777)
         with pytest.raises(UserError, match="others can write to"):
@@ -362,7 +362,9 @@ def test_unfinished_run_is_neither_recorded_nor_published(toy_run, workplace, ca
     with pytest.raises(UserError, match=printed):
         pretrained.publish(stopped, workplace / "published")
     with pytest.warns(UserWarning, match="ends at step 3 of 4"):
-        leap.load(stopped)
+        leap.load(stopped).save(workplace / "copied")
+    with pytest.raises(UserError, match=printed):
+        pretrained.publish(workplace / "copied", workplace / "published")
 
 
 # The machine.

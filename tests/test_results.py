@@ -3,6 +3,7 @@
 import json
 import math
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_infinite_values_are_not_recorded(tmp_path):
     assert not path.exists()
 
 
-def test_episodes_are_stored_with_their_rows(tmp_path):
+def test_episodes_are_stored_with_their_rows(tmp_path, monkeypatch):
     def make_episodes(*lengths):
         seeds = np.arange(len(lengths))
         return Episodes(seeds, seeds > 0, np.array(lengths), seeds / 3, 1, 10, 1.0, 1.0)
@@ -138,6 +139,11 @@ def test_episodes_are_stored_with_their_rows(tmp_path):
     assert table["seed"].tolist() == [0, 1] and table["success"].tolist() == [False, True]
     assert table["return"].tolist() == [0, 1 / 3]
     results.record(path, {**ROW, "hash": "a"}, make_episodes(7))
+    with monkeypatch.context() as patch:  # killed while it replaces a row
+        patch.setattr(results, "_write_episodes", lambda *given: sys.exit("killed"))
+        with pytest.raises(SystemExit):
+            results.record(path, {**ROW, "hash": "b"}, make_episodes(6))
+    assert {row["hash"] for row in results.read(path)} == {"a"}  # no row with episodes of another
     results.record(path, {**ROW, "hash": "b"})  # another outcome, without episodes
     assert read_lengths() == {"a": [7]}
     results.record(path, {**ROW, "hash": "a"})

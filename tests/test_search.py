@@ -133,15 +133,11 @@ def test_independent_positions_are_drawn_from_their_joint_in_one_pass():
     assert fit_p_value(counts, joint_probabilities(table).reshape(-1)) > 1e-3
 
 
-def test_nan_and_infinite_ranks_still_fill_the_plan():
-    for rank in (np.nan, -np.inf, np.inf):
-        plan = plan_for(
-            GibbsConfig(
-                HORIZON, HORIZON, fill=lambda energies, key, r=rank: energies[:, 0] * 0 + r
-            ),
-            params=random_table(0, HORIZON, ACTIONS),
-        )
-        assert (plan.actions < ACTIONS).all() and plan.passes == HORIZON
+@pytest.mark.parametrize("rank", [np.nan, -np.inf, np.inf, 3, True])
+def test_ranks_of_any_type_fill_the_plan(rank):
+    config = GibbsConfig(HORIZON, HORIZON, fill=lambda energies, key: jnp.full(HORIZON, rank))
+    plan = plan_for(config, params=random_table(0, HORIZON, ACTIONS))
+    assert (plan.actions < ACTIONS).all() and plan.passes == HORIZON
 
 
 # Kept plans, cooling, and the number of passes.

@@ -119,6 +119,8 @@ for name in {[name for name in modules if not name.endswith("__init__")]}:
 from leapjax.running import jax_setup, command_line
 for method in ("leap", "classifier", "random"):
     command_line.parse("babyai", ["--method", method])
+for domain in ("atari", "countdown", "satisfiability", "stars", "sudoku"):
+    command_line.parse(domain, [])
 jax_setup.start()
 assert len(jax.devices()) == min(len(os.sched_getaffinity(0)), 8), jax.devices()
 """

@@ -1,17 +1,24 @@
 """Damaged checkpoints: detects them, describes them and sets them aside."""
 
 import errno
+import re
 import shutil
 from pathlib import Path
 
 from leapjax.errors import first_line
 
-PASSING = {errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM}
+PASSING = {
+    errno.EMFILE, errno.ENFILE, errno.EACCES, errno.EPERM, errno.ENOMEM, errno.EIO, errno.ESTALE,
+}  # fmt: skip
+# TensorStore raises ValueError, and names the number of the system's error in its message.
+SYSTEM_ERROR = re.compile(r"os_error_code='(\d+)'")
 
 
 def is_damage(error: Exception) -> bool:
     """Returns whether a failed read means damage, not a lack of memory, files or permission."""
-    return not isinstance(error, MemoryError) and getattr(error, "errno", None) not in PASSING
+    named = SYSTEM_ERROR.search(str(error))
+    number = int(named[1]) if named else getattr(error, "errno", None)
+    return not isinstance(error, MemoryError) and number not in PASSING
 
 
 def set_aside(checkpoint: Path) -> Path:

@@ -61,11 +61,6 @@ class Checkpoints:
         )  # fmt: skip
         return ocp.CheckpointManager(self._folder, options=options)
 
-    @property
-    def latest(self) -> int | None:
-        """Step of the newest checkpoint, or `None`."""
-        return processes.run_on_first(lambda: self._manager.latest_step())
-
     def save(self, state: TrainState) -> None:
         """Writes a state in the background.
 

@@ -97,8 +97,8 @@ def choose_open(
     """
     count = open_.shape[0] if commitment.adapts else commitment.least
     # A rank of a user's own may be NaN or -inf, and the position is open all the same.
-    lowest = jnp.finfo(ranks.dtype).min
-    ranks = jnp.nan_to_num(ranks, nan=lowest, neginf=lowest)
+    lowest = jnp.finfo(jnp.float32).min
+    ranks = jnp.nan_to_num(jnp.asarray(ranks, jnp.float32), nan=lowest, neginf=lowest)
     where = jax.lax.top_k(jnp.where(open_, ranks, -jnp.inf), count)[1]
     chosen = jnp.arange(count) < commitment.least
     if commitment.adapts:

@@ -168,16 +168,22 @@ def record(path: Path, row: Row, episodes: Episodes | None = None) -> None:
             raise UserError(f"{path}: {name} of a new row is not finite: {value}") from None
     with lock_folder(path.parent, wait=True):
         rows = [other for other in read(path) if other["hash"] != row["hash"]]
-        # Episodes first: a process that is killed in between leaves episodes without a row, which
-        # the next process drops.
+        # Episodes before their row, and no row while its episodes change: a process that is killed
+        # in between leaves episodes without a row, which the next process drops.
         known, hashes = read_episodes(path), {other["hash"] for other in rows}
+        if row["hash"] in known:
+            _write_rows(path, rows)
         tables = {name: each for name, each in known.items() if name in hashes}
         if episodes is not None:
             tables[row["hash"]] = as_table(episodes)
         if tables or known:
             _write_episodes(_locate_episodes(path), tables)
-        lines = (json.dumps(entry, sort_keys=True) for entry in [*rows, row])
-        write_text(path, "".join(f"{line}\n" for line in lines))
+        _write_rows(path, [*rows, row])
+
+
+def _write_rows(path: Path, rows: Sequence[Row]) -> None:
+    lines = (json.dumps(row, sort_keys=True) for row in rows)
+    write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def change(path: Path, changed: Callable[[Any], Any]) -> Any:

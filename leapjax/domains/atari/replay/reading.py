@@ -65,8 +65,7 @@ def read(
         return load_conversion(beside / key)
     place = beside
     if not _is_writable(beside):
-        files.make_private(cached)  # so only this user can have made its content
-        place = cached
+        place = files.make_private(cached)  # so only this user can have made its content
         if (place / key).is_dir():
             return load_conversion(place / key)
     with files.lock_folder(place, wait=True):

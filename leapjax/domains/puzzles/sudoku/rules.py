@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from leapjax.domains.puzzles.sudoku import boards
 from leapjax.types import Context, Energy, Params
@@ -17,7 +18,8 @@ def rules(side: int, weight: float = 4.0) -> Energy:
         side: of the board.
         weight: of a broken rule, in nats.
     """
-    peers, cells, end = jnp.asarray(boards.find_peers(side), jnp.float32), side**2, side
+    # NumPy's array: JAX's would start the devices before a program has chosen them.
+    peers, cells, end = np.asarray(boards.find_peers(side), np.float32), side**2, side
     mask = side + 1
 
     def encode(params: Params, context: Context) -> tuple[jax.Array, jax.Array]:
@@ -43,7 +45,7 @@ def rules(side: int, weight: float = 4.0) -> Energy:
         # Positions after the last cell write no digit and break no rule.
         on_board = (cell + positions < cells)[:, None]
         places = jnp.minimum(cell + positions, cells - 1)
-        broken = peers[places] @ known(digits, cell, tokens)  # [P, side]
+        broken = jnp.asarray(peers)[places] @ known(digits, cell, tokens)  # [P, side]
         clue = digits[places][:, None]
         other = (clue > 0) & (clue - 1 != jnp.arange(side))
         energies = jnp.where(on_board, jnp.where(other, jnp.inf, weight * broken), 0.0)
