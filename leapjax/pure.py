@@ -1,7 +1,7 @@
 """Plays episodes entirely inside `jit`, in environments that are pure functions.
 
-The episodes are the same as in `leapjax.rollouts.evaluate`. One call of one program plays thousands
-of them.
+The episodes are the same as in `leapjax.rollouts.evaluate`, but rewards are summed in float32. One
+call of one program plays thousands of them.
 """
 
 import time

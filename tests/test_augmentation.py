@@ -325,7 +325,8 @@ def test_a_share_of_windows_hides_the_goal_in_all_states():
     now, past = (np.asarray(part.goal) for part in (changed.context.observation,
                                                     changed.context.past))  # fmt: skip
     hidden = (now == -1).all(axis=1)
-    assert 0.2 < hidden.mean() < 0.4 and (past[hidden] == -1).all()
+    assert 0.2 < hidden.mean() < 0.4 and (past[hidden][:, 1:] == -1).all()
+    assert (past[hidden][:, 0] == 0).all()  # the blank state before the start, as in play
     context = changed.context
     shown = context._replace(
         observation=context.observation._replace(goal=now[~hidden]),

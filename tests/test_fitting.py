@@ -84,7 +84,7 @@ def test_fit_uses_the_defaults_of_the_command_line(domain, level, method, monkey
     fitted = leap.fit([episode], made, method).specification
     chosen = dataclasses.replace(find_preset(domain, level, method, "leapjax"), demos=1)
     if method == "dt":  # its target is the best return of the data
-        chosen = change(chosen, method_settings={"target_return": 2.0})
+        chosen = change(chosen, method_settings={"target_return": 2.0, "return_scale": 2.0})
     assert dataclasses.replace(fitted, statistics=()) == specify(chosen, 0, made)
 
 

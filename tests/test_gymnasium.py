@@ -273,7 +273,9 @@ def test_target_return_defaults_to_a_high_return_of_the_data(tmp_path, monkeypat
     name = recorded("my/corridor-v0", "Corridor-v0", lambda view: 1, 2)
     options = [*SMALL, "--dataset", name, "--method", "dt", "--steps", "0"]
     assert program.main(options) == 0
-    assert "target return: 1, from the demonstrations" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "target return: 1, from the demonstrations" in printed
+    assert "return scale: 1, from the demonstrations" in printed
     (folder,) = (tmp_path / "runs").glob("gymnasium-*")
     assert pretrained.load(folder).specification.method_settings.target_return == 1.0
     assert program.main([*options, "--target-return", "7"]) == 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from leapjax import batching
-from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, qr_dqn, rem, returns
+from leapjax.agents import bc, bcq, cql, dt, iql, leap, mopo, plate, qr_dqn, rem, returns
 from leapjax.agents.base import Setup, TrainingConfig
 from leapjax.agents.measured import measure_settings
 from leapjax.domain import Scaling
@@ -17,7 +17,7 @@ from leapjax.errors import UserError
 from leapjax.models.config import ModelConfig
 from leapjax.planners import GibbsConfig
 from tests import mixed, toy
-from tests.parameters import random_parameters
+from tests.parameters import random_parameters, random_state
 from tests.programs import only_long
 from tests.quick import quick_jit
 from tests.toy import LEFT, RIGHT, WAIT
@@ -154,7 +154,10 @@ def test_target_return_defaults_to_a_high_return_of_the_data():
     data = [good._replace(rewards=np.float32([i])) for i in range(1000)]
     missing, unconditioned = dt.Settings(None), leap.Settings(target_return=None)
     assert measure_settings(missing, [good]) == dt.Settings(5.0)
-    assert measure_settings(missing, data) == dt.Settings(990.0)
+    assert measure_settings(missing, data) == dt.Settings(989.0)
+    assert measure_settings(missing, data[:20]) == dt.Settings(18.0)  # one episode had more
+    unscaled = dt.Settings(return_scale=None)
+    assert measure_settings(unscaled, [good]) == dt.Settings(return_scale=5.0)
     for settings in (given, unconditioned, bc.Settings()):
         assert measure_settings(settings, data) == settings
     assert measure_settings(missing, []) == missing
@@ -194,16 +197,28 @@ def test_reward_scale_divides_rewards(module):
     np.testing.assert_allclose(*found, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("module", "horizon"), [(bc, 1), (dt, 1), (plate, 3)])
+def test_actions_that_are_not_imitated_are_not_learned(module, horizon):
+    settings, training = module.Settings(), TrainingConfig(batch=4)
+    model = ModelConfig(layers=1, heads=1, width=8)
+    agent = module.make_agent(Setup(mixed.DOMAIN, 0, horizon, model, training, settings))
+    batch = agent.batch(jax.random.key(0), mixed.steps())
+    batch = batch._replace(imitated=jnp.zeros_like(batch.imitated))
+    _, metrics = quick_jit(agent.update)(random_state(agent), batch, jax.random.key(1))
+    assert metrics["accuracy"] == 0
+    assert metrics["loss"] == metrics.get("state_error", 0)  # PlaTe also predicts states
+
+
 def test_rewards_lower_the_target_return():
     """Scaled returns do not saturate the network; a known return to go replaces the target."""
     domain = mixed.DOMAIN._replace(scaling=Scaling(returns=4.0))
-    settings = dt.Settings(target_return=10.0)
+    settings = dt.Settings(target_return=10.0, return_scale=2.0)
     compute = returns.condition_on_target(
         Setup(domain, 2, 1, ModelConfig(), TrainingConfig(), settings)
     )
     context = mixed.contexts(2)._replace(rewards=jnp.array([1.0, 2.0]), return_so_far=3.0)
-    np.testing.assert_allclose(compute(context), np.array([10, 9, 7]) / 4)
-    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([8, 7, 5]) / 4)
+    np.testing.assert_allclose(compute(context), np.array([10, 9, 7]) / 8)
+    np.testing.assert_allclose(compute(context, jnp.float32(5)), np.array([8, 7, 5]) / 8)
 
 
 @pytest.mark.parametrize("name", ["bc", "dt", "bcq", "iql", "mopo", "cql", "qr_dqn", "rem"])

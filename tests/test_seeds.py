@@ -36,7 +36,10 @@ def test_seeds_of_all_purposes_are_disjoint(test_first, validation_first, count,
 
 
 def test_ranges_of_consecutive_training_seeds_are_adjacent():
-    assert len(list(seeds.training_seeds(3))) == seeds.TRAINING_STRIDE
+    every = seeds.training_seeds(3)
+    assert len(list(itertools.islice(every, seeds.TRAINING_STRIDE))) == seeds.TRAINING_STRIDE
+    with pytest.raises(UserError, match="no more level seeds"):
+        next(every)
     assert training_range(3).stop == training_range(4).start
     # The largest seed fits 32-bit integers of NumPy and JAX.
     assert training_range(seeds.MAX_TRAINING_SEED - 1).stop < 2**31

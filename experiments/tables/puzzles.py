@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ PAYING = (
     ("most certain first, best of 16", "16 (T + 1)"),
 )  # fmt: skip
 HARD = "Sudoku9x31-42"  # level in training; its planners also play boards of a file
-TRAINED = ("demos", "model", "training", "method_settings")  # settings of a planner
+TRAINED = ("model", "training", "method_settings")  # settings of a planner
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
 
 
@@ -119,16 +120,21 @@ def group_by_boards(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
     """Groups rows of `HARD` by search, and by boards: drawn; of a file; of a file, with rules."""
     config = find_preset("sudoku", HARD, "leap", "leapjax")
     settings = list_settings(config, seed=0)
-    defaults = dataclasses.asdict(type(config.planner)())  # of fields that older rows lack
+
+    def read(row: Row, part: str) -> dict[str, Any]:
+        """Reads a part of a row's configuration; fields that older rows lack have their default."""
+        return dataclasses.asdict(type(getattr(config, part))()) | row["configuration"][part]
+
     trained = [
         row for row in rows
         if (row["level"], row["method"]) == (HARD, "leap")
-        and all(row["configuration"][key] == settings[key] for key in TRAINED)
+        and row["configuration"]["demos"] == config.demos
+        and all(settings[part] == read(row, part) for part in TRAINED)
     ]  # fmt: skip
     found = []
     for search in SEARCHES:
         planner = search.of(config.planner.horizon)
-        of = [row for row in trained if planner == defaults | row["configuration"]["planner"]]
+        of = [row for row in trained if planner == read(row, "planner")]
         boards = [
             [
                 row for row in of

@@ -49,8 +49,11 @@ def make_imitator(
             returns=compute_returns(window.context, window.return_to_go), tokens=tokens,
         )  # fmt: skip
         logits = outputs["logits"]  # [P, A - 1]
-        taken = losses.find_actions_taken(window.context, window.actions[0], len(logits), choices)
-        loss, accuracy = losses.imitation_loss(logits, *taken)
+        taken, known = losses.find_actions_taken(
+            window.context, window.actions[0], len(logits), choices
+        )
+        known = known.at[-1].set(known[-1] & window.imitated[0])
+        loss, accuracy = losses.imitation_loss(logits, taken, known)
         return loss, {"accuracy": accuracy}
 
     def touch(module: PolicyModel, context: Context, actions: jax.Array) -> jax.Array:

@@ -59,8 +59,8 @@ def bellman_targets(transition: TransitionWindow, values: jax.Array, discount: f
 
 
 def average_where(values: jax.Array, known: jax.Array) -> jax.Array:
-    """Averages values `[P]` where `known [P]` is True; at least one element must be."""
-    return jnp.where(known, values, 0).sum() / known.sum()
+    """Averages values `[P]` where `known [P]` is True; 0 where nothing is."""
+    return jnp.where(known, values, 0).sum() / jnp.maximum(known.sum(), 1)
 
 
 def select_values(values: jax.Array, actions: jax.Array) -> jax.Array:

@@ -78,7 +78,9 @@ def make_agent(setup: Setup, mesh: Mesh | None = None) -> Agent:
         logits, predicted = outputs
         # The loss counts actions up to the first end.
         ended = jnp.cumsum(window.actions == last) - (window.actions == last)
-        cloning, accuracy = losses.imitation_loss(logits, window.actions, ended == 0)
+        cloning, accuracy = losses.imitation_loss(
+            logits, window.actions, (ended == 0) & window.imitated
+        )
         acted = (window.actions < last)[:-1]
         targets = (
             jax.lax.stop_gradient(states[-predicted.shape[0] :])

@@ -27,12 +27,19 @@ class ReturnSettings:
     Attributes:
         target_return: Return of an episode to aim for while acting; `None` for a high return of the
             training data.
+        return_scale: Divisor of returns, besides that of the domain, because the network's input
+            saturates; `None` takes the largest return to go of the data, in absolute value.
     """
 
     target_return: float | None = 1.0
+    return_scale: float | None = 1.0
 
     def __post_init__(self) -> None:
         check_types(self)
+        if self.return_scale is not None and self.return_scale <= 0:
+            raise ValueError(
+                f"return_scale must be positive, got {self.return_scale}: it divides returns"
+            )
 
     @property
     def conditioned(self) -> bool:
@@ -50,6 +57,11 @@ def lacks_target(settings: Any) -> bool:
     return aims_for_return(settings) and settings.target_return is None
 
 
+def lacks_return_scale(settings: Any) -> bool:
+    """Returns whether a method with these settings takes its scale of returns from the data."""
+    return aims_for_return(settings) and settings.return_scale is None
+
+
 def sum_rewards(demonstrations: Sequence[Demonstration]) -> list[float]:
     """Returns the return of each demonstration."""
     return [float(np.sum(each.rewards, dtype=np.float64)) for each in demonstrations]
@@ -61,14 +73,14 @@ def choose_target(demonstrations: Sequence[Demonstration]) -> float:
     Args:
         demonstrations: training data, at least one.
     """
-    return float(np.quantile(sum_rewards(demonstrations), QUANTILE, method="higher"))
+    return float(np.quantile(sum_rewards(demonstrations), QUANTILE, method="lower"))
 
 
 def condition_on_target(setup: Setup) -> ComputeReturns:
     """Makes a function that computes the returns to go at the past states and the current one.
 
     While acting, the current return to go is the target return minus the return so far. The
-    function divides all returns by `Domain.scaling.returns`.
+    function divides all returns by `Domain.scaling.returns` and by `return_scale`.
     """
 
     def compute(context: Context, return_to_go: jax.Array | None = None) -> jax.Array:
@@ -79,7 +91,13 @@ def condition_on_target(setup: Setup) -> ComputeReturns:
                     "target_return",
                 )
             return_to_go = setup.settings.target_return - context.return_so_far
-        return compute_returns_to_go(context, return_to_go) / setup.domain.scaling.returns
+        if setup.settings.return_scale is None:
+            raise UserError(
+                "there is no scale of returns, and no demonstrations to take it from",
+                "return_scale",
+            )
+        scale = setup.domain.scaling.returns * setup.settings.return_scale
+        return compute_returns_to_go(context, return_to_go) / scale
 
     return compute
 

@@ -1,6 +1,5 @@
 """Level seeds: disjoint ranges for training, validation and test, in one place."""
 
-import itertools
 from collections.abc import Iterator
 
 from leapjax.checks import check_integer
@@ -33,11 +32,17 @@ def training_seeds(seed: int) -> Iterator[int]:
     """Returns the level seeds for the demonstrations of one training seed.
 
     Raises:
-        UserError: the training seed is out of range.
+        UserError: the training seed is out of range; or, after the last level seed, there are no
+            more.
     """
     seed = check_integer("a training seed", seed, 0, MAX_TRAINING_SEED - 1)
     start = TRAINING_START + seed * TRAINING_STRIDE
-    return itertools.islice(itertools.count(start), TRAINING_STRIDE)
+
+    def count_up() -> Iterator[int]:
+        yield from range(start, start + TRAINING_STRIDE)
+        raise UserError(f"training seed {seed} has no more level seeds than {TRAINING_STRIDE}")
+
+    return count_up()
 
 
 def check_disjoint(demonstrations: list[int], episodes: range) -> None:

@@ -16,8 +16,8 @@ _VALUES: dict[str, Any] = {"target_rate": 0.1, "reward_scale": None}  # the scal
 # Chosen where exact values are known (`tests/test_values.py`) and on experts' data. MOPO keeps its
 # own target rate: 0.1 did not bring its values closer.
 _SETTINGS: dict[str, dict[str, Any]] = {
-    "leap": {"target_return": None},  # from the data
-    "dt": {"target_return": None},
+    "leap": {"target_return": None, "return_scale": None},  # from the data
+    "dt": {"target_return": None, "return_scale": None},
     "bcq": _VALUES,
     "cql": {**_VALUES, "alpha": 1.0},  # less keeps too little to the actions of an expert
     "qr_dqn": _VALUES,

@@ -19,8 +19,9 @@ def hide_goal(key: jax.Array, window: Window, share: float) -> Window:
 
     def hide(observation: Observation) -> Observation:
         goal = jnp.asarray(observation.goal)
-        nowhere = jnp.broadcast_to(jnp.array(NO_GOAL, goal.dtype), goal.shape)
-        return observation._replace(goal=jnp.where(hidden, nowhere, goal))
+        nowhere = jnp.array(NO_GOAL, goal.dtype)
+        blank = (jnp.asarray(observation.grid) == 0).all(axis=(-3, -2, -1))  # before the start
+        return observation._replace(goal=jnp.where(hidden & ~blank[..., None], nowhere, goal))
 
     context = window.context
     changed = context._replace(observation=hide(context.observation), past=hide(context.past))
