@@ -174,6 +174,11 @@ def _read(
         if domain.demonstrations.source is not None:
             return domain.demonstrations.source.load(demonstrations, seed).demonstrations
         return storage.load(demonstrations, domain).demonstrations
+    if not isinstance(demonstrations, list | tuple):
+        raise UserError(
+            "demonstrations must be a list of Demonstration or the name of a data set, got "
+            f"{type(demonstrations).__name__}"
+        )
     return [
         storage.check_demonstration(check_kind(each, Demonstration), domain, f"demonstration {i}")
         for i, each in enumerate(demonstrations)

@@ -1,6 +1,5 @@
 """Trained planners on disk: `leapjax.load` reads them, and every run writes its own."""
 
-import contextlib
 import dataclasses
 import importlib
 import json
@@ -23,7 +22,7 @@ from leapjax.checks import check_at_least, check_seed, check_types
 from leapjax.domain import Domain, Statistics, apply_statistics, blank_context, find_signature
 from leapjax.domains import check_imported, find_domain
 from leapjax.environments import Adapter
-from leapjax.errors import UserError, first_line
+from leapjax.errors import UserError, did_you_mean, first_line
 from leapjax.extras import report_missing
 from leapjax.files import check_path, write_text
 from leapjax.methods import find_method
@@ -340,7 +339,8 @@ def find_published(name: str) -> Path:
     for known in (name, name.partition("-")[0]):
         if known in names:
             return PUBLISHED / known
-    raise UserError(f"no planner is published for {name!r}: only for {', '.join(names)}")
+    hint = did_you_mean(name, names)
+    raise UserError(f"no planner is published for {name!r}: only for {', '.join(names)}{hint}")
 
 
 def publish(folder: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
@@ -364,13 +364,15 @@ def find_folder(path: str | os.PathLike[str]) -> Path:
     """Finds the folder of a run or, if it does not exist, of a level's published planner.
 
     Raises:
-        UserError: the system cannot look up the path.
+        UserError: the system cannot look up the path; or there is neither.
     """
     folder = check_path(path)
-    if not folder.exists():
-        with contextlib.suppress(UserError):  # then it is no level of a published planner either
-            return find_published(str(path))
-    return folder
+    if folder.exists():
+        return folder
+    try:
+        return find_published(str(path))
+    except UserError as error:
+        raise UserError(f"there is no folder {folder}, and {error}") from None
 
 
 def ask_for_return(specification: Specification, target_return: float) -> Specification:

@@ -346,6 +346,10 @@ def evaluate(
             f"make_adapter is {_name_kind(make_adapter)}: expected a function that makes a new "
             "adapter for each episode"
         )
+    if not hasattr(plan, "plan_next"):
+        raise UserError(
+            f"plan is {_name_kind(plan)}: expected a compiled planner, such as planner.plan"
+        )
     level_seeds = check_seeds(seeds, "level seed")
     seed, context = check_seed(seed), check_integer("context", context)
     executed, max_steps = check_limits(executed, max_steps)

@@ -114,7 +114,7 @@ for path in ("GoToLocalS7N5", "no-such-run"):
     assert process.returncode == 0, process.stderr
     *_, needed, unknown = process.stdout.splitlines()
     assert 'is not installed: pip install ".[babyai]"' in needed
-    assert unknown.startswith("no-such-run is not a checkpoint")
+    assert unknown.startswith("there is no folder no-such-run, and no planner is published")
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,7 @@ def test_planner_of_an_unregistered_domain_cannot_be_saved(monkeypatch, tmp_path
     ("change", "options", "message"),
     [
         (lambda data: [], {}, "no demonstrations"),
+        (lambda data: None, {}, "must be a list of Demonstration .* got NoneType"),
         (lambda data: [data[0]._replace(actions=[99])], {}, "demonstration 0: actions run from 99"),
         (lambda data: [data[0]._replace(rewards=[1])], {}, "demonstration 0: rewards of shape"),
         (lambda data: [data[0]._replace(observations=3)], {}, "has no observation 'edges'"),

@@ -9,7 +9,7 @@ import pytest
 
 from leapjax import domains
 from leapjax.errors import UserError
-from leapjax.running import command_line, loggers, results
+from leapjax.running import command_line, loggers, metrics, results
 from leapjax.running import main as running
 from tests.frozen_lake import FROZEN_LAKE
 from tests.programs import LAKE, SMALL, only_long
@@ -87,6 +87,13 @@ def test_a_resumed_run_tells_loggers_where_it_resumes(tmp_path, wandb, monkeypat
     assert wandb.begun[0]["mode"] == "online" and wandb.begun[0]["resume"] == "allow"
     # Step 40 was logged before: TensorBoard drops values of earlier files from step 41 on.
     assert read(tmp_path / "tensorboard") == ([("training/loss", 60, 0.5)], [41])
+
+
+def test_a_resumed_run_drops_the_measurements_of_lost_steps(tmp_path):
+    curve = [{"step": step, "seconds": step / 10, "loss": 1.0} for step in (20.0, 40.0)]
+    metrics.write_metrics(tmp_path, curve)
+    assert metrics.resume_metrics(tmp_path, 30) == metrics.read_metrics(tmp_path) == curve[:1]
+    assert metrics.resume_metrics(tmp_path, 0) == metrics.read_metrics(tmp_path) == []
 
 
 def test_unknown_and_missing_loggers_raise_an_error(monkeypatch):

@@ -89,7 +89,7 @@ def test_a_published_planner_equals_its_run(published, tmp_path):
     with pytest.raises(UserError, match="another configuration"):
         leap.load("GoToLocalS7N5")
     shutil.rmtree(specification.parent.parent)
-    with pytest.raises(UserError, match="is not a checkpoint"):
+    with pytest.raises(UserError, match="there is no folder GoToLocalS7N5, and no planner is"):
         leap.load("GoToLocalS7N5")
 
 

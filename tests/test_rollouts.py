@@ -409,6 +409,11 @@ def test_invalid_environments_are_named_in_the_error(make, message):
         walk(make)
 
 
+def test_a_planner_without_a_compiled_plan_raises_an_error():
+    with pytest.raises(UserError, match="plan is object: expected a compiled planner, such as"):
+        leap.evaluate(Corridor, [1], object(), None, context=0)
+
+
 def test_numbers_and_flags_of_any_type_are_accepted():
     for cast in (np.float16, np.array, jnp.float32, np.uint8):
         found = walk(lambda cast=cast: Corridor(reward=cast(1), score=cast(1), truncated=cast(0)))

@@ -83,6 +83,8 @@ def make_level(name: str, level: str, settings: Any) -> Domain:
         UserError: the domain or level is unknown, the settings are of another domain, or the
             environment cannot be made.
     """
+    if not isinstance(level, str):
+        raise UserError(f"a level must be a name, got {level!r}")
     kind = find_domain(name)
     check_kind(settings, kind.settings)
     return kind.make(level, settings)._replace(made_from=(name, drop_files(settings)))

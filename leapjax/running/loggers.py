@@ -52,7 +52,7 @@ def log_nothing(step: int, values: Mapping[str, float]) -> None:
 def open_tensorboard(about: About) -> Logger:
     """Opens event files in the run's folder."""
     writer = _import_logger("tensorboard").SummaryWriter(
-        str(about.folder / "tensorboard"), purge_step=about.begin + 1 if about.begin else None
+        str(about.folder / "tensorboard"), purge_step=about.begin + 1
     )
 
     def log(step: int, values: Mapping[str, float]) -> None:

@@ -17,6 +17,23 @@ def write_metrics(folder: Path, metrics: Metrics) -> None:
     files.write_text(folder / "metrics.csv", "\n".join(lines) + "\n")
 
 
+def resume_metrics(folder: Path, step: int) -> Metrics:
+    """Drops what a training curve says of later steps, also in its file; returns the rest.
+
+    A run that was killed may have written its curve, but not the checkpoint of that step.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    before = read_metrics(folder)
+    metrics = [entry for entry in before if entry["step"] <= step]
+    if not metrics:
+        (folder / "metrics.csv").unlink(missing_ok=True)
+    elif len(metrics) < len(before):
+        write_metrics(folder, metrics)
+    return metrics
+
+
 def read_metrics(folder: Path) -> Metrics:
     """Reads the training curve so far.
 

@@ -42,7 +42,7 @@ class Experiment(NamedTuple):
         config: `Config`, or a subclass with the program's own names of options.
         paper: (level, method) -> the paper's success, in percent, or `None`. The field is `None` if
             the paper has no such experiment.
-        package: package of its module.
+        package: package of its module; "" for a file of your own.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Experiment(NamedTuple):
     @property
     def module(self) -> str:
         """The module of the program."""
-        return f"{self.package}.{self.name}"
+        return f"{self.package}.{self.name}".lstrip(".")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ from leapjax.data import windows
 from leapjax.domain import apply_statistics, measure_statistics
 from leapjax.pretrained import Pretrained
 from leapjax.running.data import check_data, judge_data
-from leapjax.running.metrics import Metrics, read_metrics, write_metrics
+from leapjax.running.metrics import resume_metrics, write_metrics
 from leapjax.running.programs import make_mesh
 from leapjax.running.progress import Meter
 from leapjax.running.run import Run
@@ -65,10 +65,9 @@ def train(run: Run, data: Sequence[Demonstration], watch: Watch | None = None) -
     restored = saved.restore(state, skipped=lambda line: print(line, file=sys.stderr))
     # Only now: a run that does not fit the checkpoints in the folder must not change it.
     processes.run_on_first(lambda: pretrained.save_specification(folder, run.specification))
-    metrics: Metrics = []
+    state = state if restored is None else restored
+    metrics = processes.run_on_first(lambda: resume_metrics(folder, int(state.step)))
     if restored is not None:
-        state = restored
-        metrics = [m for m in read_metrics(folder) if m["step"] <= int(state.step)]
         console.print(f"continuing at step {int(state.step)} of {total}")
     if not total and restored is None:
         saved.save(state)  # the method does not learn: its first state is its last

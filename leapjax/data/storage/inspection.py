@@ -19,6 +19,7 @@ from leapjax.errors import UserError
 from leapjax.types import PyTree
 
 LARGEST_SPACE = 10_000_000  # elements
+LARGEST_CHUNK = 2**24  # bytes; h5py chooses chunks of at most a sixteenth of this
 DEEPEST = 16  # levels of nested groups
 SLAB = 2**28  # bytes to read at once while sizes are unknown
 
@@ -137,6 +138,10 @@ def _outline_file(file: h5py.File, file_size: int) -> dict[str, Any]:
             # gzip compresses at most 1032 bytes to 1.
             if array.nbytes > 1032 * item.id.get_storage_size() + 1024:
                 raise ValueError(f"{name} claims {array.nbytes} bytes, which are not there")
+            # HDF5 unpacks whole chunks, which may be larger than their array.
+            chunk = math.prod(item.chunks or ()) * array.itemsize
+            if chunk > max(array.nbytes, LARGEST_CHUNK):
+                raise ValueError(f"{name} is stored in pieces of {chunk} bytes")
             if array.dtype.hasobject:
                 _check_varying(item, name, file_size)
     return outline
