@@ -171,8 +171,8 @@ class Energy(NamedTuple):
         total: (params, memory, actions `[T]`) -> `[]`, the energy of a complete plan.
         num_actions: A, the end action included.
         accepts_mask: whether actions may be MASK; if not, planning starts from uniform actions.
-        left_to_right: whether actions may be MASK from the queried position on, as if actions were
-            chosen from left to right; `accepts_mask` implies it.
+        left_to_right: whether actions may be MASK from the queried position on, if not elsewhere:
+            the energy reads earlier actions only.
         violation: (params, memory, actions `[T]`) -> `[]`, 0 where every constraint holds, else
             positive; +inf for a plan that is forbidden. For a plan that holds MASK: positive only
             if every way to complete it breaks a constraint.

@@ -57,17 +57,15 @@ def check(config: AnyConfig) -> None:
     )
     # `module:id` is an environment that a module registers; data sets name only the id.
     if recorded is not None and recorded != config.level.rpartition(":")[2]:
-        other = (
-            ""
-            if config.domain == "gymnasium"
-            else (
+        remedy = f"use {config.flag('level')} {recorded}"
+        if config.domain != "gymnasium":
+            remedy += (
                 f"; if {config.domain} has no such level: the program gymnasium, with --dataset "
                 f"{config.demonstrations}"
             )
-        )
         raise UserError(
             f"{config.flag('demonstrations')} {config.demonstrations} is of {recorded}, not of "
-            f"{config.level}: use {config.flag('level')} {recorded}{other}"
+            f"{config.level}: {remedy}"
         )
     domain = make_domain(config)
     if domain.held_out is not None:
