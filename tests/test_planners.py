@@ -665,10 +665,10 @@ LEFT_TO_RIGHT = autoregressive(ENUMERABLE.encode, _read_left, ACTIONS)
     "config",
     [
         BeamConfig(HORIZON, len(PLANS)),
-        BeamConfig(HORIZON, 2, temperature=1.0, score=True),
         GibbsConfig(HORIZON, 5, restarts=2),
         ShootingConfig(HORIZON),
-        CrossEntropyConfig(HORIZON),
+        pytest.param(BeamConfig(HORIZON, 2, temperature=1.0, score=True), marks=only_long),
+        pytest.param(CrossEntropyConfig(HORIZON), marks=only_long),
     ],
 )
 def test_planners_mask_only_later_actions_of_a_left_to_right_energy(config):
@@ -676,9 +676,9 @@ def test_planners_mask_only_later_actions_of_a_left_to_right_energy(config):
     assert plans.valid.all() and (plans.actions < ACTIONS).all()
     if config == BeamConfig(HORIZON, len(PLANS)):
         assert_equal(plans.actions[0], PLANS[joint_energies(PLANS).argmin()])
-    both = compose([LEFT_TO_RIGHT, ENUMERABLE])
-    assert plan_all(both, config, (TABLE, TABLE), chains=20).valid.all()
-    assert not compose([both, FROM_TOTAL]).left_to_right
+        both = compose([LEFT_TO_RIGHT, ENUMERABLE])
+        assert plan_all(both, config, (TABLE, TABLE), chains=20).valid.all()
+        assert not compose([both, FROM_TOTAL]).left_to_right
 
 
 # Energies that are NaN or -inf. Parameters: a table, and the value of undefined energies.

@@ -19,7 +19,7 @@ from leapjax.presets import find_preset
 from leapjax.pretrained import make_agent
 from leapjax.types import pad_token
 from tests.parameters import random_parameters
-from tests.programs import only_long
+from tests.programs import LONG
 
 LEVELS = pytest.mark.parametrize(
     ("name", "level"),
@@ -62,17 +62,11 @@ def test_augmented_windows_follow_the_rules_of_the_puzzle(name, level, cut):
             jax.tree.map(np.testing.assert_array_equal, after, states[place + 1])
 
 
+@LEVELS
 @pytest.mark.parametrize("method", ["leap", "classifier", "plate", "bc"])
-@pytest.mark.parametrize(
-    ("name", "level"),
-    [
-        ("sudoku", "Sudoku4x6"),
-        pytest.param("stars", "Star2x3", marks=only_long),
-        pytest.param("countdown", "Countdown3", marks=only_long),
-        pytest.param("satisfiability", "Nae4x6", marks=only_long),
-    ],
-)
 def test_every_method_sees_the_puzzle(name, level, method):
+    if not LONG and (name, method) not in (("sudoku", "classifier"), ("sudoku", "plate")):
+        pytest.skip("long")
     config = find_preset(name, level, method, "leapjax")
     small = dataclasses.replace(config.model, width=16)
     config = dataclasses.replace(config, model=small, context=0)

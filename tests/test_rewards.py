@@ -197,7 +197,10 @@ def test_reward_scale_divides_rewards(module):
     np.testing.assert_allclose(*found, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("module", "horizon"), [(bc, 1), (dt, 1), (plate, 3)])
+@pytest.mark.parametrize(
+    ("module", "horizon"),
+    [(bc, 1), *(pytest.param(*case, marks=only_long) for case in ((dt, 1), (plate, 3)))],
+)
 def test_actions_that_are_not_imitated_are_not_learned(module, horizon):
     settings, training = module.Settings(), TrainingConfig(batch=4)
     model = ModelConfig(layers=1, heads=1, width=8)
