@@ -220,7 +220,8 @@ def test_memory_marks_deeds_sides_of_the_first_pose_and_the_carried_object():
         Observation(None, np.int32([[0, 0, 0], [2, 3, 1], [2, 3, 1]]), None, None, None),
         np.int32([pad_token(7), 3, 2]), np.zeros(3), np.int32(2), np.float32(0),
     )  # fmt: skip
-    features = np.asarray(memory.recall(context, symmetries.rotate(observation, 3)))
+    recall = quick_jit(lambda context, seen: memory.recall(context, symmetries.rotate(seen, 3)))
+    features = np.asarray(recall(context, observation))
     # Three quarter turns move (x, y) to (5 - y, x).
     deeds = np.zeros((6, 6, 3))
     deeds[1, 2, 0] = 2 / 4
@@ -253,7 +254,7 @@ def test_things_are_doors_keys_balls_boxes_and_the_agent():
     for side, count in ((SIDE, SIDE**2), (12, cells.MOST_THINGS)):
         kinds = rng.choice([1, 1, 1, 2, 4, 5, 6, 7, 8, 9, 10], (side, side), p=[0.07] * 10 + [0.3])
         grid = np.stack([kinds] * 3, axis=-1)
-        found = cells.find_things(Observation(grid, None, None, None, None))
+        found = quick_jit(cells.find_things)(Observation(grid, None, None, None, None))
         expected = np.flatnonzero(np.isin(kinds, [4, 5, 6, 7, 10]))[:count]
         assert found.shape == (count,)
         np.testing.assert_array_equal(found[: len(expected)], expected)

@@ -49,7 +49,10 @@ class Untrained:
         first = jax.tree.map(lambda x: x[0], self.contexts)
         self.context = windows.context_at(first, 0, past)
         module = plate.AlternatingModel(setup.model, setup.sizes, setup.make_encoder())
-        self.apply = functools.partial(module.apply, self.params)
+        self.call = quick_jit(
+            lambda method, *inputs: module.apply(self.params, *inputs, method=method),
+            static_argnums=0,
+        )
         self.memory = quick_jit(self.agent.energy.encode)(self.params, self.context)
         conditional = functools.partial(quick_jit(self.agent.energy.conditional), self.params)
         self.energies = functools.partial(conditional, self.memory)
@@ -64,13 +67,13 @@ def test_later_states_of_a_window_are_encoded_like_current_states(architecture, 
     network = untrained(architecture, past)
     unrolled = jax.tree.map(lambda x: x[1], network.contexts)
     second = jax.tree.map(lambda x: x[1:2], network.contexts)
-    (tokens,) = network.apply(second, method="encode_batch")
-    states, actions = network.apply(unrolled, tokens, method="encode_unrolled")
+    (tokens,) = network.call("encode_batch", second)
+    states, actions = network.call("encode_unrolled", unrolled, tokens)
     shown = past if architecture == "paper" else 0
     assert states.shape[0] == shown + HORIZON and actions.shape == (shown + HORIZON - 1,)
     for place in range(HORIZON):
         context = windows.context_at(unrolled, place, past)
-        seen, before = network.apply(context, method="encode")
+        seen, before = network.call("encode", context)
         np.testing.assert_allclose(seen[-1], states[shown + place], rtol=1e-5, atol=1e-5)
         np.testing.assert_array_equal(before, actions[place : place + shown])
 
@@ -79,9 +82,8 @@ def test_later_states_of_a_window_are_encoded_like_current_states(architecture, 
 def test_incremental_decoding_equals_passes_over_all_tokens(architecture, past):
     """Compares cached energies with passes over all tokens, predicted states included."""
     network, plan = untrained(architecture, past), jnp.array([0, 1, 2, 0])
-    states, before = network.apply(network.context, method="encode")
-    between = jnp.concatenate([before, plan[:-1]])
-    read = quick_jit(functools.partial(network.apply, method="read"))
+    states, before = network.call("encode", network.context)
+    between, read = jnp.concatenate([before, plan[:-1]]), functools.partial(network.call, "read")
     states = jnp.concatenate([states, jnp.zeros((HORIZON - 1, states.shape[1]))])
     for place in range(HORIZON - 1):
         _, predicted = read(states, between)
@@ -104,7 +106,7 @@ def test_only_the_end_follows_an_end():
     expected = np.where(np.arange(toy.END + 1) == toy.END, 0.0, np.inf)
     np.testing.assert_array_equal(found[2:], np.stack([expected, expected]))
     ended = jnp.array([0, toy.END, toy.END, toy.END])
-    total = network.agent.energy.total(network.params, network.memory, ended)
+    total = quick_jit(network.agent.energy.total)(network.params, network.memory, ended)
     assert total == pytest.approx(found[0, 0] + found[1, toy.END], rel=1e-5)
 
 

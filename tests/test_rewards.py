@@ -191,7 +191,8 @@ def test_reward_scale_divides_rewards(module):
         agent = module.make_agent(
             Setup(mixed.DOMAIN, 1, 1, model, TrainingConfig(batch=8), settings)
         )
-        batch = agent.batch(jax.random.key(0), steps._replace(rewards=steps.rewards * times))
+        scaled = steps._replace(rewards=steps.rewards * times)
+        batch = quick_jit(agent.batch)(jax.random.key(0), scaled)
         found.append(np.asarray(batch.context.rewards))
     assert found[0].any()
     np.testing.assert_allclose(*found, rtol=1e-6)
@@ -205,7 +206,7 @@ def test_actions_that_are_not_imitated_are_not_learned(module, horizon):
     settings, training = module.Settings(), TrainingConfig(batch=4)
     model = ModelConfig(layers=1, heads=1, width=8)
     agent = module.make_agent(Setup(mixed.DOMAIN, 0, horizon, model, training, settings))
-    batch = agent.batch(jax.random.key(0), mixed.steps())
+    batch = quick_jit(agent.batch)(jax.random.key(0), mixed.steps())
     batch = batch._replace(imitated=jnp.zeros_like(batch.imitated))
     _, metrics = quick_jit(agent.update)(random_state(agent), batch, jax.random.key(1))
     assert metrics["accuracy"] == 0

@@ -198,9 +198,9 @@ def test_judge_halves_sums_conditionals_given_the_other_half():
         tokens = np.where(np.isin(np.arange(horizon), [*hidden]), actions, plan)
         return -sum(np.log(conditional_by_counting(joint, tokens, t)[plan[t]]) for t in hidden)
 
-    found = set()
+    score_plan, found = quick_jit(functools.partial(sum_halves, energy, table, memory)), set()
     for seed, plan in itertools.product(range(4), all_plans(horizon, actions)[[0, 5, 14]]):
-        score = float(sum_halves(energy, table, memory, jax.random.key(seed), jnp.asarray(plan)))
+        score = float(score_plan(jax.random.key(seed), plan))
         splits = [cost(plan, half) + cost(plan, {*range(horizon)} - half) for half in halves]
         sums = [sum(each) for each in itertools.product(splits, repeat=SPLITS)]
         assert np.isclose(sums, score, rtol=1e-4).any()
@@ -368,7 +368,8 @@ def test_judge_halves_chooses_among_beams_of_all_plans():
     table, key = random_table(4, HORIZON, ACTIONS), jax.random.key(0)
     memory = ENUMERABLE.encode(table, NO_TILT)
     judge_key = jax.random.fold_in(key, 2)
-    scores = jax.vmap(lambda plan: sum_halves(ENUMERABLE, table, memory, judge_key, plan))(PLANS)
+    score = functools.partial(sum_halves, ENUMERABLE, table, memory, judge_key)
+    scores = quick_jit(jax.vmap(score))(PLANS)
     plan = plan_for(BeamConfig(HORIZON, len(PLANS), judge="halves"), params=table)
     assert_equal(plan.actions, PLANS[np.argmin(scores)])
 

@@ -242,7 +242,9 @@ def test_energy_of_the_rules_counts_conflicts(cell, horizon):
     energy, rng = rules(4, weight=3.0), np.random.default_rng(0)
     clues, solution = boards.draw(SMALL, 0)
     written = np.where(np.arange(16) < cell, solution, clues)
-    memory, end = energy.encode((), context_at(cell, written)), min(16, cell + horizon)
+    memory = quick_jit(energy.encode)((), context_at(cell, written))
+    sum_energy, conditional = quick_jit(energy.total), quick_jit(energy.conditional)
+    end = min(16, cell + horizon)
     clue, empty = (
         cell + np.flatnonzero(found) for found in (written[cell:end], written[cell:end] == 0)
     )
@@ -251,24 +253,24 @@ def test_energy_of_the_rules_counts_conflicts(cell, horizon):
         """Returns the plan that writes a board; it continues with 1 after the board's end."""
         return jnp.asarray(np.append(digits, np.ones(16))[cell : cell + horizon] - 1, int)
 
-    assert float(energy.total((), memory, make_plan(solution))) == 0
+    assert float(sum_energy((), memory, make_plan(solution))) == 0
     for _ in range(10):
         board = np.where(written > 0, written, rng.integers(1, 5, 16))
         board[end:] = written[end:]
-        total = float(energy.total((), memory, make_plan(board)))
+        total = float(sum_energy((), memory, make_plan(board)))
         assert total == pytest.approx(3.0 * count_conflicts(board, 4))
         # A conditional is the total with each digit in turn, up to a constant.
         where = int(rng.choice(empty))
         for others, plan in ((board, make_plan(board)), (written, jnp.full(horizon, 5))):  # MASK
             tried = [np.where(np.arange(16) == where, digit, others) for digit in range(1, 5)]
             totals = np.array([3.0 * count_conflicts(each, 4) for each in tried])
-            found = energy.conditional((), memory, plan, jnp.array([where - cell]))[0]
+            found = np.asarray(conditional((), memory, plan, np.array([where - cell]))[0])
             np.testing.assert_allclose(found[:4] - found[0], totals - totals[0], rtol=1e-5)
             assert np.isinf(found[4])  # the end action
     changed = np.where(np.arange(16) == clue[0], solution % 4 + 1, solution)
-    assert np.isinf(energy.total((), memory, make_plan(changed)))
+    assert np.isinf(sum_energy((), memory, make_plan(changed)))
     after = jnp.arange(end - cell, horizon)  # positions beyond the board
-    for row in np.asarray(energy.conditional((), memory, make_plan(solution), after)):
+    for row in np.asarray(conditional((), memory, make_plan(solution), after)):
         np.testing.assert_array_equal(row, [0.0] * 4 + [np.inf])
 
 
@@ -295,8 +297,9 @@ def test_rules_alone_solve_boards_by_confident_filling_or_by_sampling():
 
 
 def test_turned_board_has_the_renamed_solution_and_the_same_energies():
-    turn = functools.partial(boards.turn, side=4)
-    energy = symmetric(rules(4), functools.partial(turn, horizon=18))  # two actions after the end
+    turn = functools.partial(boards.turn, side=4, horizon=18)  # two actions after the end
+    energy, turn_context = symmetric(rules(4), turn), quick_jit(turn)
+    conditional, turn_memory = quick_jit(energy.conditional), quick_jit(energy.turn)
     clues, solution = boards.draw(SMALL, 1)
     context, seen, rng = context_at(0, clues), set(), np.random.default_rng(0)
     plan = np.append(solution - 1, [4, 4])
@@ -304,7 +307,7 @@ def test_turned_board_has_the_renamed_solution_and_the_same_energies():
     where, empty = jnp.arange(16), np.flatnonzero(clues == 0)
     for seed in range(8):
         key = jax.random.key(seed)
-        turned = jax.tree.map(np.asarray, turn(key, context, horizon=18))
+        turned = jax.tree.map(np.asarray, turn_context(key, context))
         (found,) = boards.find_solutions(turned.context.observation.digits)
         np.testing.assert_array_equal(
             found - 1, turned.names[turned.places, plan[turned.places]][:16]
@@ -314,8 +317,8 @@ def test_turned_board_has_the_renamed_solution_and_the_same_energies():
         tried = np.where(rng.random(18) < 0.4, 5, np.append(rng.integers(0, 4, 16), [0, 0]))  # MASK
         for tokens in (plan, tried):
             before, after = (
-                energy.conditional((), view, jnp.asarray(tokens), where)
-                for view in (memory, energy.turn((), key, memory))
+                conditional((), view, jnp.asarray(tokens), where)
+                for view in (memory, turn_memory((), key, memory))
             )
             np.testing.assert_allclose(before[empty], after[empty], rtol=1e-6)
     assert len(seen) == 8

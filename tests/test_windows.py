@@ -143,14 +143,16 @@ def test_states_keep_their_dtypes():
     states = {name: np.ones((4, 2), kind) for name, kind in kinds.items()}
     episode = Demonstration(states, np.zeros(3, np.int32), np.zeros(3, np.float32), True, False, 0)
     steps = on_device(windows.concatenate([episode]))
-    whole = windows.window(steps, jnp.int32(1), 2, 3, END)
-    assert whole.extras == ()  # extras exist only on request
-    start = whole.context
-    taken = windows.transition_window(steps, jnp.int32(1), 2, END).context
-    unrolled = windows.unrolled_window(steps, jnp.int32(1), 2, 3, END).context
-    for context in (
-        start, windows.before(taken), windows.after(taken), windows.context_at(unrolled, 1, 2)
-    ):  # fmt: skip
+
+    def find_contexts(steps):
+        whole = windows.window(steps, jnp.int32(1), 2, 3, END)
+        assert whole.extras == ()  # extras exist only on request
+        taken = windows.transition_window(steps, jnp.int32(1), 2, END).context
+        unrolled = windows.unrolled_window(steps, jnp.int32(1), 2, 3, END).context
+        later = windows.context_at(unrolled, 1, 2)
+        return whole.context, windows.before(taken), windows.after(taken), later
+
+    for context in jax.eval_shape(find_contexts, steps):
         for name, kind in kinds.items():
             assert context.past[name].dtype == context.observation[name].dtype == kind
 
