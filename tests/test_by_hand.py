@@ -150,9 +150,8 @@ def test_classifier_loss_matches_its_formula():
     case = make_case(classifier, classifier.Settings(), mixed.DOMAIN, horizon=4)
     setup, batch = case.setup, case.batch
     call = make_call(classifier.SequenceClassifier(setup.model, setup.sizes, setup.make_encoder()))
-    corrupted, degrees = jax.vmap(classifier.corrupt, (0, 0, 0, None))(
-        KEYS, batch.actions, batch.imitated, toy.DOMAIN.num_actions
-    )
+    corrupt = functools.partial(classifier.corrupt, num_actions=toy.DOMAIN.num_actions)
+    corrupted, degrees = quick_jit(jax.vmap(corrupt))(KEYS, batch.actions, batch.imitated)
 
     def loss(params):
         found = call(params, "degree", call(params, "encode", batch.context), corrupted)
@@ -166,7 +165,8 @@ def test_bcq_loss_matches_its_formula():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = make_steps(case.batch)
     evaluate = batched(case.setup.make_policy(("q", CHOICES), ("behaviour", CHOICES)))
-    later, frozen = (evaluate(x, steps.after) for x in (case.state.params, case.state.extra))
+    now = quick_jit(evaluate)
+    later, frozen = (now(x, steps.after) for x in (case.state.params, case.state.extra))
     likely = jax.nn.softmax(later["behaviour"])
     likely = likely / likely.max(axis=-1, keepdims=True) >= 0.9
     best = jnp.where(likely, later["q"], -jnp.inf).argmax(axis=-1)
@@ -199,9 +199,10 @@ def test_iql_loss_matches_its_formula():
     steps, params = make_steps(case.batch), case.state.params["params"]
     critic = batched(case.setup.make_policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)))
     policy = batched(case.setup.make_policy(("logits", CHOICES)))
-    later = critic({"params": params["critic"]}, steps.after)["value"][..., 0]
+    now = quick_jit(critic)
+    later = now({"params": params["critic"]}, steps.after)["value"][..., 0]
     returns = steps.bootstrap(later)
-    frozen = critic(case.state.extra, steps.earlier)
+    frozen = now(case.state.extra, steps.earlier)
     min_q = jnp.minimum(at(frozen["q1"], steps.taken), at(frozen["q2"], steps.taken))
 
     def loss(params):
@@ -278,7 +279,8 @@ def test_mopo_loss_matches_its_formula():
 def test_cql_loss_matches_its_formula():
     case = make_case(cql, cql.Settings(discount=DISCOUNT, alpha=0.7))
     steps, evaluate = make_steps(case.batch), batched(case.setup.make_policy(("q", CHOICES)))
-    later, frozen = (evaluate(x, steps.after)["q"] for x in (case.state.params, case.state.extra))
+    now = quick_jit(evaluate)
+    later, frozen = (now(x, steps.after)["q"] for x in (case.state.params, case.state.extra))
     target = steps.bootstrap(at(frozen, later.argmax(axis=-1)))
 
     def loss(params):
@@ -300,7 +302,7 @@ def test_qr_dqn_loss_matches_its_formula():
         outputs = apply(params, contexts)["q"]
         return outputs.reshape(*outputs.shape[:2], CHOICES, count).swapaxes(2, 3)
 
-    frozen = evaluate(case.state.extra, steps.after)
+    frozen = quick_jit(evaluate)(case.state.extra, steps.after)
     best = jnp.broadcast_to(frozen.mean(axis=2).argmax(axis=-1)[..., None], frozen.shape[:3])
     values = at(frozen, best)  # [B, P, N]
     targets = [steps.bootstrap(values[..., i]) for i in range(count)]
@@ -330,7 +332,7 @@ def test_rem_loss_matches_its_formula():
         outputs = apply(params, contexts)["q"].reshape(BATCH, PAST + 1, CHOICES, count)
         return (outputs * mixtures[:, None, None]).sum(axis=-1)
 
-    highest = evaluate(case.state.extra, steps.after).max(axis=-1)
+    highest = quick_jit(evaluate)(case.state.extra, steps.after).max(axis=-1)
     target = steps.bootstrap(highest)
 
     def loss(params):
@@ -352,7 +354,7 @@ def test_plate_loss_matches_its_formula():
         tokens = module.apply(params, case.batch.context, method="encode_batch")
         return call(params, "encode_unrolled", case.batch.context, tokens)
 
-    next_states = unrolled(case.state.params)[0][:, 1 - horizon :]
+    next_states = quick_jit(unrolled)(case.state.params)[0][:, 1 - horizon :]
     ends = [[int(action) == toy.END for action in plan] for plan in actions]
     chosen = jnp.array([[not any(plan[:i]) for i in range(horizon)] for plan in ends])
     acted = jnp.array([[not any(plan[: i + 1]) for i in range(horizon)] for plan in ends])

@@ -20,6 +20,7 @@ from leapjax.running import results
 from leapjax.types import pad_token
 from tests.parameters import make_leap_agent, random_parameters
 from tests.programs import only_long
+from tests.quick import quick_jit
 from tests.toy import compile_augmentation
 
 SAT, NAE = Size(6, 20, differ=False), Size(6, 10, differ=True)
@@ -289,8 +290,8 @@ def test_plans_later_in_an_episode_assign_the_remaining_variables():
 def test_causal_attention_hides_later_actions():
     agent = make_agent(attention="causal")
     params, (formula, _) = random_parameters(agent, 0.3), start(SAT, 0)
-    memory = agent.energy.encode(params, observe(SAT, formula))
-    conditional = jax.jit(agent.energy.conditional)
+    memory = quick_jit(agent.energy.encode)(params, observe(SAT, formula))
+    conditional = quick_jit(agent.energy.conditional)
     plans = [np.array([0, MASK, 1, value, 1, 0]) for value in (0, 1)]
     found = [conditional(params, memory, plan, np.array([1])) for plan in plans]
     np.testing.assert_array_equal(*found)

@@ -22,6 +22,7 @@ from leapjax.models.config import ModelConfig
 from leapjax.training import NonFiniteLoss
 from leapjax.types import Agent, TrainState
 from tests import toy
+from tests.parameters import random_parameters
 from tests.programs import only_long
 from tests.quick import quick_jit
 
@@ -170,9 +171,11 @@ def test_the_loss_is_the_mean_cross_entropy_of_masked_actions(masking, end, data
 
 def test_without_an_end_action_no_plan_ends():
     setup = make_setup()._replace(settings=leap.Settings(masking="each", end=False))
-    energy, params = leap.make_agent(setup).energy, make_tiny()[0].init(jax.random.key(0)).params
-    memory = energy.encode(params, blank_context(toy.DOMAIN, 0))
-    energies = energy.conditional(params, memory, np.full(4, toy.END + 1), np.arange(4))
+    agent = leap.make_agent(setup)
+    energy, params = agent.energy, random_parameters(agent)
+    memory = quick_jit(energy.encode)(params, blank_context(toy.DOMAIN, 0))
+    conditional = quick_jit(energy.conditional)
+    energies = conditional(params, memory, np.full(4, toy.END + 1), np.arange(4))
     assert np.isinf(energies).tolist() == [[False, False, False, True]] * 4
 
 
