@@ -128,7 +128,7 @@ def make_call(module):
 def batched(module):
     """Returns (parameters, contexts) -> the outputs of `__call__` for a batch."""
     call = make_call(module)
-    return lambda params, contexts: call(params, "__call__", contexts)
+    return jax.jit(lambda params, contexts: call(params, "__call__", contexts))
 
 
 def test_bc_loss_matches_its_formula():
@@ -165,8 +165,7 @@ def test_bcq_loss_matches_its_formula():
     case = make_case(bcq, bcq.Settings(discount=DISCOUNT, threshold=0.9))
     steps = make_steps(case.batch)
     evaluate = batched(case.setup.make_policy(("q", CHOICES), ("behaviour", CHOICES)))
-    now = quick_jit(evaluate)
-    later, frozen = (now(x, steps.after) for x in (case.state.params, case.state.extra))
+    later, frozen = (evaluate(x, steps.after) for x in (case.state.params, case.state.extra))
     likely = jax.nn.softmax(later["behaviour"])
     likely = likely / likely.max(axis=-1, keepdims=True) >= 0.9
     best = jnp.where(likely, later["q"], -jnp.inf).argmax(axis=-1)
@@ -199,10 +198,9 @@ def test_iql_loss_matches_its_formula():
     steps, params = make_steps(case.batch), case.state.params["params"]
     critic = batched(case.setup.make_policy(("value", 1), ("q1", CHOICES), ("q2", CHOICES)))
     policy = batched(case.setup.make_policy(("logits", CHOICES)))
-    now = quick_jit(critic)
-    later = now({"params": params["critic"]}, steps.after)["value"][..., 0]
+    later = critic({"params": params["critic"]}, steps.after)["value"][..., 0]
     returns = steps.bootstrap(later)
-    frozen = now(case.state.extra, steps.earlier)
+    frozen = critic(case.state.extra, steps.earlier)
     min_q = jnp.minimum(at(frozen["q1"], steps.taken), at(frozen["q2"], steps.taken))
 
     def loss(params):
@@ -279,8 +277,7 @@ def test_mopo_loss_matches_its_formula():
 def test_cql_loss_matches_its_formula():
     case = make_case(cql, cql.Settings(discount=DISCOUNT, alpha=0.7))
     steps, evaluate = make_steps(case.batch), batched(case.setup.make_policy(("q", CHOICES)))
-    now = quick_jit(evaluate)
-    later, frozen = (now(x, steps.after)["q"] for x in (case.state.params, case.state.extra))
+    later, frozen = (evaluate(x, steps.after)["q"] for x in (case.state.params, case.state.extra))
     target = steps.bootstrap(at(frozen, later.argmax(axis=-1)))
 
     def loss(params):
@@ -302,7 +299,7 @@ def test_qr_dqn_loss_matches_its_formula():
         outputs = apply(params, contexts)["q"]
         return outputs.reshape(*outputs.shape[:2], CHOICES, count).swapaxes(2, 3)
 
-    frozen = quick_jit(evaluate)(case.state.extra, steps.after)
+    frozen = evaluate(case.state.extra, steps.after)
     best = jnp.broadcast_to(frozen.mean(axis=2).argmax(axis=-1)[..., None], frozen.shape[:3])
     values = at(frozen, best)  # [B, P, N]
     targets = [steps.bootstrap(values[..., i]) for i in range(count)]
@@ -332,7 +329,7 @@ def test_rem_loss_matches_its_formula():
         outputs = apply(params, contexts)["q"].reshape(BATCH, PAST + 1, CHOICES, count)
         return (outputs * mixtures[:, None, None]).sum(axis=-1)
 
-    highest = quick_jit(evaluate)(case.state.extra, steps.after).max(axis=-1)
+    highest = evaluate(case.state.extra, steps.after).max(axis=-1)
     target = steps.bootstrap(highest)
 
     def loss(params):

@@ -263,10 +263,9 @@ def test_ways_hide_open_doors_and_penalise_revisits_as_named():
         energy = way.minimise([counts])
         visible = 0 if way.name.endswith("open doors seen as empty") else doors
         back = AGAIN if "exploring" in way.name else 0
-        find_total = quick_jit(
-            lambda seen, e=energy: e.total((), e.encode((), seen), jnp.array(TURNS))
-        )
-        assert find_total(context) == visible + back
+        memory = quick_jit(energy.encode)((), context)
+        found = quick_jit(energy.total)((), memory, np.array(TURNS))
+        assert found == visible + back
 
 
 def test_obstacles_lie_between_agent_and_key_and_split_into_halves():
