@@ -1,4 +1,4 @@
-"""Atari (paper, table 2): `python -m experiments.atari --game Breakout --help`.
+"""Atari (paper, table 3): `python -m experiments.atari --game Breakout --help`.
 
 Trains a method on played games, and reports its score beside the paper's. Built-in demonstrators
 play the games if there are no data yet. `python -m experiments.atari collect --help` tells how to

@@ -1,6 +1,6 @@
 """Energies of good and bad plans over training: `python -m experiments.landscape --help`.
 
-The paper's 'Energy Landscape Verification' (section 4, figure 6, right). Measures the energy of
+The paper's 'Energy Landscape Verification' (section 5, figure 6, right). Measures the energy of
 demonstrations that the model never learned from, over training: as they are, and with a share of
 their actions replaced at random. Also measures the energy of plans over the iterations that refine
 them.

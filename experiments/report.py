@@ -135,7 +135,7 @@ def list_sections(rows: Mapping[str, Any]) -> dict[str, tuple[Callable[[Any], st
         "parts": (speed.list_parts, "training"),
         "quality": (speed.compare_quality, "quality"),
         "landscape": (analyses.compare_energies, "landscape"),
-        "table-3": (
+        "properties": (
             functools.partial(
                 analyses.compare_ways,
                 properties,

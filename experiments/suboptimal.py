@@ -1,4 +1,4 @@
-"""Imperfect demonstrations (paper, appendix): `python -m experiments.suboptimal --help`.
+"""Imperfect demonstrations (paper, table 2): `python -m experiments.suboptimal --help`.
 
 A quarter of the demonstrator's actions are random. On levels `...Mistakes` it executes them, and
 goes on from there. On levels `...Mislabelled` only the recorded actions are wrong, as the file of

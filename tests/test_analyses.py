@@ -63,7 +63,7 @@ def test_violations_are_penalised_and_counted(cwd, capsys):
     (row,) = read_rows(cwd, "properties", "results")
     assert (row["case"], row["way"], row["method"]) == ("adaptation-medium", "whole plan", "leap")
     assert row["violations"] == 0  # the penalty keeps even an untrained model off lava
-    assert row["planner"]["fill"] == "sequential" and row["paper_success"] == 64.5
+    assert row["planner"]["fill"] == "sequential" and row["paper_success"] is None
     assert 0 <= row["first_pass_successes"] <= row["episodes"] == 2
     assert cases.main(analysis, [*SHORT, "--record"]) == 0
     assert "recorded already" in capsys.readouterr().out
@@ -187,8 +187,8 @@ def test_tables_show_current_rows_beside_the_papers_numbers():
     row = {
         "experiment": "ablation", "case": case.name, "way": way.name, "method": "leap",
         "preset": "leapjax", "seed": 0, "episodes": 200, "successes": 150,
-        "first_pass_successes": 100, "violations": None, "mean_length": 9.0, "plans": 10,
-        "plans_per_second": 500.0, "first_episode_seed": 10_000_000,
+        "first_pass_successes": 100, "violations": None, "mean_length": 9.0,
+        "first_episode_seed": 10_000_000,
         "train_seconds": 300.0, "compile_seconds": 20.0, "eval_seconds": 40.0,
         "versions": {"machine": "x86_64"},
         "hash": cases.hash_row(analysis, case, way, settings, 0, Options()),
@@ -196,7 +196,7 @@ def test_tables_show_current_rows_beside_the_papers_numbers():
     stale = {**row, "successes": 0, "hash": "of another"}
     table = analyses.compare_ways(analysis, [row, stale], ways=[way.name], cases=["masked"])
     (line,) = (line for line in table.splitlines() if "Gibbs" in line)
-    assert "| 62.5% | - | 75.0%" in line and "2.0 ms" in line
+    assert "| 62.5% | - | 75.0%" in line
     assert "Gibbs" not in analyses.compare_ways(analysis, [row], cases=["classifier"])
     assert report.is_used(row) and not report.is_used(stale)
 

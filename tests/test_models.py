@@ -353,7 +353,7 @@ def test_causal_attention_with_a_cached_context_equals_attention_over_all_tokens
 
 @pytest.mark.parametrize(("past", "repeat_state"), [(2, False), (0, True)])
 def test_repeat_state_shows_the_current_state_at_later_positions(past, repeat_state):
-    """Later positions show the current state (equation 4), or its part without the pose."""
+    """Later positions show the current state (equation 3), or its part without the pose."""
     encoder = StateTokens(SIDE, 16)
     sizes = Sizes(ACTIONS, past, HORIZON, MAX_STEPS)
     module = build_masked_model(

@@ -133,7 +133,9 @@ MOST_CERTAIN = {"certainty": 1.0, "restarts": 1, "judge": "energy", "enough": No
 
 
 def board_row(rate, passes=81, boards=None, **options):
-    """Makes the row of a planner that plays boards of a file."""
+    """Makes the row of a planner that plays drawn boards, or all boards of a file."""
+    if boards:
+        options = {"episodes": puzzles.MIXTURE_BOARDS, **options}
     config = with_options(find_preset("sudoku", puzzles.HARD, "leap", "leapjax"), options)
     settings = json.loads(json.dumps(list_settings(config, 0)))
     settings["domain_settings"]["boards"] = boards
@@ -142,17 +144,21 @@ def board_row(rate, passes=81, boards=None, **options):
 
 
 def test_searches_are_compared_on_training_and_hard_boards():
+    hard = puzzles.MIXTURE
     rows = [
-        board_row(0.9, **MOST_CERTAIN), board_row(0.6, boards="hard.txt 1234", **MOST_CERTAIN),
-        board_row(0.7, boards="hard.txt 1234", rules=1.0, **MOST_CERTAIN),
-        board_row(0.5, passes=29.6, boards="hard.txt 1234", **MOST_CERTAIN | {"certainty": 0.999}),
-        board_row(0.95, passes=38.2, boards="hard.txt 1234"),
-        board_row(0.8, boards="hard.txt 1234", layers=2),  # another network
+        board_row(0.9, **MOST_CERTAIN), board_row(0.6, boards=hard, **MOST_CERTAIN),
+        board_row(0.7, boards=hard, rules=1.0, **MOST_CERTAIN),
+        board_row(0.5, passes=29.6, boards=hard, **MOST_CERTAIN | {"certainty": 0.999}),
+        board_row(0.95, passes=38.2, boards=hard),
+        # These do not count: another network, other boards, boards seen while choosing settings.
+        board_row(0.8, boards=hard, layers=2), board_row(0, boards="other.txt 1234"),
+        board_row(0, boards=hard, episodes=10), board_row(0, validation=True),
     ]  # fmt: skip
     older = rows[1]["configuration"]["planner"]
     del older["judge"], older["enough"]  # older rows lack these settings
-    assert [report.is_used(row) for row in rows] == [True] * 5 + [False]
-    lines = read_table(puzzles.compare_boards(rows))
+    assert [report.is_used(row) for row in rows] == [True] * 5 + [False] * 4
+    lines = read_table(puzzles.compare_boards([*rows, rows[0]]))  # a seed counts once
+    assert lines[0][2].endswith("1 seed")
     assert [[cell.split(" ")[0] for cell in line] for line in lines] == [
         ["most", "81", "90.0%", "60.0%", "70.0%"],
         ["all", "30", "-", "50.0%", "-"],

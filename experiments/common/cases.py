@@ -132,14 +132,12 @@ class Analysis(NamedTuple):
         name: names its module, and its file of rows.
         cases: the cases.
         domain: domain of all levels.
-        timed: whether tables show the time of a plan, so that rows need an idle machine.
         change: changes the configuration of every model, for tests.
     """
 
     name: str
     cases: Sequence[Case]
     domain: str = "babyai"
-    timed: bool = False
     change: Change = keep_config
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from experiments import ablation, properties, stochastic, suboptimal
 from experiments.common.cases import Analysis, select_rows
-from experiments.tables.cells import compute_milliseconds, format_beside, make_table
+from experiments.tables.cells import format_beside, make_table
 from leapjax.running.results import Row
 
 ANALYSES = {
@@ -12,14 +12,14 @@ ANALYSES = {
     for program in (properties, stochastic, suboptimal, ablation)
 }
 PRESETS = ("paper", "leapjax")
-# LEAP executes whole plans, DT and IQL choose single actions; each at two temperatures where noise
-# matters. Below each sum stands one part of it.
+# Each method without a cost of revisits, at two temperatures where noise matters. Below each sum
+# stands one part of it.
 NOISY = (
     "leap, with noise", "sum, with more noise", "dt, with noise", "dt, with more noise",
     "iql, with noise", "iql, with more noise",
 )  # fmt: skip
 WITHOUT_REVISITS = (
-    *("whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql"),
+    *("next action", "whole plan", "leap", "sum", "one half alone", "pick-up alone", "dt", "iql"),
     *NOISY,
 )
 CONSTRAINED = (
@@ -29,7 +29,11 @@ CONSTRAINED = (
     "constraints-room",
     "constraints-maze",
 )
-EXPLORING = tuple(f"{way}, exploring" for way in ("whole plan", "leap", "sum", "dt", "iql"))
+EXPLORING = tuple(
+    f"{way}, exploring{rest}"
+    for way in ("whole plan", "leap", "sum", "dt", "iql")
+    for rest in ("", ", replanned after each action", ", beam search")
+)
 ERRANDS = ("constraints-errand", "constraints-detour")
 
 
@@ -66,7 +70,7 @@ def compare_ways(
                     planner = f"{way.method}: {way.name}"
                 paper = "-" if way.paper is None else f"{way.paper:.1f}%"
                 cells = [
-                    _format_cell(of, mine, way.paper if preset == "paper" else None)
+                    _format_cell(mine, way.paper if preset == "paper" else None)
                     for preset, mine in zip(PRESETS, found, strict=True)
                 ]
                 lines.append([case.name, planner, paper, *cells])
@@ -74,14 +78,12 @@ def compare_ways(
     return make_table(" | ".join(["case", "planner", "published", *presets]), lines)
 
 
-def _format_cell(of: Analysis, rows: Sequence[Row], published: float | None) -> str:
-    """Formats the success of rows, one for each seed, with time and violations if there are any.
+def _format_cell(rows: Sequence[Row], published: float | None) -> str:
+    """Formats the success of rows, one for each seed, with violations if there are any.
 
     Marks a success that differs from a published number, see `format_beside`.
     """
     cell = format_beside(rows, published)
-    if rows and of.timed:
-        cell += f", {compute_milliseconds(rows):.1f} ms"
     violations = sum(row["violations"] or 0 for row in rows)
     if violations:
         cell += f", {violations / sum(row['episodes'] for row in rows):.2g} violations an episode"

@@ -188,7 +188,7 @@ def compare_iterations(rows: Sequence[Row]) -> str:
 def group_by_iterations(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]]]:
     """Groups the rows of training seed 0 by level, title of the setting, and N.
 
-    Takes rows of a checkpoint played again where there are any: then all N have one network.
+    Prefers rows of a checkpoint played again, because these have one network.
     """
     first = [row for row in rows if row["seed"] == 0]
     trained = select(first, LEVELS, BY_ITERATIONS)

@@ -66,12 +66,6 @@ def compute_mean_rate(rows: Sequence[Row]) -> float:
     return 100 * sum(row["successes"] for row in rows) / sum(row["episodes"] for row in rows)
 
 
-def compute_milliseconds(rows: Sequence[Row]) -> float:
-    """Computes the milliseconds of a plan, when hundreds are made at once."""
-    plans = sum(row["plans"] for row in rows)
-    return 1e3 * sum(row["plans"] / row["plans_per_second"] for row in rows) / plans
-
-
 def list_rows(rows: Sequence[Row], columns: Columns) -> str:
     """Makes a Markdown table with a line for each row.
 

@@ -30,7 +30,8 @@ PAYING = (
     ("all that are certain", "≤ T"), ("restarts on turned puzzles", "≤ 16 (T + 6)"),
     ("most certain first, best of 16", "16 (T + 1)"),
 )  # fmt: skip
-HARD = "Sudoku9x31-42"  # level in training; its planners also play boards of a file
+HARD = "Sudoku9x31-42"  # level in training; its planners also play the boards of a file:
+MIXTURE, MIXTURE_BOARDS = "mixture.txt b48842797aed", 360  # name and hash of the file, its boards
 TRAINED = ("model", "training", "method_settings")  # settings of a planner
 ARMS_LEVEL, ARMS = "Star3x5", (2, 3, 5, 7, 9)  # level in training; arms of the levels played
 
@@ -125,26 +126,35 @@ def group_by_boards(rows: Sequence[Row]) -> list[tuple[str, list[list[Row]]]]:
         """Reads a part of a row's configuration; fields that older rows lack have their default."""
         return dataclasses.asdict(type(getattr(config, part))()) | row["configuration"][part]
 
+    def select_boards(planner: dict[str, Any], boards: str | None, rules: float) -> list[Row]:
+        """Returns the rows of a search on some boards, one for each seed."""
+        played = {
+            "demos": config.demos, "test_seed": config.test_seed, "validation": False,
+            "rules": rules, "episodes": MIXTURE_BOARDS if boards else config.episodes,
+        }  # fmt: skip
+        of = [
+            row for row in trained
+            if planner == read(row, "planner")
+            and row["configuration"]["domain_settings"].get("boards") == boards
+            and all(row["configuration"][name] == value for name, value in played.items())
+        ]  # fmt: skip
+        return list({row["seed"]: row for row in of}.values())
+
     trained = [
         row for row in rows
         if (row["level"], row["method"]) == (HARD, "leap")
-        and row["configuration"]["demos"] == config.demos
         and all(settings[part] == read(row, part) for part in TRAINED)
     ]  # fmt: skip
-    found = []
-    for search in SEARCHES:
-        planner = search.of(config.planner.horizon)
-        of = [row for row in trained if planner == read(row, "planner")]
-        boards = [
+    return [
+        (
+            search.name,
             [
-                row for row in of
-                if bool(row["configuration"]["domain_settings"].get("boards")) == from_file
-                and row["configuration"]["rules"] == rules
-            ]
-            for from_file, rules in ((False, 0.0), (True, 0.0), (True, 1.0))
-        ]  # fmt: skip
-        found.append((search.name, boards))
-    return found
+                select_boards(search.of(config.planner.horizon), *of)
+                for of in ((None, 0.0), (MIXTURE, 0.0), (MIXTURE, 1.0))
+            ],
+        )
+        for search in SEARCHES
+    ]
 
 
 def compare_arms(rows: Sequence[Row]) -> str:

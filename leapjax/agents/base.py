@@ -25,7 +25,7 @@ UNNAMED = ("microbatch",)
 
 @dataclasses.dataclass(frozen=True)
 class TrainingConfig:
-    """How a network is trained. The defaults are the paper's (appendix, table 5).
+    """How a network is trained. The defaults are the paper's (appendix, table 6).
 
     1600 steps are 200 epochs of one window for each of 500 demonstrations.
 

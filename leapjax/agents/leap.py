@@ -32,7 +32,7 @@ class Settings(ReturnSettings):
             function `leapjax.schedules.sample_masks` explains them.
         end: Let plans end early. Otherwise padding follows a demonstration's last action, and the
             loss skips it.
-        repeat_state: Show the whole state to every position (eq. 4). Otherwise later positions see
+        repeat_state: Show the whole state to every position (eq. 3). Otherwise later positions see
             the state without the agent's pose.
         returns: Condition plans on the return to go, as Decision Transformer does. Only then the
             target return has an effect.

@@ -1,4 +1,4 @@
-"""The optimizer of every method: AdamW, as in the paper's appendix (table 5)."""
+"""The optimizer of every method: AdamW, as in the paper's appendix (table 6)."""
 
 import jax
 import optax
@@ -10,7 +10,7 @@ UNDECAYED = ("bias", "scale", "embedding")  # parameters without weight decay, b
 
 
 def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
-    """Makes AdamW with clipping, linear warm-up and cosine decay (paper, appendix, table 5)."""
+    """Makes AdamW with clipping, linear warm-up and cosine decay (paper, appendix, table 6)."""
     warmup = min(config.warmup, config.steps // 10)
     rate = optax.warmup_cosine_decay_schedule(
         config.learning_rate / max(warmup, 1) if warmup else config.learning_rate,

@@ -2,7 +2,7 @@
 
 A window starts at one step of one demonstration. It holds the K steps before this step, the state
 at the step, and the next T actions. After the end of the demonstration every action is `end`; the
-model predicts it like other actions. States after the start never enter (paper, eq. 4).
+model predicts it like other actions. States after the start never enter (paper, eq. 3).
 """
 
 import hashlib

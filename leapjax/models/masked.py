@@ -1,7 +1,7 @@
 """Masked language models over plans (paper, section 3.1): one network for each architecture.
 
 Both networks score actions from the same `Context`, by `encode` and then `logits`. Every position
-of a plan sees the current state and no later one (paper, equation 4). So `encode` runs once per
+of a plan sees the current state and no later one (paper, equation 3). So `encode` runs once per
 plan, and only the action tokens change from pass to pass. The domain's `Encoder`, a field of the
 network, turns states into tokens.
 """
@@ -28,7 +28,7 @@ def build_masked_model(
         sizes: sizes of contexts and plans.
         encoder: encoder of the domain for this architecture.
         conditioned: whether the network is conditioned on returns to go.
-        repeat_state: whether all positions of a plan hold the current state (paper, equation 4);
+        repeat_state: whether all positions of a plan hold the current state (paper, equation 3);
             if not, later positions hold a state without a pose.
 
     Raises:

@@ -40,7 +40,7 @@ class PaperModel(nn.Module):
         config: size of the network.
         sizes: sizes of contexts and plans.
         states: encoder of the domain, with a token for each state of a context, `[K + 1, D]`. The
-            last token is repeated at all positions of a plan (equation 4). An encoder may add a
+            last token is repeated at all positions of a plan (equation 3). An encoder may add a
             token, which then replaces the last one at all positions but the first.
         conditioned: whether the network is conditioned on returns to go.
     """

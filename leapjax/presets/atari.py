@@ -1,4 +1,4 @@
-"""Presets of Atari: the paper's (appendix, tables 6 and 8) and ours."""
+"""Presets of Atari: the paper's (appendix, tables 7 and 9) and ours."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Presets of BabyAI: the paper's (appendix, tables 4, 5 and 7) and ours."""
+"""Presets of BabyAI: the paper's (appendix, tables 5, 6 and 8) and ours."""
 
 from typing import Any
 
@@ -85,7 +85,7 @@ def _together(level: Level, method: str) -> AnyConfig:
 
 
 def _paper_context(level: Level, method: str) -> int:
-    """Returns K; methods that choose single actions see the appendix's number of past states."""
+    """Returns K; methods of single actions see as many states as the appendix has, with today's."""
     return level.context if method in (*common.SEQUENCE, "random") else level.states - 1
 
 

@@ -15,14 +15,14 @@ SEQUENCE = ("leap", "classifier", "plate", "rules")  # these plan several action
 
 
 def paper_model(method: str, **changes: Any) -> ModelConfig:
-    """Returns the network of the paper's appendix, table 5."""
+    """Returns the network of the paper's appendix, table 6."""
     if method in UNTRAINED:
         return ModelConfig()
     return ModelConfig(architecture="paper", dropout=0.1, **changes)
 
 
 def paper_training(method: str, **changes: Any) -> TrainingConfig:
-    """Returns the training of the paper's appendix, table 5."""
+    """Returns the training of the paper's appendix, table 6."""
     if method in UNTRAINED:
         return TrainingConfig(steps=0)
     # This many examples fit into a core's cache. LEAP makes a copy of each for every action.

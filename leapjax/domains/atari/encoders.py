@@ -16,7 +16,7 @@ from leapjax.types import Context
 
 STACK = 4  # frames in a state
 # Kernel side, stride and features of each layer; features are multiples of the first layer's
-# (paper, table 6).
+# (paper, table 7).
 Layers = tuple[tuple[int, int, int], ...]
 LAYERS: Layers = ((8, 4, 1), (4, 2, 2), (3, 1, 2))
 HALVED: Layers = ((4, 2, 1), *LAYERS[1:])  # for frames with sides of half the length

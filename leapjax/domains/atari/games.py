@@ -39,8 +39,8 @@ class Game(NamedTuple):
         target: target return, a sum of clipped rewards.
         return_scale: divisor of returns before a network sees them.
         mirror: reflection that keeps the rules.
-        paper: gamer-normalised scores by method (paper, table 2), in percent.
-        paper_without_return: LEAP's score without a target return (paper, table 9).
+        paper: gamer-normalised scores by method (paper, table 3), in percent.
+        paper_without_return: LEAP's score without a target return (paper, table 10).
     """
 
     name: str

@@ -17,7 +17,7 @@ from leapjax.errors import UserError, did_you_mean
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """A level, and the paper's settings for it (appendix, tables 4 and 7).
+    """A level, and the paper's settings for it (appendix, tables 5 and 8).
 
     Attributes:
         name: name of the level, or its registered id.
@@ -105,7 +105,7 @@ def _like(name: str, paper: str, **options: Any) -> Level:
     return dataclasses.replace(LEVELS[paper], name=name, **options)
 
 
-# Levels of the paper's analyses (section 5, appendix). Some have the settings of a maze of side 10.
+# Levels of the paper's analyses (section 6, appendix). Some have the settings of a maze of side 10.
 _LONG = {"horizon": 10, "iterations": 30, "states": 10}
 MODIFIED = {
     level.name: level

@@ -1,4 +1,4 @@
-"""Levels of the paper's analyses (section 5) that MiniGrid does not have.
+"""Levels of the paper's analyses (section 6) that MiniGrid does not have.
 
 The paper describes them only briefly; details follow its authors' code.
 """
