@@ -84,7 +84,10 @@ def check_kind(value: T, kind: type[T]) -> T:
         UserError: the value is of another class.
     """
     if not isinstance(value, kind):
-        raise UserError(f"expected {kind.__name__}, got {type(value).__name__}")
+        expected, got = kind.__name__, type(value).__name__
+        if expected == got:  # such as the Settings of two methods
+            expected, got = f"{kind.__module__}.{expected}", f"{type(value).__module__}.{got}"
+        raise UserError(f"expected {expected}, got {got}")
     return value
 
 

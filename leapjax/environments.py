@@ -200,8 +200,9 @@ def _list_attributes(owner: object) -> list[Any]:
 class GymnasiumAdapter:
     """Any Gymnasium environment with discrete actions.
 
-    An episode succeeds when its return reaches `success_return` or, by default, the environment's
-    `reward_threshold`. Without either, it succeeds when it terminates with a positive reward.
+    An episode succeeds if it ends with a return of at least `success_return` or, by default, the
+    environment's `reward_threshold`. Without either, it succeeds when it terminates with a positive
+    reward.
 
     Args:
         env: a Gymnasium environment.

@@ -116,7 +116,7 @@ def compile_rollout(
         over = jnp.asarray(found.terminated | found.truncated) | (now.step >= max_steps)
         acted = episode._replace(
             state=state, context=now, score=episode.score + found.counted, over=over,
-            success=found.success & over,
+            success=jnp.asarray(found.success),  # of the last step, also if the planner gives up
             strange=jnp.where(
                 (episode.strange < 0) & ~_is_finite((found[:2], found.counted)),
                 now.step, episode.strange,

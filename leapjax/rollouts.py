@@ -427,8 +427,8 @@ def evaluate(
                 check_flag(f"{name} at {history.where}", getattr(found, name))
                 for name in ("terminated", "truncated", "success")
             )
+            successes[place] = success  # of the last step, also if the planner gives up after it
             if terminated or truncated or too_long:
-                successes[place] = success
                 return True
         return False
 

@@ -9,6 +9,7 @@ import pytest
 
 import leapjax as leap
 from leapjax import fitting, pretrained
+from leapjax.agents import leap as leap_agent
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import change, specify
 from leapjax.domain import Demonstrations
@@ -106,12 +107,17 @@ def test_planner_of_an_unregistered_domain_cannot_be_saved(monkeypatch, tmp_path
         (lambda data: [data[0]._replace(actions=[99])], {}, "demonstration 0: actions run from 99"),
         (lambda data: [data[0]._replace(rewards=[1])], {}, "demonstration 0: rewards of shape"),
         (lambda data: [data[0]._replace(observations=3)], {}, "has no observation 'edges'"),
+        (lambda data: [data[0]._replace(terminated=[False, True])], {},
+         "demonstration 0: terminated, one flag an episode, must be true or false"),
+        (lambda data: [data[0]._replace(seed=None)], {}, "demonstration 0: seed must be"),
         (lambda data: [d._replace(rewards=0 * d.rewards) for d in data], {"method": "dt"},
          "no demonstration holds a reward"),
         (list, {"method": "lepa"}, "unknown method 'lepa'"),
         (list, {"steps": -1}, "steps must be at least 0"),
         (list, {"seed": 2**31}, "seed must be at most 2147483647"),
         (list, {"settings": SMALL}, "expected Settings, got ModelConfig"),
+        (list, {"method": "iql", "settings": leap_agent.Settings()},
+         r"expected leapjax.agents.iql.Settings, got leapjax.agents.leap.Settings"),
         (list, {"horizon": 9, "planner": leap.GibbsConfig(9, 9)}, "horizon is 9, longer than any"),
         (list, {"context": 99}, "context is 99, longer than any"),
         (list, {"horizon": 9}, "it needs 9 iterations"),

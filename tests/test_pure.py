@@ -35,8 +35,9 @@ def step(state, action):
     reward = jnp.where(reached, 1.0, -0.1)
     observation = {"at": state.at, "to": state.to}
     over = state.steps >= LONGEST
+    near = jnp.abs(state.at - state.to) <= 1  # a success even if the planner gives up there
     # The score differs from the reward, which planners see.
-    return state, Transition(observation, reward, reached, over, reached, score=3 * reward + 1)
+    return state, Transition(observation, reward, reached, over, near, score=3 * reward + 1)
 
 
 WALK = PureEnvironment(reset, step, END + 1)

@@ -327,6 +327,22 @@ def test_plans_that_start_with_the_end_finish_the_episode():
     walk(steps=0, progress=give_up_after(50))
 
 
+def test_the_last_step_decides_on_success_if_the_planner_gives_up():
+    """Gives up before any step, at the success in cell 3, and after going past it."""
+
+    class Passing(Corridor):
+        def step(self, action):
+            found = super().step(action)
+            return found._replace(success=self.position == 3)
+
+    plan = plan_script(
+        lambda steps, context: jnp.where(context.step + jnp.arange(HORIZON) < steps, RIGHT, END)
+    )
+    for steps, success in ((0, False), (1, True), (2, False)):
+        played = leap.evaluate(Passing, [3], plan, jnp.int32(steps), context=0)
+        assert (played.lengths.tolist(), played.successes.tolist()) == ([steps], [success])
+
+
 @pytest.mark.parametrize("most", [1, 6])
 def test_max_steps_cuts_episodes_off(most):
     seeds = np.array([0, 3, 6])

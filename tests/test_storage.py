@@ -446,7 +446,8 @@ NOISE = np.random.default_rng(0).integers(0, 256, (3, *PICTURE.shape))
 @pytest.mark.parametrize("frames", [np.zeros_like(NOISE), NOISE], ids=["alike", "different"])
 def test_jpeg_pictures_without_a_seed_are_loaded(frames):
     write_frames(frames)
-    (found,) = storage.load(NAME, domain_of(PICTURE)).demonstrations
+    with pytest.warns(UserWarning, match="stores pictures as JPEG, which changes them"):
+        (found,) = storage.load(NAME, domain_of(PICTURE)).demonstrations
     assert found.truncated and found.seed == storage.UNKNOWN_SEED
     assert found.observations.shape == frames.shape
     assert found.observations.any() == frames.any()

@@ -417,10 +417,14 @@ def test_data_that_solve_no_board_raise_an_error():
     source = make("Sudoku4x6", Settings()).demonstrations
     states = source.collect(1, 0, lambda done: None).demonstrations[0].observations
     source.check(states, "here")
+    swapped = states.digits.copy()
+    swapped[-1] = swapped[-1] % 4 + 1  # another solution
     for wrong, message in (
         (states._replace(digits=states.digits + 1), "here: digits run from 1 to 5, expected 0"),
         (jax.tree.map(lambda x: x[:5], states), "here does not fill the 16 cells"),
         (states._replace(cell=states.cell[::-1]), "one after the other"),
+        (states._replace(digits=np.ones_like(states.digits)), "a digit twice in a row"),
+        (states._replace(digits=swapped), "changes a digit that stands on the board"),
     ):
         with pytest.raises(UserError, match=message):
             source.check(wrong, "here")

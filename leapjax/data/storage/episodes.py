@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from leapjax.checks import MOST, check_fits, check_range
+from leapjax.checks import MOST, check_fits, check_flag, check_integer, check_range
+from leapjax.data.storage.datasets import UNKNOWN_SEED
 from leapjax.data.storage.spaces import name_parts
 from leapjax.domain import Domain
 from leapjax.errors import UserError
@@ -62,6 +63,11 @@ def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Dem
     check_range(f"{where}: actions", actions, 0, domain.num_actions - 2)
     if rewards.shape != actions.shape:
         raise UserError(f"{where}: rewards of shape {rewards.shape}, actions of {actions.shape}")
+    terminated, truncated = (
+        check_flag(f"{where}: {name}, one flag an episode,", getattr(given, name))
+        for name in ("terminated", "truncated")
+    )
+    check_integer(f"{where}: seed", given.seed, UNKNOWN_SEED, 2**64 - 1)
     observations = _arrange_like(domain.blank, given.observations, where)
     _check_shapes(observations, domain, len(actions) + 1, where)
     domain.demonstrations.check(observations, where)
@@ -74,6 +80,8 @@ def check_demonstration(given: Demonstration, domain: Domain, where: str) -> Dem
         observations=jax.tree.map_with_path(narrowed, observations, domain.blank),
         actions=actions.astype(np.int32),
         rewards=rewards,
+        terminated=terminated,
+        truncated=truncated,
     )
 
 

@@ -60,7 +60,6 @@ def inspect_dataset(folder: Path, metadata: dict[str, Any]) -> list[PyTree]:
             raise ValueError(f"metadata.json has no {name}")
         _check_sizes(json.loads(metadata[name]))
     spaces = [deserialize_space(metadata[name]) for name in SPACES]
-    jpeg = bool(metadata.get("jpeg_encoding", True))  # as Minari reads it
     path = folder / "main_data.hdf5"
     with h5py.File(path) as file:
         total = metadata.get("total_episodes")
@@ -72,12 +71,28 @@ def inspect_dataset(folder: Path, metadata: dict[str, Any]) -> list[PyTree]:
         if missing:
             raise ValueError(f"{missing[0]} is not there")
         episodes = [outlines[name] for name in names]
-        for index, outline in enumerate(episodes) if jpeg else ():
+        for index, outline in enumerate(episodes) if may_have_jpeg(metadata) else ():
             for part, space in zip(("observations", "actions"), spaces, strict=True):
                 if part in outline:
                     stored = file[names[index]][part]
                     outline[part] = _outline_frames(outline[part], stored, space)
     return episodes
+
+
+def may_have_jpeg(metadata: dict[str, Any]) -> bool:
+    """Returns whether a data set stores the parts that Minari calls pictures as JPEG."""
+    return bool(metadata.get("jpeg_encoding", True))  # as Minari reads it
+
+
+def has_jpeg_observations(metadata: dict[str, Any]) -> bool:
+    """Returns whether a part of the observations is stored as JPEG, which changes its numbers."""
+    return may_have_jpeg(metadata) and _has_image(deserialize_space(metadata[SPACES[0]]))
+
+
+def _has_image(space: gym.Space) -> bool:
+    if isinstance(space, gym.spaces.Dict):
+        return any(map(_has_image, space.spaces.values()))
+    return is_image_space(space)
 
 
 def _check_sizes(space: Any) -> None:

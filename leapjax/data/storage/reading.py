@@ -29,7 +29,7 @@ from leapjax.data.storage.episodes import (
     check_rewards,
     read_mark,
 )
-from leapjax.data.storage.inspection import inspect_dataset, read_metadata
+from leapjax.data.storage.inspection import has_jpeg_observations, inspect_dataset, read_metadata
 from leapjax.data.storage.provenance import compare_with_play
 from leapjax.data.storage.spaces import read_spaces
 from leapjax.domain import Collection, Domain, Recording
@@ -82,7 +82,7 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
             dropped[result] += 1
         else:
             found.append(result)
-    compare_with_play(name, recorded, domain, found)
+    compare_with_play(name, recorded, domain, found, exact=not has_jpeg_observations(metadata))
     collection = Collection(found, dropped)
     if not found:
         only = f" that can be used, only {describe_dropped(collection)}" if dropped else ""

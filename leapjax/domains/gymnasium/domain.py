@@ -90,6 +90,8 @@ class CheckedAdapter(GymnasiumAdapter):
     def _guard(self, what: str, work: Callable[[], R]) -> R:
         try:
             return work()
+        except UserError:
+            raise
         except Exception as error:  # the user's code may raise anything
             raise UserError(
                 f"{what} of {self._name} raised {type(error).__name__}: {first_line(error)}"

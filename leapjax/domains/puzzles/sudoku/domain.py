@@ -136,7 +136,7 @@ def make(name: str, settings: Settings) -> Domain:
 
 
 def check_boards(states: Board, where: str, side: int) -> None:
-    """Checks that an episode fills a board cell by cell with digits in range.
+    """Checks that an episode fills a board cell by cell, with its solution.
 
     Raises:
         UserError: it does not.
@@ -145,6 +145,11 @@ def check_boards(states: Board, where: str, side: int) -> None:
     check_range(f"{where}: digits", digits, 0, side)
     if not np.array_equal(states.cell, np.arange(cells + 1)) or digits[-1].min() < 1:
         raise UserError(f"{where} does not fill the {cells} cells of a board, one after the other")
+    groups = [digits[-1][group == n] for group in boards.find_groups(side) for n in range(side)]
+    if any(len(set(group)) < side for group in groups):
+        raise UserError(f"{where} has a digit twice in a row, a column or a box of its last board")
+    if not ((digits == 0) | (digits == digits[-1])).all():
+        raise UserError(f"{where} changes a digit that stands on the board")
 
 
 SUDOKU = DomainType(Settings, make, boards.LEVELS)
