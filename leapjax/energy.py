@@ -181,8 +181,8 @@ class Factors(NamedTuple):
     """The terms of an energy; each term reads a few positions of a plan.
 
     Attributes:
-        positions: `[M, S]` int32, the positions that each of M terms reads; a term with fewer
-            positions repeats some.
+        positions: `[M, S]` integers in 0 .. T - 1, the positions that each of M terms reads; a term
+            with fewer positions repeats some.
         data: leaves `[M, ...]`, further numbers of each term, or `()`.
     """
 
@@ -207,13 +207,14 @@ def from_factors(
         term: (params, data of one term, actions `[S]` at its positions) -> `[]`, lower is better;
             +inf forbids.
         num_actions: A.
-        degree: the largest number of terms that read one position. If more terms read a position,
-            its energies are NaN.
+        degree: the largest number of terms that read one position.
         accepts_mask: whether the term takes MASK, the number of actions: for example 0 as long as
             the open actions can satisfy it.
 
     Raises:
-        UserError: `degree` is less than 1.
+        ValueError: `degree` is less than 1. Conditionals and totals raise it if positions are out
+            of range or more than `degree` terms read one. Inside of `jit`, where values are
+            unknown, these energies are NaN.
     """
     check_integer("degree", degree, 1)
     mask = mask_token(num_actions)
@@ -225,6 +226,7 @@ def from_factors(
         params: Params, memory: Factors, actions: jax.Array, positions: jax.Array
     ) -> jax.Array:
         actions, positions = _check_query(actions, positions, num_actions)
+        memory, fits = _check_factors(memory, actions.shape[0], degree)
         # Terms that take MASK see all queried positions masked; others see the whole plan.
         tokens = actions.at[positions].set(mask) if accepts_mask else actions
 
@@ -240,19 +242,50 @@ def from_factors(
                 return jnp.where(touches[found], terms, 0).sum()
 
             energies = jax.vmap(sum_terms)(jnp.arange(num_actions))
-            return jnp.where(touches.sum() > degree, jnp.nan, energies)
+            return jnp.where(fits & (touches.sum() <= degree), energies, jnp.nan)
 
         return _check_energies(jax.vmap(at)(positions), positions)
 
     def total(params: Params, memory: Factors, actions: jax.Array) -> jax.Array:
         actions = _check_plan(actions, num_actions)
-        reads = actions[jnp.asarray(memory.positions)]  # [M, S]
+        memory, fits = _check_factors(memory, actions.shape[0], degree)
+        reads = actions[memory.positions]  # [M, S]
         terms = jax.vmap(evaluate, in_axes=(None, 0, 0))(params, memory.data, reads)
-        return _infinite_if_incomplete(_check_total(terms.sum()), actions, num_actions)
+        energy = _check_total(jnp.where(fits, terms.sum(), jnp.nan))
+        return _infinite_if_incomplete(energy, actions, num_actions)
 
     return Energy(
         encode, conditional, total, check_num_actions(num_actions), accepts_mask=accepts_mask
     )
+
+
+def _check_factors(factors: Factors, horizon: int, degree: int) -> tuple[Factors, jax.Array]:
+    """Checks the positions of terms.
+
+    Returns:
+        The terms, positions as an array of JAX, and whether all positions are in the plan.
+
+    Raises:
+        ValueError: see `from_factors`.
+    """
+    positions = jnp.asarray(check_kind(factors, Factors).positions)
+    if positions.ndim != 2 or not jnp.issubdtype(positions.dtype, jnp.integer):
+        raise UserError(
+            "the positions of factors must be integers of shape [terms, positions of a term], got "
+            f"{positions.dtype}{list(positions.shape)}"
+        )
+    if not isinstance(positions, jax.core.Tracer):
+        expected = f"0 .. {horizon - 1}, the horizon is {horizon}"
+        _check_integers("positions of factors", positions.reshape(-1), horizon, expected)
+        counts = np.zeros(horizon, int)
+        for row in np.asarray(positions):
+            counts[row] += 1  # once, also if a term repeats a position
+        if counts.max() > degree:
+            raise UserError(
+                f"{counts.max()} terms read position {counts.argmax()}, and degree is {degree}: "
+                f"degree must be at least {counts.max()}"
+            )
+    return factors._replace(positions=positions), jnp.all((positions >= 0) & (positions < horizon))
 
 
 def classifier(encode: EncodeFn, degree: TotalFn, num_actions: int) -> Energy:
@@ -394,7 +427,7 @@ def constrain(
         # If every possible action at a position is forbidden, another position has to change. Then
         # this position ignores the constraint.
         both = base + extra
-        hopeless = jnp.all(jnp.isinf(both), axis=-1, keepdims=True)
+        hopeless = jnp.all(jnp.isposinf(both), axis=-1, keepdims=True)
         return _check_energies(jnp.where(hopeless, base, both), positions)
 
     def total(params: Params, memory: PyTree, actions: jax.Array) -> jax.Array:

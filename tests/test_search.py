@@ -1,5 +1,6 @@
 """Search with an energy: positions by certainty, beams in any order, dead ends, local terms."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -22,7 +23,16 @@ from leapjax import (
 )
 from leapjax.energy import symmetric
 from leapjax.errors import UserError
-from leapjax.planners import FILLS, CrossEntropyConfig, ShootingConfig, bind
+from leapjax.planners import (
+    FILLS,
+    CrossEntropyConfig,
+    ShootingConfig,
+    beam_search,
+    bind,
+    cross_entropy_method,
+    gibbs,
+    random_shooting,
+)
 from leapjax.planners.judges import SPLITS, sum_halves
 from leapjax.planners.positions import Commitment, choose_open, most_certain
 from leapjax.types import Turned, mask_token
@@ -44,6 +54,14 @@ ENUMERABLE = enumerable_energy(HORIZON, ACTIONS)
 NO_TILT = np.zeros((HORIZON, ACTIONS), np.float32)
 assert_equal = np.testing.assert_array_equal
 assert_close = np.testing.assert_allclose
+
+
+CONFIGS = [
+    GibbsConfig(HORIZON, 1),
+    ShootingConfig(HORIZON, 5),
+    CrossEntropyConfig(HORIZON, 2, 5),
+    BeamConfig(HORIZON, 4),
+]
 
 
 @functools.cache
@@ -218,6 +236,29 @@ def test_judge_halves_forbids_actions_that_the_energy_forbids():
     for plan, expected in (([0, 1, 0], SPLITS * 3 * np.log(2)), ([0, 2, 0], np.inf)):
         score = sum_halves(forbidden, None, None, jax.random.key(0), jnp.array(plan))
         assert_close(score, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("judge", ["energy", "halves"])
+def test_best_of_the_trace_is_complete_if_every_plan_is_forbidden(judge):
+    energy = constrain(ENUMERABLE, lambda context, plan: jnp.inf)
+    config = GibbsConfig(HORIZON, HORIZON + 2, fill="margin", keep="best", judge=judge, score=True)
+    plan = plan_for(
+        dataclasses.replace(config, score_trace=True), energy, params=random_table(0, HORIZON, 3)
+    )
+    assert (plan.actions < ACTIONS).all() and not plan.satisfied and plan.valid
+    assert plan.trace_energies.shape == (HORIZON + 2,) and np.isposinf(plan.energy)
+
+
+def test_judge_halves_takes_an_allowed_plan():
+    """One pass ignores the penalty of complete plans, so restarts draw both kinds of plans."""
+    table = random_table(0, HORIZON, ACTIONS)
+    likely = np.unravel_index(joint_probabilities(table).argmax(), (ACTIONS,) * HORIZON)
+    energy = constrain(ENUMERABLE, lambda context, plan: 9.0 * (plan[0] == likely[0]))
+    config = GibbsConfig(HORIZON, 1, temperature=1.0, restarts=16, judge="halves")
+    assert plan_for(config, energy, params=table, chains=20).satisfied.all()
+    assert not plan_for(
+        dataclasses.replace(config, restarts=1), energy, table, chains=20
+    ).satisfied.all()
 
 
 def test_judge_halves_never_keeps_an_unfinished_plan():
@@ -439,6 +480,32 @@ PLANNERS = {
 }
 
 
+@pytest.mark.parametrize("options", [{}, {"temperature": 1.0}, {"judge": "energy", "score": True}])
+def test_beams_of_probability_0_may_have_undefined_energies(options):
+    def conditional(params, memory, actions, positions):
+        first = jnp.array([jnp.inf, 1.0, 2.0])
+        second = jnp.where(actions[0] == 0, jnp.nan, jnp.arange(3.0))
+        return jnp.where(positions[:, None] == 0, first, second)
+
+    def total(params, memory, actions):
+        return jnp.where(actions[0] == 0, jnp.nan, (actions + 1.0).sum())
+
+    energy = Energy(lambda params, context: None, conditional, total, 3)
+    plan = plan_for(BeamConfig(2, 9, **options), energy)
+    assert plan.valid and (options.get("temperature") or plan.actions.tolist() == [1, 0])
+    hopeless = energy._replace(conditional=lambda *query: conditional(*query) + jnp.nan)
+    assert not plan_for(BeamConfig(2, 9, **options), hopeless).valid
+
+
+@pytest.mark.parametrize(
+    ("config", "penalty"),
+    [*((config, np.nan) for config in CONFIGS), (GibbsConfig(HORIZON, 2), -np.inf)],
+)
+def test_undefined_penalties_make_a_plan_invalid(config, penalty):
+    energy = constrain(ENUMERABLE, lambda context, plan: penalty)
+    assert not plan_for(config, energy, params=random_table(0, HORIZON, ACTIONS)).valid
+
+
 # Energies of local terms.
 
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (4, 4)], np.int32)
@@ -496,12 +563,26 @@ def test_local_terms_may_score_incomplete_plans():
     assert (pairs[:, 0] != pairs[:, 1]).all()
 
 
-def test_more_terms_at_a_position_than_the_degree_raise_an_error():
-    few = from_factors(lambda params, context: Factors(EDGES, WEIGHTS), _clash, 3, degree=2)
-    plan = plan_for(GibbsConfig(5, 10), few, params=1.0)
-    assert not plan.valid
-    with pytest.raises(ValueError, match="NaN"):
-        few.conditional(1.0, few.encode(1.0, None), jnp.zeros(5, int), jnp.array([0]))
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        (np.append(EDGES[:5], [[0, 4]], axis=0), "4 terms read position 0, and degree is 3"),
+        (EDGES - 1, r"positions of factors .* are not all in 0 \.\. 4"),
+        (EDGES + 1, r"positions of factors .* are not all in 0 \.\. 4"),
+        (EDGES[0], r"integers of shape \[terms, positions of a term\], got int32\[2\]"),
+        (EDGES * 1.0, "must be integers of shape"),
+    ],
+)
+def test_positions_of_terms_that_do_not_fit_raise_an_error(edges, message):
+    memory, plan = COLOURING.encode(1.0, edges), jnp.zeros(5, int)
+    for query in (
+        lambda: COLOURING.conditional(1.0, memory, plan, jnp.array([0])),
+        lambda: COLOURING.total(1.0, memory, plan),
+    ):
+        with pytest.raises(ValueError, match=message):
+            query()
+    if edges.shape == EDGES.shape and edges.dtype == EDGES.dtype:  # values that `jit` does not know
+        assert not plan_for(GibbsConfig(5, 10), COLOURING, params=1.0, context=edges).valid
 
 
 @pytest.mark.parametrize(
@@ -520,6 +601,20 @@ def test_more_terms_at_a_position_than_the_degree_raise_an_error():
         (lambda: BeamConfig(5, judge="length"), "unknown judge 'length'"),
         (lambda: BeamConfig(5, temperature=1.0, entropy_bound=0.1), "use one of the two"),
         (lambda: from_factors(None, None, 3, degree=0), "degree"),
+        (
+            lambda: gibbs(ENUMERABLE, None, None, None, BeamConfig()),
+            "expected GibbsConfig, got Beam",
+        ),
+        (lambda: beam_search(ENUMERABLE, None, None, None, GibbsConfig()), "expected BeamConfig"),
+        (lambda: random_shooting(ENUMERABLE, None, None, None, None), "expected ShootingConfig"),
+        (lambda: cross_entropy_method(ENUMERABLE, None, None, None, None), "expected CrossEntropy"),
+        (
+            lambda: plan_for(
+                GibbsConfig(3, 3, fill=lambda energies, key: energies[:2, 0]),
+                params=random_table(0, HORIZON, ACTIONS),
+            ),
+            r"fill must return a rank for each position, \[3\], got \[2\]",
+        ),
     ],
 )
 def test_invalid_settings_raise_an_error(make, message):

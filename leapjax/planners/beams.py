@@ -5,8 +5,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import check_kind
 from leapjax.planners.configs import BeamConfig, check_masks, find_selection, make_commitment
-from leapjax.planners.guard import guard_shapes, is_undefined, map_few, score_open
+from leapjax.planners.guard import (
+    check_constraints,
+    guard_shapes,
+    is_undefined,
+    map_few,
+    score_open,
+)
 from leapjax.planners.judges import JUDGES
 from leapjax.planners.positions import choose_open
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token, no_violation
@@ -20,7 +27,8 @@ class _Beams(NamedTuple):
         sums: sum `[W]` of the conditional energies of the chosen actions.
         likelihoods: log-probability `[W]` of drawing the choices, at the temperature.
         ranks: likelihoods `[W]` with noise; the highest ranks survive.
-        dead: booleans `[W]`: no plan, or a plan that breaks a constraint whatever follows.
+        dead: booleans `[W]`: no plan, a plan of probability 0, or a plan that breaks a constraint
+            whatever follows.
     """
 
     plans: jax.Array
@@ -50,6 +58,7 @@ def beam_search(
     Raises:
         UserError: the energy does not accept MASK where beams of this configuration leave it.
     """
+    check_kind(config, BeamConfig)
     energy = guard_shapes(energy)
     check_masks(energy, config)
     judge = None if config.judge == "sum" else JUDGES[config.judge]
@@ -89,14 +98,16 @@ def beam_search(
         beams, done, trace, valid = state
         grown = jax.vmap(grow, in_axes=(0, None))(beams.plans, select_key)
         plans, paid, branch, energies, defined = grown
+        impossible = _is_impossible(beams)
         sums = (beams.sums + paid)[:, None] + energies  # [W, A]
+        sums = jnp.where(impossible[:, None], jnp.inf, sums)
         likelihoods = ranks = -sums
         if config.temperature:
             likelihoods, ranks = _draw_ranks(draw_keys[done], beams, energies, config.temperature)
-        children = jax.vmap(
-            lambda plan, at: jnp.tile(plan, (actions, 1)).at[:, at].set(jnp.arange(actions))
-        )(plans, branch)  # [W, A, T]
-        dead = jnp.broadcast_to(beams.dead[:, None], sums.shape)
+        children = jax.vmap(lambda plan, at: jnp.tile(plan, (actions, 1)).at[:, at].set(choices))(
+            plans, branch
+        )  # [W, A, T]
+        dead = beams.dead[:, None] | jnp.isposinf(sums)
         if energy.violation is not no_violation:
             dead |= jnp.isposinf(jax.vmap(jax.vmap(violate))(children))
         order = jnp.lexsort((-ranks.reshape(-1), dead.reshape(-1)))[:width]
@@ -104,7 +115,8 @@ def beam_search(
             children.reshape(-1, horizon)[order],
             *(leaf.reshape(-1)[order] for leaf in (sums, likelihoods, ranks, dead)),
         )
-        return beams, done + 1, trace.at[done].set(beams.plans[0]), valid & defined.all()
+        valid &= (defined | impossible).all()
+        return beams, done + 1, trace.at[done].set(beams.plans[0]), valid
 
     def violate(plan: jax.Array) -> jax.Array:
         return energy.violation(params, memory, plan)
@@ -113,6 +125,7 @@ def beam_search(
         open_ = jnp.any(state[0].plans == mask, axis=-1)
         return jnp.any(open_ & (~state[0].dead | state[0].dead.all()))
 
+    choices = jnp.arange(actions, dtype=jnp.int32)
     blank = jnp.full((width, horizon), mask, jnp.int32)
     # One beam starts; copies of it would only repeat its continuations.
     missing = jnp.arange(width) > 0
@@ -132,12 +145,13 @@ def beam_search(
         judged = map_few(
             lambda plan: judge.score(energy, params, memory, judge_key, plan), beams.plans
         )
-        valid &= ~jnp.any(is_undefined(judged))
+        valid &= ~jnp.any(is_undefined(judged) & ~_is_impossible(beams))
         passes += width * judge.count_passes(horizon)
     found = jnp.lexsort((judged, beams.dead))[0]
     best = beams.plans[found]
     trace = jnp.where(jnp.arange(horizon)[:, None] < done - 1, trace, best)
-    plan = Plan(best, trace, violate(best) <= 0, valid, passes)
+    satisfied, defined = check_constraints(energy, params, memory, best)
+    plan = Plan(best, trace, satisfied, valid & defined, passes)
     if config.score and config.judge == "energy":
         plan = plan._replace(energy=judged[found])
     elif config.score:
@@ -146,6 +160,12 @@ def beam_search(
             energy=total, valid=valid & ~is_undefined(total), passes=passes + horizon
         )
     return plan
+
+
+def _is_impossible(beams: _Beams) -> jax.Array:
+    """Tells which beams `[W]` have probability 0, if not all: their energies may be undefined."""
+    impossible = jnp.isposinf(beams.sums)
+    return impossible & ~impossible.all()
 
 
 def _draw_ranks(

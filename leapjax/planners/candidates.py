@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import check_kind
 from leapjax.planners.configs import CrossEntropyConfig, ShootingConfig
-from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined
+from leapjax.planners.guard import check_constraints, compute_totals, guard_shapes, is_undefined
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
 
 
@@ -49,16 +50,18 @@ def random_shooting(
     energy: Energy, params: Params, key: jax.Array, memory: PyTree, config: ShootingConfig
 ) -> Plan:
     """Draws possible plans at random, and returns the plan of least energy (paper, ablation)."""
+    check_kind(config, ShootingConfig)
     energy = guard_shapes(energy)
     choices = _find_choices(energy, params, memory, config.horizon)
     plans = _draw_plans(key, choices.logits, config.candidates)
     energies = compute_totals(energy, params, memory, plans)
     best = jnp.argmin(energies)
+    satisfied, defined = check_constraints(energy, params, memory, plans[best])
     plan = Plan(
         plans[best],
         plans[best][None],
-        energy.violation(params, memory, plans[best]) <= 0,
-        choices.valid & ~jnp.any(is_undefined(energies)),
+        satisfied,
+        choices.valid & defined & ~jnp.any(is_undefined(energies)),
         jnp.asarray(choices.passes + plans.size, jnp.int32),
     )
     return plan._replace(energy=energies[best]) if config.score else plan
@@ -72,6 +75,7 @@ def cross_entropy_method(
     It returns the best plan of the last round, as in the paper. Elites survive unchanged, so this
     is also the best plan of all rounds.
     """
+    check_kind(config, CrossEntropyConfig)
     energy = guard_shapes(energy)
     count, horizon = config.candidates, config.horizon
     choices = _find_choices(energy, params, memory, horizon)
@@ -104,11 +108,12 @@ def cross_entropy_method(
     keys = jax.random.split(loop_key, config.iterations)[1:]
     (plans, energies), (later, invalid) = jax.lax.scan(breed, (plans, energies), keys)
     best = jnp.argmin(energies)
+    satisfied, defined = check_constraints(energy, params, memory, plans[best])
     plan = Plan(
         plans[best],
         jnp.concatenate([first[None], later]),
-        energy.violation(params, memory, plans[best]) <= 0,
-        choices.valid & ~(first_invalid | invalid.any()),
+        satisfied,
+        choices.valid & defined & ~(first_invalid | invalid.any()),
         jnp.asarray(choices.passes + config.iterations * count * horizon, jnp.int32),
     )
     return plan._replace(energy=energies[best]) if config.score else plan

@@ -72,10 +72,11 @@ class GibbsConfig:
             fills P positions.
         cool_to: Temperature of the last iteration; it changes linearly after the first plan. By
             default the temperature is constant.
-        keep: Which plan of the trace to return: the "last", or the "best", for which the judge
-            scores the whole trace.
+        keep: Which plan of the trace to return: the "last", or the "best" after the fill, for which
+            the judge scores all of these plans.
         judge: What compares plans. "energy" takes the least total energy, for T passes a plan.
-            "halves" takes the least energy of actions with half of the plan in view, for 6 passes.
+            "halves" takes the least energy of actions with half of the plan in view, for 6 passes,
+            plus the violation of constraints.
         enough: Restarts stop once the judge gives a plan at most this, in nats. By default all run.
     """
 
@@ -126,8 +127,8 @@ class GibbsConfig:
 
     @property
     def returnable(self) -> int:
-        """The plans of a trace that may be returned: all, or the last."""
-        return self.iterations if self.keep == "best" else 1
+        """The last plans of a trace, which may be returned: all complete plans, or one."""
+        return self.iterations - self.fill_iterations + 1 if self.keep == "best" else 1
 
     @property
     def is_judged(self) -> bool:

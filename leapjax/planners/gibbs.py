@@ -5,8 +5,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from leapjax.checks import check_kind
 from leapjax.planners.configs import GibbsConfig, check_masks, find_selection, make_commitment
-from leapjax.planners.guard import compute_totals, guard_shapes, is_undefined, score_open
+from leapjax.planners.guard import (
+    check_constraints,
+    compute_totals,
+    guard_shapes,
+    is_undefined,
+    score_open,
+)
 from leapjax.planners.positions import choose_open, compute_probabilities
 from leapjax.planners.restarts import Chain, find_best_chain, turns_contexts
 from leapjax.types import Energy, Params, Plan, PyTree, mask_token
@@ -30,6 +37,7 @@ def gibbs(
         UserError: the plan should be filled position by position or judged by halves, and the
             energy does not accept MASK.
     """
+    check_kind(config, GibbsConfig)
     energy = guard_shapes(energy)
     check_masks(energy, config)
 
@@ -39,8 +47,8 @@ def gibbs(
     chain = find_best_chain(energy, params, key, memory, config, run)
     best = jnp.argmin(chain.scores)
     actions = chain.trace[-config.returnable :][best]
-    satisfied = energy.violation(params, memory, actions) <= 0
-    plan = Plan(actions, chain.trace, satisfied, chain.valid, chain.passes)
+    satisfied, defined = check_constraints(energy, params, memory, actions)
+    plan = Plan(actions, chain.trace, satisfied, chain.valid & defined, chain.passes)
     # The judge knows the energies, unless it is another or saw the context turned.
     known = config.judge == "energy" and not turns_contexts(energy, config)
     if config.score and known and config.is_judged:
@@ -48,7 +56,7 @@ def gibbs(
     elif config.score:
         plan, totals = _score(energy, params, memory, plan, actions[None])
         plan = plan._replace(energy=totals[0])
-    if config.score_trace and known and config.keep == "best":
+    if config.score_trace and known and config.keep == "best" and config.fill == "together":
         plan = plan._replace(trace_energies=chain.scores)
     elif config.score_trace:
         plan, totals = _score(energy, params, memory, plan, chain.trace)
@@ -106,7 +114,7 @@ def _run_chain(
         drawn = jnp.argmin(energies - noise, axis=-1).astype(jnp.int32)
         # If every action is forbidden, another position has to change: this one keeps its action
         # (action 0 in place of MASK, which is the number of actions).
-        hopeless = jnp.all(jnp.isinf(energies), axis=-1)
+        hopeless = jnp.all(jnp.isposinf(energies), axis=-1)
         drawn = jnp.where(hopeless, plan.actions[where] % energy.num_actions, drawn)
         age = plan.age
         if age is not None:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from leapjax.checks import check_floats, check_kind
-from leapjax.types import Energy, Params, PyTree, mask_token
+from leapjax.types import Energy, Params, PyTree, mask_token, no_violation
 
 SCORED_TOGETHER = 8  # totals of one context at a time: each may hold T copies of a plan
 
@@ -40,7 +40,19 @@ def guard_shapes(energy: Energy) -> Energy:
         found = energy.violation(params, memory, actions)
         return check_floats("violation of the energy", found, ())
 
-    return energy._replace(conditional=conditional, total=total, violation=violation)
+    return energy._replace(
+        conditional=conditional,
+        total=total,
+        violation=no_violation if energy.violation is no_violation else violation,
+    )
+
+
+def check_constraints(
+    energy: Energy, params: Params, memory: PyTree, plan: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns whether a plan `[T]` satisfies all constraints, and whether that is defined."""
+    violation = energy.violation(params, memory, plan)
+    return violation <= 0, ~jnp.isnan(violation)
 
 
 def score_open(energy: Energy, params: Params, memory: PyTree, plan: jax.Array) -> jax.Array:

@@ -42,7 +42,7 @@ def sum_halves(
     A random half of the plan is masked and its actions are scored in one pass, then those of the
     other half. `SPLITS` random splits are summed. A pseudo-likelihood has all other actions in
     view, and wrong actions confirm each other; here they are rarely all in view. The sum is in
-    nats, and +inf if an action is forbidden or MASK.
+    nats, and +inf if an action is forbidden or MASK. The violation of constraints is added.
     """
     positions = jnp.arange(plan.shape[0])
     keys = jax.random.split(key, SPLITS)
@@ -57,7 +57,8 @@ def sum_halves(
         return jnp.where(hidden, jnp.where(forbidden, jnp.inf, costs), 0).sum()
 
     sums = jax.vmap(score)(jnp.concatenate([halves == 0, halves == 1]))
-    return jnp.where(jnp.all(plan < energy.num_actions), sums.sum(), jnp.inf)
+    cost = sums.sum() + energy.violation(params, memory, plan)
+    return jnp.where(jnp.all(plan < energy.num_actions), cost, jnp.inf)
 
 
 JUDGES: Mapping[str, Judge] = {

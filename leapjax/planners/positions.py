@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from leapjax.errors import UserError
+
 Select = Callable[[jax.Array, jax.Array], jax.Array]
 # (energies [T, A] of every action, key) -> ranks [T]. Rows of filled positions hold energies of
 # another position, so a rank depends on its own row only.
@@ -94,10 +96,18 @@ def choose_open(
     Returns:
         Positions `[P]`, the highest rank first, and booleans `[P]`: whether each is filled. P is
         `commitment.least`, or T where the number depends on the energies.
+
+    Raises:
+        UserError: the ranks have another shape.
     """
     count = open_.shape[0] if commitment.adapts else commitment.least
     # A rank of a user's own may be NaN or -inf, and the position is open all the same.
     lowest = jnp.finfo(jnp.float32).min
+    if jnp.shape(ranks) != open_.shape:
+        raise UserError(
+            f"fill must return a rank for each position, {list(open_.shape)}, got "
+            f"{list(jnp.shape(ranks))}"
+        )
     ranks = jnp.nan_to_num(jnp.asarray(ranks, jnp.float32), nan=lowest, neginf=lowest)
     where = jax.lax.top_k(jnp.where(open_, ranks, -jnp.inf), count)[1]
     chosen = jnp.arange(count) < commitment.least

@@ -19,8 +19,8 @@ class Chain(NamedTuple):
         trace: actions `[N, T]` after every iteration.
         valid: `[]` bool: every energy was defined, in all chains.
         passes: `[]` int32, of all chains and the judge.
-        scores: `[C]`, the judge's scores of the plans that may be returned: of the whole trace, or
-            of its last plan. 0 while nobody has judged.
+        scores: `[C]`, the judge's scores of the plans that may be returned, the last C of the
+            trace. 0 while nobody has judged.
     """
 
     trace: jax.Array
