@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from leapjax import pretrained
+from leapjax.errors import UserError
 from leapjax.running import jax_setup, shell
 
 
@@ -31,7 +32,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def publish_runs(runs: Sequence[Path]) -> None:
-    """Publishes runs; of two runs on the same level, the later one stays."""
+    """Publishes runs; of two runs on the same level, the later one stays.
+
+    Raises:
+        UserError: there are no runs, or a run cannot be read.
+    """
+    if not runs:
+        raise UserError("no runs to publish: name their folders")
     targets = [pretrained.PUBLISHED / pretrained.read_specification(run).level for run in runs]
     jax_setup.start()
     for folder, target in zip(runs, targets, strict=True):

@@ -62,7 +62,7 @@ def read_text(path: Path, most: int = LARGEST_TEXT) -> str:
         if len(data) > most:
             raise ValueError(f"larger than {most >> 20} MiB")
         # As in text mode, every kind of line end becomes "\n".
-        return data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, ValueError) as error:
         raise UserError(f"cannot read {path}: {first_line(error)}") from None
 
@@ -268,7 +268,8 @@ def check_writable(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise UserError(f"cannot write to {folder}: {first_line(error)}") from None
+        reason = error.strerror or first_line(error)  # not with the name of the temporary file
+        raise UserError(f"cannot write to {folder}: {reason}") from None
 
 
 @contextlib.contextmanager

@@ -133,7 +133,7 @@ def fit(
     data = _read(demonstrations, domain, seed)
     if not data and training.steps:
         raise UserError("no demonstrations: expected at least one to learn from")
-    if learns_from_rewards(method, settings) and not any(d.rewards.any() for d in data):
+    if data and learns_from_rewards(method, settings) and not any(d.rewards.any() for d in data):
         raise UserError(f"no demonstration holds a reward, and {method} learns from rewards")
     settings = measure_settings(settings, data)
     name_of_data = demonstrations if isinstance(demonstrations, str) else None

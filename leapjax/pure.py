@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from leapjax import compilation
 from leapjax.batching import check_fit, plan_key, planner_key
 from leapjax.checks import check_integer, check_kind, check_seeds
 from leapjax.environments import Transition
@@ -66,6 +67,9 @@ def compile_rollout(
 ) -> Callable[[Params, Sequence[int], int], Episodes]:
     """Builds, once, a function that plays any number of episodes.
 
+    Each number of episodes compiles at its first use. Compiled programs are kept on disk, as in
+    `compile_planner`.
+
     Args:
         environment: environment to play in.
         energy: energy to minimise, with as many actions as the environment.
@@ -92,6 +96,7 @@ def compile_rollout(
     check_kind(environment, PureEnvironment)
     check_actions("energy", check_kind(energy, Energy).num_actions, environment.num_actions)
     _check_environment(environment)
+    compilation.use_disk_cache()
     plan = bind(energy, config)
     end = energy.num_actions - 1
 

@@ -4,6 +4,7 @@ import importlib
 import os
 import re
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -51,6 +52,14 @@ def test_a_closed_output_pipe_ends_a_program_quietly():
     completed = run_python("-m", "experiments", "--help", stdout=writer)
     os.close(writer)
     assert (completed.returncode, completed.stderr) == (startup.UNREAD, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a device that is full")
+def test_an_output_that_cannot_be_written_ends_a_program_with_one_line():
+    with Path("/dev/full").open("w") as full:
+        completed = run_python("-m", "experiments", "--help", stdout=full)
+    expected = "error: cannot write the output: No space left on device\n"
+    assert (completed.returncode, completed.stderr) == (1, expected)
 
 
 def read_help(main, arguments, capsys, monkeypatch):

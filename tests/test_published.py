@@ -103,9 +103,15 @@ def test_the_command_line_plays_published_planners(published, tmp_path, capsys):
         (["--level", "PickUpLoc"], "no planner is published for 'PickUpLoc': only for GoToLocal"),
         (["--checkpoint", str(published)], "give one of them"),
         (["--seeds", "0"], "seed is 3, not 0"),
+        (["--seeds", "3", "0"], "--seeds 3 0: a planner that is trained already is of one seed"),
     ):
         assert babyai.main([*options, *more]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_publishing_no_runs_is_refused(capsys):
+    assert publish.main([]) == 2
+    assert "no runs to publish" in capsys.readouterr().err
 
 
 def test_a_family_planner_plays_each_level_of_its_family(published, tmp_path):

@@ -466,3 +466,8 @@ def test_a_frame_of_another_size_is_not_unpacked(minari_folder, monkeypatch, sha
         file["episode_0/observations"][1] = np.frombuffer(packed.getvalue(), np.uint8)
     monkeypatch.setattr(minari, "load_dataset", lambda name: pytest.fail("it is read"))
     assert "a frame of shape" in load_error(domain=domain_of(PICTURE))
+
+
+def test_only_reasons_that_dropped_episodes_are_described():
+    collection = Collection([], {"failed": 0, "too long": 2, "without a seed": 1})
+    assert storage.describe_dropped(collection) == "2 too long, 1 without a seed"

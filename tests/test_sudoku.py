@@ -336,7 +336,8 @@ def test_plans_of_a_part_of_a_board_stay_unturned(cell, horizon):
 
 def write_boards(folder, *lines):
     path = folder / "hard.txt"
-    path.write_text("# from a magazine\n\n" + "\n".join(lines) + "\n")
+    # With the mark that editors on Windows put before UTF-8.
+    path.write_text("\ufeff# from a magazine\n\n" + "\n".join(lines) + "\n", "utf-8")
     return path
 
 

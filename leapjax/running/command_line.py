@@ -82,6 +82,11 @@ def parse(
             if methods and len(methods) > 1 and not default.training.steps:
                 config = change(config, training={"steps": 0})  # this method does not learn
             check(config)
+            if trained is not None and len(config.seeds) > 1:
+                raise UserError(
+                    f"{kind.flag('seeds')} {' '.join(map(str, config.seeds))}: a planner that is "
+                    "trained already is of one seed"
+                )
             configs.append(config)
     return configs
 

@@ -57,9 +57,10 @@ def prepare() -> None:
 
 
 class Output(io.TextIOWrapper):
-    """A stream that ends the program when its reader has gone, as in `--help | head`.
+    """A stream that ends the program when it cannot be written to.
 
-    SIGPIPE ends other programs then. It would also end this program when a worker process or a
+    Its reader may have gone, as in `--help | head`, or the disk may be full. SIGPIPE ends other
+    programs when a reader has gone. It would also end this program when a worker process or a
     logger has gone, instead of letting it report the failure.
     """
 
@@ -67,15 +68,15 @@ class Output(io.TextIOWrapper):
         """Writes a text."""
         try:
             return super().write(text)
-        except BrokenPipeError:
-            end_unread()
+        except OSError as error:
+            end_unwritten(error)
 
     def flush(self) -> None:
         """Flushes the buffer; the interpreter does so when it exits."""
         try:
             super().flush()
-        except BrokenPipeError:
-            end_unread()
+        except OSError as error:
+            end_unwritten(error)
 
 
 def make_output(stream: TextIO) -> TextIO:
@@ -88,9 +89,13 @@ def make_output(stream: TextIO) -> TextIO:
     )  # fmt: skip
 
 
-def end_unread() -> NoReturn:
-    """Ends the program silently: its output has no reader."""
-    os._exit(UNREAD)
+def end_unwritten(error: OSError) -> NoReturn:
+    """Ends the program: silently if its output has no reader, else with one line on stderr."""
+    if isinstance(error, BrokenPipeError):
+        os._exit(UNREAD)
+    with contextlib.suppress(OSError):  # stderr may be on the same disk
+        os.write(2, f"error: cannot write the output: {error.strerror}\n".encode())
+    os._exit(1)
 
 
 def format_command(module: str) -> str:

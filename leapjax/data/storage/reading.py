@@ -85,14 +85,15 @@ def load(name: str, domain: Domain, most: int | None = None) -> Collection:
     compare_with_play(name, recorded, domain, found, exact=not has_jpeg_observations(metadata))
     collection = Collection(found, dropped)
     if not found:
-        only = f" that can be used, only {describe_dropped(collection)}" if dropped else ""
+        described = describe_dropped(collection)
+        only = f" that can be used, only {described}" if described else ""
         raise UserError(f"the Minari data set {name!r} has no episodes{only}")
     return collection
 
 
 def describe_dropped(collection: Collection) -> str:
-    """Describes how many episodes were dropped, for which reasons."""
-    return ", ".join(f"{count} {reason}" for reason, count in collection.dropped.items())
+    """Describes how many episodes were dropped, for which reasons; empty if none was."""
+    return ", ".join(f"{count} {reason}" for reason, count in collection.dropped.items() if count)
 
 
 @contextlib.contextmanager
