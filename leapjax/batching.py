@@ -303,6 +303,11 @@ def _check_inputs(
                 f"context{jax.tree_util.keystr(path)} has shape {np.shape(leaf)}: its first "
                 f"dimension must be the number of keys, {batch}"
             )
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            raise UserError(
+                f"context{jax.tree_util.keystr(path)} holds random keys: pass "
+                "jax.random.key_data(keys), and wrap_key_data in the energy"
+            )
         if not isinstance(leaf, jax.Array) and not _is_real(np.asarray(leaf).dtype):
             raise ValueError(
                 f"context{jax.tree_util.keystr(path)} holds {np.asarray(leaf).dtype}, not "
@@ -329,15 +334,17 @@ def check_fit(name: str, tree: PyTree) -> None:
 
     Args:
         name: name of the tree, for the message.
-        tree: arrays of any kind; JAX arrays always pass.
+        tree: arrays of numbers; JAX arrays always pass.
 
     Raises:
-        UserError: a number does not fit; the message names the first such leaf.
+        UserError: a leaf holds no numbers, or one that does not fit; the message names the first.
     """
     for path, leaf in jax.tree.leaves_with_path(tree):
         if isinstance(leaf, jax.Array):
             continue
         array = np.asarray(leaf)
+        if array.dtype.kind in "OSUmM":
+            raise UserError(f"{name}{jax.tree_util.keystr(path)} holds {array.dtype}, not numbers")
         if array.dtype.kind not in "iuf" or not array.size:
             continue
         narrow = jax.dtypes.canonicalize_dtype(array.dtype)

@@ -334,7 +334,7 @@ def compose(energies: Sequence[Energy], weights: Sequence[float] | None = None) 
     active = [index for index, weight in enumerate(weights) if weight >= np.finfo(np.float32).tiny]
 
     def encode(params: Params, context: PyTree) -> PyTree:
-        counted = isinstance(params, Sequence | np.ndarray | jax.Array)
+        counted = isinstance(params, Sequence) or bool(getattr(params, "shape", ()))
         if not counted or len(params) != len(energies):
             raise UserError(
                 f"params of {len(energies)} composed energies must be a tuple of as many, got "
@@ -495,7 +495,7 @@ def symmetric(energy: Energy, draw: Callable[[jax.Array, PyTree], Turned]) -> En
             original context, renamed, must solve the turned one.
 
     Raises:
-        UserError: while it plans: `draw` returns no `Turned`, or one for plans of another length.
+        UserError: while it plans: `draw` returns no `Turned`, or one of other shapes or types.
     """
     num_actions = check_kind(energy, Energy).num_actions
 
@@ -503,7 +503,7 @@ def symmetric(energy: Energy, draw: Callable[[jax.Array, PyTree], Turned]) -> En
         return _Form(context, energy.encode(params, context))
 
     def turn(params: Params, key: jax.Array, form: _Form) -> _Form:
-        turned = check_kind(draw(key, form.context), Turned)
+        turned = _check_turned(draw(key, form.context), num_actions)
         return _Form(
             form.context, energy.encode(params, turned.context), turned.places, turned.names
         )
@@ -541,6 +541,24 @@ def symmetric(energy: Energy, draw: Callable[[jax.Array, PyTree], Turned]) -> En
         encode=encode, conditional=conditional, total=total, turn=turn,
         violation=no_violation if energy.violation is no_violation else violation,
     )  # fmt: skip
+
+
+def _check_turned(turned: Turned, num_actions: int) -> Turned:
+    """Checks the shapes and types of what `draw` returned, see `symmetric`.
+
+    Raises:
+        UserError: they are others than `Turned` says.
+    """
+    horizon = np.size(check_kind(turned, Turned).places)
+    for name, shape in ("places", (horizon,)), ("names", (horizon, num_actions)):
+        given = getattr(turned, name)
+        integers = jnp.issubdtype(getattr(given, "dtype", object), jnp.integer)
+        if np.shape(given) != shape or not integers:
+            raise UserError(
+                f"{name} of a Turned must be integers of shape {list(shape)}, got "
+                f"{getattr(given, 'dtype', given)}{list(np.shape(given))}"
+            )
+    return turned
 
 
 def neutral(energy: Energy, actions: Sequence[int]) -> Energy:

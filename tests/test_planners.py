@@ -744,7 +744,7 @@ def test_keys_and_contexts_of_many_types_are_accepted():
     for keys in (jax.random.wrap_key_data(KEYS), [*KEYS], KEYS):
         plan = compile_batched(GIBBS)(TABLE, keys, CONTEXTS | (types if keys is KEYS else {}))
         jax.tree.map(assert_equal, plan, expected)
-    for fits in ([2**31 - 1, -(2**31)], [np.nan, -np.inf, 3e38, 1 / 3], [], ["words"]):
+    for fits in ([2**31 - 1, -(2**31)], [np.nan, -np.inf, 3e38, 1 / 3], []):
         check_fit("context", {"x": np.array(fits)})
     check_fit("context", {"x": np.array([2**32 - 1], np.uint64)})
 
@@ -770,6 +770,8 @@ WRONG = [
         (lambda w=wide: _plan(more=[w]), r"context\['more'\]\[0\] holds .*does not fit")
         for wide in WIDE
     ),
+    (lambda: _plan(params="words"), "params holds <U5, not numbers"),
+    (lambda: _plan(more=jax.random.split(jax.random.key(0))), r"\['more'\] holds random keys"),
     (lambda: _plan(params={"more": WIDE[0]}), r"params\['more'\] holds .*does not fit"),
     (lambda: jax.jit(_plan)(KEYS), r"inside of jit, vmap or grad.* use leap.gibbs"),
     *(

@@ -586,6 +586,21 @@ def test_positions_of_terms_that_do_not_fit_raise_an_error(edges, message):
 
 
 @pytest.mark.parametrize(
+    ("name", "places", "names"),
+    [
+        ("places", np.arange(3.0), np.zeros((3, 3), int)),
+        ("places", None, np.zeros((3, 3), int)),
+        ("names", np.arange(3), np.zeros((2, 3), int)),
+        ("names", np.arange(3), np.zeros((3, 3))),
+    ],
+)
+def test_turned_contexts_of_other_shapes_or_types_raise_an_error(name, places, names):
+    energy = symmetric(mislead(), lambda key, context: Turned(context, places, names))
+    with pytest.raises(UserError, match=f"{name} of a Turned must be integers of shape"):
+        energy.turn((), jax.random.key(0), energy.encode((), jnp.arange(3)))
+
+
+@pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: GibbsConfig(5, 5, fill="uncertain"), "unknown fill 'uncertain'"),
