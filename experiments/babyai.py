@@ -21,7 +21,7 @@ def play_members(config: AnyConfig) -> list[AnyConfig]:
 
 
 EXPERIMENT = Experiment(
-    "babyai", "babyai", searches=play_members, animate=animate, paper=find_success
+    "babyai", "babyai", variants=play_members, animate=animate, paper=find_success
 )
 
 

@@ -39,7 +39,7 @@ def try_temperatures(config: AnyConfig) -> list[AnyConfig]:
     return change_planner(config, [make_noise(each, kind) for each in TEMPERATURES])
 
 
-EXPERIMENT = Experiment("noise", "babyai", searches=try_temperatures)
+EXPERIMENT = Experiment("noise", "babyai", variants=try_temperatures)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

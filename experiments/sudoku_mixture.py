@@ -1,6 +1,6 @@
 """Makes hard boards to play: `python -m experiments.sudoku_mixture sudoku17.txt boards.txt`.
 
-Recurrent Relational Networks (Palm et al., 2018) are tested on boards with 17 to 34 givens, equally
+Recurrent Relational Networks (Palm et al., 2018) are tested on boards with 17 to 34 clues, equally
 many of each. Givens beyond 17 are digits of the solution at random open cells.
 """
 
@@ -20,21 +20,21 @@ from leapjax.domains.puzzles.sudoku import boards
 from leapjax.errors import UserError
 from leapjax.running import shell
 
-FEWEST, MOST = 17, 34  # givens
+FEWEST, MOST = 17, 34  # clues
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Make boards of 17 to 34 givens from boards of 17, for `experiments.sudoku --boards`."""
+    """Make boards of 17 to 34 clues from boards of 17, for `experiments.sudoku --boards`."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Text file of boards with 17 givens, one a line, such as Gordon Royle's."""
+    """Text file of boards with 17 clues, one a line, such as Gordon Royle's."""
     target: Annotated[Path, tyro.conf.Positional]
     """Text file to write."""
     count: int = 360
     """Boards to make."""
     seed: int = 0
-    """Seed that draws boards and givens."""
+    """Seed that draws boards and clues."""
 
     def __post_init__(self) -> None:
         check_at_least(self, 1, "count")
@@ -52,7 +52,7 @@ def write_boards(options: Options) -> None:
     """Writes the boards of a mixture.
 
     Raises:
-        UserError: the source has too few boards, or a board without exactly 17 givens or without
+        UserError: the source has too few boards, or a board without exactly 17 clues or without
             exactly one solution.
     """
     source = PuzzleFile(options.source, "boards", lambda text: boards.read_board(text, 9))
@@ -67,7 +67,7 @@ def write_boards(options: Options) -> None:
         clues, solution = source.read_line(int(place))
         if (clues > 0).sum() != FEWEST:
             raise UserError(
-                f"{options.source}, line {lines[place][0]}: {(clues > 0).sum()} givens, expected "
+                f"{options.source}, line {lines[place][0]}: {(clues > 0).sum()} clues, expected "
                 f"{FEWEST}"
             )
         extra = index % (MOST - FEWEST + 1)

@@ -473,7 +473,7 @@ def test_unavailable_rules_are_one_error_line(program, arguments, message, capsy
     assert message in error and error.count("\n") == 1
 
 
-def test_mixture_adds_digits_of_the_solution_to_boards_of_17_givens(tmp_path, capsys):
+def test_mixture_adds_digits_of_the_solution_to_boards_of_17_clues(tmp_path, capsys):
     source, target = write_boards(tmp_path, *[SEVENTEEN] * 40), tmp_path / "mixture.txt"
     assert sudoku_mixture.main([str(source), str(target), "--count", "36"]) == 0
     made = np.array([read_digits(line) for line in target.read_text().split()])
@@ -489,4 +489,4 @@ def test_mixture_adds_digits_of_the_solution_to_boards_of_17_givens(tmp_path, ca
     assert (
         sudoku_mixture.main([str(write_boards(tmp_path, more)), str(target), "--count", "1"]) == 2
     )
-    assert "line 3: 18 givens, expected 17" in capsys.readouterr().err
+    assert "line 3: 18 clues, expected 17" in capsys.readouterr().err

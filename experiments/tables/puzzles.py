@@ -85,7 +85,7 @@ def group_by_passes(rows: Sequence[Row]) -> dict[str, dict[str, dict[float, Row]
                 added.setdefault(level, {}).setdefault(name, {}).update(_add_up(of))
     for name, (_, of, _) in group_by_boards(planned):
         if of:
-            added.setdefault("Sudoku, 17 to 34 givens, learned", {})[name] = _add_up(of)
+            added.setdefault("Sudoku, 17 to 34 clues, learned", {})[name] = _add_up(of)
     return added
 
 
@@ -107,8 +107,8 @@ def compare_boards(rows: Sequence[Row]) -> str:
         if any(by_boards)
     ]
     return make_table(
-        "search | passes, 17 to 34 givens | 31 to 42 givens | 17 to 34 givens | "
-        "17 to 34 givens, with rules",
+        "search | passes, 17 to 34 clues | 31 to 42 clues | 17 to 34 clues | "
+        "17 to 34 clues, with rules",
         lines,
     )
 

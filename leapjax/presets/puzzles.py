@@ -13,7 +13,7 @@ Preset = Callable[[str, str], AnyConfig]  # (level, method) -> configuration
 
 
 # Plans again and again on turned copies of the puzzle, until the energy is sure of a plan. For
-# puzzles with symmetries (`Domain.turn`); chosen on validation boards of 17 to 22 givens.
+# puzzles with symmetries (`Domain.turn`); chosen on validation boards of 17 to 22 clues.
 TURNED = {
     "fill": "confident", "certainty": 0.999, "restarts": 16, "judge": "halves", "enough": 0.02,
 }  # fmt: skip

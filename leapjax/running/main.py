@@ -40,7 +40,7 @@ def run_all(experiment: Experiment, arguments: Sequence[str], interruption: Inte
     for config, seed in runs:
         try:
             rows.append(finish(experiment, config, seed, versions, console, interruption))
-            for again in find_searches(experiment, config, seed):
+            for again in find_variants(experiment, config, seed):
                 rows.append(finish(experiment, again, seed, versions, console, interruption))
         except shell.FAILURES as error:
             if len(runs) > 1:  # the other runs go on
@@ -119,16 +119,16 @@ def compare(experiment: Experiment, configs: Sequence[AnyConfig], console: Conso
         console.print(experiment.compare(level, seeds))
 
 
-def find_searches(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:
-    """Returns configurations that plan in other ways with the parameters of a run.
+def find_variants(experiment: Experiment, config: AnyConfig, seed: int) -> list[AnyConfig]:
+    """Returns configurations of other searches or levels for the parameters of a run.
 
     Raises:
         UserError: the folder of the run is missing, and some of these configurations have no row.
     """
-    if config.checkpoint is not None or experiment.searches is None:
+    if config.checkpoint is not None or experiment.variants is None:
         return []
     folder = find_folder(experiment, config, seed)
-    others = experiment.searches(config)
+    others = experiment.variants(config)
     found = [dataclasses.replace(o, checkpoint=folder, pictures=False) for o in others]
 
     def count_unreachable() -> int:

@@ -34,8 +34,8 @@ class Experiment(NamedTuple):
     Attributes:
         name: name of its module and of its file of rows.
         domain: name of its domain.
-        searches: (configuration) -> configurations that plan in other ways with the trained
-            parameters; each makes a row. `None` if the experiment has a single way.
+        variants: (configuration) -> configurations of other searches or levels for the trained
+            parameters; each makes a row. `None` if there are none.
         animate: (planner, run, level seeds, path); draws how plans are refined and executed.
         compare: (level, level seeds) -> table of solvers without learning, on the same levels.
         iterations: whether to draw success against the number of iterations.
@@ -47,7 +47,7 @@ class Experiment(NamedTuple):
 
     name: str
     domain: str
-    searches: Callable[[AnyConfig], Sequence[AnyConfig]] | None = None
+    variants: Callable[[AnyConfig], Sequence[AnyConfig]] | None = None
     animate: "Callable[[Pretrained, Run, Sequence[int], Path], None] | None" = None
     compare: Callable[[str, Sequence[int]], Table] | None = None
     iterations: bool = True
