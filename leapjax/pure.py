@@ -53,7 +53,7 @@ class _Episode(NamedTuple):
     plans: jax.Array  # [] int32
     passes: jax.Array  # [] int32: passes of the model in all plans
     valid: jax.Array  # [] bool: no energy was NaN or -inf
-    strange: jax.Array  # [] int32: the first step with a number that is not finite, or -1
+    strange: jax.Array  # [] int32: the first step with a number out of range, or -1
 
 
 def compile_rollout(
@@ -87,7 +87,7 @@ def compile_rollout(
         UserError: A count is not an integer in its range, or `step` returns other structures,
             shapes or types than `reset`. The returned function raises it if there are no seeds or
             a seed is not an integer in 0 .. 2^32 - 1. It also does if 64-bit parameters do not fit
-            32 bits, or the environment gave numbers that are not finite.
+            32 bits, or the environment gave numbers that are not finite or a `taken` out of range.
         ValueError: The environment and the energy have different actions. The returned function
             raises it if an energy was NaN or -inf.
     """
@@ -118,13 +118,14 @@ def compile_rollout(
         ended |= action >= end  # or MASK
         state, found = environment.step(episode.state, jnp.minimum(action, end - 1))
         now = _advance_context(episode.context, action, found)
+        taken = jnp.asarray(found.executed(action))
+        sound = _is_finite((found[:2], found.counted)) & (taken >= 0) & (taken < end)
         over = jnp.asarray(found.terminated | found.truncated) | (now.step >= max_steps)
         acted = episode._replace(
             state=state, context=now, score=episode.score + found.counted, over=over,
             success=jnp.asarray(found.success),  # of the last step, also if the planner gives up
             strange=jnp.where(
-                (episode.strange < 0) & ~_is_finite((found[:2], found.counted)),
-                now.step, episode.strange,
+                (episode.strange < 0) & ~sound, now.step, episode.strange
             ),
         )  # fmt: skip
         idle = ended | episode.over
@@ -158,9 +159,9 @@ def compile_rollout(
         if strange.any():
             first = np.argmax(strange)
             raise UserError(
-                f"the environment gave numbers that are not finite in {strange.sum()} of "
-                f"{len(level_seeds)} episodes, the first at step {played.strange[first]} of level "
-                f"seed {level_seeds[first]}"
+                f"the environment gave numbers that are not finite (or `taken` outside of 0 .. "
+                f"{end - 1}) in {strange.sum()} of {len(level_seeds)} episodes, the first at step "
+                f"{played.strange[first]} of level seed {level_seeds[first]}"
             )
         if not played.valid.all():
             raise ValueError(

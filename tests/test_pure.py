@@ -150,5 +150,12 @@ def test_non_finite_rewards_raise_an_error():
     world = WALK._replace(step=step_to_nan)
     rollout = compile_rollout(world, still, leap.GibbsConfig(2, 2), context=1, max_steps=5)
     assert rollout((), [8, 13]).lengths.tolist() == [2, 2]  # over before step 3
-    with pytest.raises(UserError, match="not finite in 2 of 4 .* at step 3 of level seed 11"):
+    with pytest.raises(UserError, match="not finite .* in 2 of 4 .* at step 3 of level seed 11"):
         rollout((), [8, 11, 13, 12])
+
+
+@pytest.mark.parametrize("taken", [-1, END])
+def test_actions_taken_out_of_range_raise_an_error(taken):
+    world = alter(taken=lambda _: jnp.int32(taken))
+    with pytest.raises(UserError, match=rf"`taken` outside of 0 \.\. {END - 1}\) in 3 of 3"):
+        play(world=world)
