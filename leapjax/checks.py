@@ -80,10 +80,13 @@ def check_number(name: str, value: Any, least: float = -LARGEST, most: float = L
 def check_kind(value: T, kind: type[T]) -> T:
     """Returns the value if it is an instance of a class.
 
+    Of a dataclass it must be no subclass: nothing would read the further fields.
+
     Raises:
         UserError: the value is of another class.
     """
-    if not isinstance(value, kind):
+    exact = dataclasses.is_dataclass(kind)
+    if not (type(value) is kind if exact else isinstance(value, kind)):
         expected, got = kind.__name__, type(value).__name__
         if expected == got:  # such as the Settings of two methods
             expected, got = f"{kind.__module__}.{expected}", f"{type(value).__module__}.{got}"

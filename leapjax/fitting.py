@@ -103,6 +103,8 @@ def fit(
         NonFiniteLoss: see `leapjax.training.train`.
     """
     check_kind(domain, Domain)
+    if not callable(progress):
+        raise UserError(f"progress must be a function of (step, metrics), got {progress!r}")
     chosen, seed = find_method(method), check_integer("seed", seed)
     name, domain_settings = domain.made_from or (None, None)
     kinds = (ModelConfig, TrainingConfig, chosen.planner, chosen.settings)

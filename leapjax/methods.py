@@ -46,6 +46,6 @@ def find_method(name: str) -> Method:
     Raises:
         UserError: the name is unknown; lists the known names.
     """
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise UserError(f"unknown method {name!r}: expected one of {', '.join(METHODS)}")
     return METHODS[name]

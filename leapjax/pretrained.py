@@ -490,10 +490,9 @@ def load(
         params = weights.read(folder / WEIGHTS, like, whose)
     else:
         checkpoints = _import_checkpoints()
-        params = checkpoints.restore_params(
+        params, step = checkpoints.restore_params(
             folder / CHECKPOINTS, like, whose, specification.training.steps if finished else None
         )
-        step = checkpoints.find_newest(folder / CHECKPOINTS)[0]
         if step < specification.training.steps:
             warnings.warn(
                 f"{folder} ends at step {step} of {specification.training.steps}", stacklevel=2

@@ -10,6 +10,7 @@ import pytest
 import leapjax as leap
 from leapjax import fitting, pretrained
 from leapjax.agents import leap as leap_agent
+from leapjax.agents import mopo
 from leapjax.agents.base import TrainingConfig
 from leapjax.configuration import change, specify
 from leapjax.domain import Demonstrations
@@ -117,6 +118,10 @@ def test_planner_of_an_unregistered_domain_cannot_be_saved(monkeypatch, tmp_path
         (list, {"steps": -1}, "steps must be at least 0"),
         (list, {"seed": 2**31}, "seed must be at most 2147483647"),
         (list, {"settings": SMALL}, "expected Settings, got ModelConfig"),
+        (list, {"method": ["bc"]}, r"unknown method \['bc'\]"),
+        (list, {"progress": None}, "progress must be a function"),
+        (list, {"method": "iql", "settings": mopo.Settings()},
+         r"expected leapjax.agents.iql.Settings, got leapjax.agents.mopo.Settings"),
         (list, {"method": "iql", "settings": leap_agent.Settings()},
          r"expected leapjax.agents.iql.Settings, got leapjax.agents.leap.Settings"),
         (list, {"horizon": 9, "planner": leap.GibbsConfig(9, 9)}, "horizon is 9, longer than any"),

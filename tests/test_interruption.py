@@ -223,8 +223,9 @@ def test_checkpoint_of_another_configuration_raises_an_error_and_stays(tmp_path)
     checkpoints = Checkpoints(folder)
     checkpoints.save(make_state(1))
     checkpoints.close()
-    weights = restore_params(folder, jax.eval_shape(lambda: make_state(0)).params)
+    weights, step = restore_params(folder, jax.eval_shape(lambda: make_state(0)).params)
     np.testing.assert_array_equal(weights["w"], 1.0)
+    assert step == 1
     other = TrainState({"w": jnp.zeros((3, 3))}, (), jnp.int32(0))
     with pytest.raises(UserError, match=r"params/w is \(50, 50\), expected \(3, 3\)"):
         Checkpoints(folder).restore(other)

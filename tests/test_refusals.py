@@ -24,6 +24,7 @@ import leapjax as leap
 from experiments import accuracy, babyai, gymnasium
 from leapjax import checkpoints, files, pretrained
 from leapjax.checkpoints import Checkpoints, states
+from leapjax.checkpoints.paths import find_newest
 from leapjax.configuration import make_domain, specify
 from leapjax.data import storage
 from leapjax.domains.babyai import bot, levels
@@ -87,7 +88,7 @@ def save(folder, *values, **options):
 
 
 def check_params(folder, value, *identity):
-    found = checkpoints.restore_params(folder, make_state(0.0).params, *identity)
+    found, _ = checkpoints.restore_params(folder, make_state(0.0).params, *identity)
     np.testing.assert_array_equal(found["w"], value)
 
 
@@ -235,7 +236,7 @@ def test_module_of_a_data_set_does_not_run(trap, monkeypatch):
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "folder/" + "x" * 300, 7])
 def test_impossible_path_raises_a_short_error(name, workplace):
     (workplace / "folder").mkdir()
-    for use in (leap.load, checkpoints.find_newest, Checkpoints, files.check_path):
+    for use in (leap.load, find_newest, Checkpoints, files.check_path):
         with pytest.raises(UserError, match="cannot look for|expected a path") as raised:
             use(name if not isinstance(name, str) else Path(name))
         assert len(str(raised.value)) < 200
@@ -364,6 +365,23 @@ def test_unfinished_run_is_neither_recorded_nor_published(toy_run, workplace, ca
     with pytest.warns(UserWarning, match="ends at step 3 of 4"):
         leap.load(stopped).save(workplace / "copied")
     with pytest.raises(UserError, match=printed):
+        pretrained.publish(workplace / "copied", workplace / "published")
+
+
+def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(toy_run, workplace):
+    stopped = workplace / "stopped"
+    shutil.copytree(toy_run, stopped)
+    last = stopped / "checkpoints" / "4"
+    shutil.copytree(last, last.parent / "3")
+    for file in (last / "default").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[:20])
+    with pytest.warns(UserWarning) as warned:
+        planner = leap.load(stopped)
+    messages = "\n".join(str(each.message) for each in warned)
+    assert "using step 3" in messages and "ends at step 3 of 4" in messages and planner.step == 3
+    planner.save(workplace / "copied")
+    with pytest.raises(UserError, match="ends at step 3 of 4"):
         pretrained.publish(workplace / "copied", workplace / "published")
 
 

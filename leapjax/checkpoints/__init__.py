@@ -18,7 +18,7 @@ from leapjax.checkpoints.parameters import (
     restore_params,
     save_params,
 )
-from leapjax.checkpoints.paths import check_path, find_newest
+from leapjax.checkpoints.paths import check_path
 from leapjax.checkpoints.states import Checkpoints
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "Unfinished",
     "check_identity",
     "check_path",
-    "find_newest",
     "hush_orbax",
     "restore_params",
     "save_params",

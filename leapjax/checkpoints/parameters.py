@@ -54,7 +54,7 @@ def check_identity(folder: Path, identity: str) -> list[int]:
 
 def restore_params(
     folder: Path, like: PyTree, identity: str = "", step: int | None = None
-) -> PyTree:
+) -> tuple[PyTree, int]:
     """Reads the parameters of the newest readable checkpoint, or of the checkpoint of a step.
 
     Warns of each damaged checkpoint that it skips.
@@ -64,6 +64,9 @@ def restore_params(
         like: parameters of the same structure and shapes.
         identity: identity of their configuration.
         step: step of the checkpoint; `None` for the newest readable checkpoint.
+
+    Returns:
+        The parameters, and the step of the checkpoint that they are from.
 
     Raises:
         UserError: there is no readable checkpoint, or its arrays have other shapes or another
@@ -107,7 +110,7 @@ def restore_params(
         else:
             for reason in reasons:
                 warnings.warn(f"{reason}: using step {step}", stacklevel=2)
-            return jax.tree.map(jnp.asarray, params)
+            return jax.tree.map(jnp.asarray, params), step
     raise (UserError if step is None else Unfinished)("; ".join(reasons))
 
 
