@@ -193,6 +193,7 @@ def test_passes_count_every_conditional_and_every_total():
         (GibbsConfig(HORIZON, 7, score=True), 7 + HORIZON),
         (GibbsConfig(HORIZON, 7, restarts=4, score=True), 4 * (7 + HORIZON)),
         (GibbsConfig(HORIZON, 7, keep="best", score_trace=True), 7 + 7 * HORIZON),
+        (GibbsConfig(HORIZON, 7, fill="margin", keep="best"), 7 + (8 - HORIZON) * HORIZON),
         (GibbsConfig(HORIZON, 7, restarts=4, judge="halves"), 4 * (7 + 2 * SPLITS)),
         (BeamConfig(HORIZON, 4, judge="energy", score=True), 8 * HORIZON),
         (BeamConfig(HORIZON, 4, judge="halves"), 4 * HORIZON + 4 * 2 * SPLITS),
