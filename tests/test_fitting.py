@@ -40,6 +40,8 @@ def test_saved_planner_equals_the_fitted_planner(star, tmp_path):
     assert reports == [(3, ["accuracy", "gradient_norm", "loss"])]
     assert planner.specification.training == dataclasses.replace(training, steps=3)
     untrained = leap.fit(data, domain, steps=0, model=SMALL, training=training)
+    other = leap.fit(data, domain, steps=0, model=SMALL, training=training, seed=1)
+    assert not np.array_equal(*(jax.tree.leaves(p.params)[0] for p in (other, untrained)))
     assert leap.fit([], domain, "iql", steps=0, model=SMALL).specification.method == "iql"
     assert not np.array_equal(*(jax.tree.leaves(p.params)[0] for p in (planner, untrained)))
     planner.save(tmp_path / "mine")

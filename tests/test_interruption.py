@@ -189,6 +189,7 @@ def test_damaged_checkpoint_is_set_aside_and_the_previous_checkpoint_restored(tm
     restored = checkpoints.restore(make_state(0), skipped=messages.append)
     assert int(restored.step) == 2
     np.testing.assert_array_equal(restored.params["w"], 2.0)
+    assert not (tmp_path / "1").exists()  # the oldest go
     assert len(messages) == 1 and re.search("3 is damaged.*the one before is used", messages[0])
     checkpoints.save(make_state(3))  # replaces the damaged step
     checkpoints.close()

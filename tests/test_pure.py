@@ -30,6 +30,7 @@ def reset(key):
 
 
 def step(state, action):
+    action = jnp.where(state.steps % 3 == 2, STAY, action)  # contexts hold the action taken
     state = Place(state.at + jnp.array([-1, 1, 0])[action], state.to, state.steps + 1)
     reached = state.at == state.to
     reward = jnp.where(reached, 1.0, -0.1)
@@ -37,7 +38,7 @@ def step(state, action):
     over = state.steps >= LONGEST
     near = jnp.abs(state.at - state.to) <= 1  # a success even if the planner gives up there
     # The score differs from the reward, which planners see.
-    return state, Transition(observation, reward, reached, over, near, score=3 * reward + 1)
+    return state, Transition(observation, reward, reached, over, near, 3 * reward + 1, action)
 
 
 WALK = PureEnvironment(reset, step, END + 1)

@@ -126,6 +126,9 @@ def test_program_runs_on_recorded_data(tmp_path, monkeypatch, capsys):
     few = ["--demos", "4", "--steps", "0", "--method", "random"]
     assert babyai.main([*"--episodes 2 --no-pictures".split(), *few, "--demonstrations", name]) == 0
     assert f"dropped: 1 {replay.DONE}" in " ".join(capsys.readouterr().out.split())
+    overlap = ["--demonstrations", name, "--test-seed", "1000"]
+    assert babyai.main([*"--episodes 2 --no-pictures".split(), *few, *overlap]) == 2
+    assert "both a demonstration" in " ".join(capsys.readouterr().err.split())
 
 
 @only_long

@@ -416,6 +416,15 @@ def test_judge_halves_chooses_among_beams_of_all_plans():
     assert_equal(plan.actions, PLANS[np.argmin(scores)])
 
 
+@pytest.mark.parametrize("fill", ["together", "sequential"])
+def test_no_action_stays_masked_if_all_are_forbidden(fill):
+    def forbid(params, memory, actions, positions):
+        return jnp.full((positions.shape[0], 3), jnp.inf)
+
+    energy = Energy(lambda params, context: None, forbid, lambda *inputs: jnp.inf, 3)
+    assert (plan_for(GibbsConfig(3, 3, fill=fill), energy).actions < 3).all()
+
+
 def test_judges_energy_and_sum_choose_different_beams():
     """The conditionals of this pseudo-likelihood belong to no joint distribution."""
 

@@ -227,7 +227,9 @@ def test_padding_does_not_change_windows():
     # The fingerprint of a run's data does not depend on padding.
     jax.tree.map(np.testing.assert_array_equal, windows.unpadded(padded), steps)
     assert windows.fingerprint(windows.unpadded(padded)) == windows.fingerprint(steps)
-    assert windows.fingerprint(padded) != windows.fingerprint(steps)
+    others = windows.concatenate(make_demonstrations(1), extras=mark_needed_cells)
+    for different in (padded, others):
+        assert windows.fingerprint(different) != windows.fingerprint(steps)
 
 
 def test_memory_mapped_frames_are_copied_once(tmp_path):
