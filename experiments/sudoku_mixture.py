@@ -1,7 +1,7 @@
 """Makes hard boards to play: `python -m experiments.sudoku_mixture sudoku17.txt boards.txt`.
 
 Recurrent Relational Networks (Palm et al., 2018) are tested on boards with 17 to 34 clues, equally
-many of each. Givens beyond 17 are digits of the solution at random open cells.
+many of each. Clues beyond 17 are digits of the solution at random open cells.
 """
 
 import dataclasses

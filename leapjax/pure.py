@@ -117,8 +117,8 @@ def compile_rollout(
         episode, ended = carry
         ended |= action >= end  # or MASK
         state, found = environment.step(episode.state, jnp.minimum(action, end - 1))
-        now = _advance_context(episode.context, action, found)
         taken = jnp.asarray(found.executed(action))
+        now = _advance_context(episode.context, taken, found)
         sound = _is_finite((found[:2], found.counted)) & (taken >= 0) & (taken < end)
         over = jnp.asarray(found.terminated | found.truncated) | (now.step >= max_steps)
         acted = episode._replace(
@@ -267,8 +267,8 @@ def _is_finite(tree: PyTree) -> jax.Array:
     return jnp.array([jnp.isfinite(leaf).all() for leaf in floats], bool).all()
 
 
-def _advance_context(context: Context, action: jax.Array, found: Transition) -> Context:
-    """Makes the context after a step."""
+def _advance_context(context: Context, taken: jax.Array, found: Transition) -> Context:
+    """Makes the context after a step, in which an action was taken."""
 
     def shifted(past: jax.Array, latest: Array) -> jax.Array:
         return jnp.concatenate([past, jnp.asarray(latest, past.dtype)[None]])[1:]
@@ -276,7 +276,7 @@ def _advance_context(context: Context, action: jax.Array, found: Transition) -> 
     return Context(
         found.observation,
         jax.tree.map(shifted, context.past, context.observation),
-        shifted(context.actions, found.executed(action)),
+        shifted(context.actions, taken),
         shifted(context.rewards, found.reward),
         context.step + 1,
         context.return_so_far + found.reward,

@@ -24,7 +24,16 @@ from leapjax.running.interruption import SIGNALS, Interrupted, catch_signals
 from leapjax.running.metrics import read_metrics
 from leapjax.running.progress import Meter
 from leapjax.types import TrainState
-from tests.programs import RANDOM, ROOT, STEPS, Place, only_long, place_with_a_run, run_python
+from tests.programs import (
+    RANDOM,
+    ROOT,
+    STEPS,
+    Place,
+    damage,
+    only_long,
+    place_with_a_run,
+    run_python,
+)
 
 place = pytest.fixture(place_with_a_run, scope="module")
 
@@ -182,9 +191,7 @@ def test_damaged_checkpoint_is_set_aside_and_the_previous_checkpoint_restored(tm
     for step in (1, 2, 3):
         checkpoints.save(make_state(step))
     checkpoints.close()
-    for file in (tmp_path / "3" / "default").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[:20])
+    damage(tmp_path / "3")
     checkpoints = Checkpoints(tmp_path)
     restored = checkpoints.restore(make_state(0), skipped=messages.append)
     assert int(restored.step) == 2

@@ -34,7 +34,7 @@ from leapjax.running import jax_setup, startup
 from leapjax.running import main as running
 from leapjax.running.command_line import parse
 from leapjax.types import TrainState
-from tests.programs import TOY_RUN, only_long, run_python, seal, toy_row, untrained_run
+from tests.programs import TOY_RUN, damage, only_long, run_python, seal, toy_row, untrained_run
 
 OTHER = "another configuration"
 
@@ -373,9 +373,7 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(toy_run, workpla
     shutil.copytree(toy_run, stopped)
     last = stopped / "checkpoints" / "4"
     shutil.copytree(last, last.parent / "3")
-    for file in (last / "default").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[:20])
+    damage(last)
     with pytest.warns(UserWarning) as warned:
         planner = leap.load(stopped)
     messages = "\n".join(str(each.message) for each in warned)

@@ -69,13 +69,14 @@ def _find_difference(adapter: Adapter, recorded: Demonstration, exact: bool) -> 
         return jax.tree.map(lambda leaf: leaf[step], recorded.observations)
 
     again = f"an episode that is played again with its seed {recorded.seed} has another"
-    if differs(adapter.reset(recorded.seed), state(0)) and exact:
+    begun = adapter.reset(recorded.seed)
+    if exact and differs(begun, state(0)):
         return f"{again} first observation"
     for step, action in enumerate(recorded.actions[:COMPARED]):
         found = adapter.step(int(action))
         if differs(found.reward, recorded.rewards[step]):
             return f"{again} reward at step {step}"
-        if differs(found.observation, state(step + 1)) and exact:
+        if exact and differs(found.observation, state(step + 1)):
             return f"{again} observation after step {step}"
         if found.terminated or found.truncated:
             break
